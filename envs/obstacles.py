@@ -1,0 +1,215 @@
+"""Obstacle geometry as compiled kernels: clearance, and the smooth proximity cost with gradient and Hessian.
+
+All kernels read one flat array, the packed field, so that it can pass through any compiled function:
+
+    [0] proximity weight k   [1] proximity scale sigma   [2] robot radius   [3] circles   [4] polygons
+    [5:9] arena (x_min, y_min, x_max, y_max)
+    then per circle:   x, y, r
+    then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
+
+Obstacles are numbered as in the scenario; since circles are packed before polygons the numbers are stored last,
+one per packed obstacle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numba import float64, int64, njit, types
+
+# A term whose distance exceeds 40 sigma is below 1e-17 k, the rounding error of the sum, and is skipped exactly.
+CUTOFF = 40.0
+CIRCLES, POLYGONS, ARENA, SHAPES = 3, 4, 5, 9  # positions in the packed field
+_field = types.Array(types.float64, 1, "C", readonly=True)
+
+
+def pack_field(
+    shapes: Sequence[Any],
+    arena: tuple[float, float, float, float],
+    radius: float,
+    weight: float,
+    scale: float,
+) -> np.ndarray:
+    """Packs circles `(center, radius)` and polygons (array `(m, 2)`) into the flat array that the kernels read."""
+    circles: list[float] = []
+    polygons: list[float] = []
+    circle_numbers: list[int] = []
+    polygon_numbers: list[int] = []
+    for number, shape in enumerate(shapes):
+        if isinstance(shape, tuple):
+            circles += [*shape[0], shape[1]]
+            circle_numbers.append(number)
+        else:
+            polygons += _pack_polygon(np.asarray(shape, dtype=float))
+            polygon_numbers.append(number)
+    header = [weight, scale, radius, len(circle_numbers), len(polygon_numbers), *arena]
+    field = np.array(header + circles + polygons + circle_numbers + polygon_numbers, dtype=np.float64)
+    field.flags.writeable = False
+    return field
+
+
+def _pack_polygon(vertices: np.ndarray) -> list[float]:
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    area = float(np.sum(vertices[:, 0] * np.roll(vertices[:, 1], -1) - vertices[:, 1] * np.roll(vertices[:, 0], -1)))
+    if area < 0:  # counter-clockwise from here on, so that (dy, -dx) points outwards
+        return _pack_polygon(vertices[::-1])
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
+    offsets = np.sum(normals * vertices, axis=1)
+    return [float(len(vertices)), *np.column_stack([normals, offsets, vertices]).ravel().tolist()]
+
+
+@njit(float64(float64), cache=True, error_model="numpy", nogil=True)
+def sinc(angle):
+    """sin(angle) / angle, smooth through zero."""
+    return 1.0 - angle * angle / 6.0 if abs(angle) < 1e-4 else math.sin(angle) / angle
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _polygon_distance(x, y, field, rows, edges):
+    """Euclidean distance to a convex polygon, negative inside."""
+    inside = -np.inf
+    outside = np.inf
+    for j in range(edges):
+        row = rows + 5 * j
+        nx, ny = field[row], field[row + 1]
+        following = rows + 5 * ((j + 1) % edges)
+        ax, ay = field[row + 3], field[row + 4]
+        inside = max(inside, nx * x + ny * y - field[row + 2])
+        # Position along the edge, whose direction is the normal turned by 90 degrees, held within the edge.
+        length = -ny * (field[following + 3] - ax) + nx * (field[following + 4] - ay)
+        along = min(max(-ny * (x - ax) + nx * (y - ay), 0.0), length)
+        outside = min(outside, math.hypot(x - ax + ny * along, y - ay - nx * along))
+    return inside if inside < 0 else outside
+
+
+@njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
+def proximity(x, y, field):
+    """Proximity cost at a point: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
+    k, sigma, radius = field[0], field[1], field[2]
+    reach = CUTOFF * sigma
+    value = gx = gy = hxx = hxy = hyy = 0.0
+    for side in range(4):  # walls: one half-plane each, the inside positive
+        along_x = side % 2 == 0
+        sign = 1.0 if side < 2 else -1.0
+        distance = sign * ((x if along_x else y) - field[ARENA + side]) - radius
+        if distance < reach:
+            term = k * math.exp(-distance / sigma)
+            value += term
+            if along_x:
+                gx -= sign * term / sigma
+                hxx += term / sigma**2
+            else:
+                gy -= sign * term / sigma
+                hyy += term / sigma**2
+    at = SHAPES
+    for _ in range(int(field[CIRCLES])):
+        dx, dy = x - field[at], y - field[at + 1]
+        smooth = math.sqrt(dx * dx + dy * dy + 1e-6)  # differentiable at the centre
+        distance = smooth - field[at + 2] - radius
+        at += 3
+        if distance < reach:
+            term = k * math.exp(-distance / sigma)
+            nx, ny = dx / smooth, dy / smooth
+            slope = term / sigma
+            value += term
+            gx -= slope * nx
+            gy -= slope * ny
+            bend = slope / sigma + slope / smooth
+            hxx += bend * nx * nx - slope / smooth
+            hxy += bend * nx * ny
+            hyy += bend * ny * ny - slope / smooth
+    for _ in range(int(field[POLYGONS])):
+        edges = int(field[at])
+        rows = at + 1
+        at = rows + 5 * edges
+        farthest = -np.inf
+        for j in range(edges):
+            row = rows + 5 * j
+            farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+        distance = farthest - radius
+        if distance < reach:
+            total = mx = my = sxx = sxy = syy = 0.0
+            for j in range(edges):
+                row = rows + 5 * j
+                nx, ny = field[row], field[row + 1]
+                # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
+                share = math.exp((nx * x + ny * y - field[row + 2] - farthest) / sigma)
+                total += share
+                mx += share * nx
+                my += share * ny
+                sxx += share * nx * nx
+                sxy += share * nx * ny
+                syy += share * ny * ny
+            term = k * math.exp(-distance / sigma) / total
+            mx, my = mx / total, my / total
+            slope, bend = term / sigma, term / sigma**2
+            value += term
+            gx -= slope * mx
+            gy -= slope * my
+            hxx += bend * (2 * mx * mx - sxx / total)
+            hxy += bend * (2 * mx * my - sxy / total)
+            hyy += bend * (2 * my * my - syy / total)
+    return value, gx, gy, hxx, hxy, hyy
+
+
+@njit(types.Tuple((float64, int64))(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
+def clearance(x, y, field):
+    """Signed distance (m) from the robot's rim to the nearest obstacle or wall, and that obstacle's number.
+
+    Negative inside. The wall has the number after the last obstacle.
+    """
+    radius = field[2]
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    numbers = len(field) - circles - polygons
+    best = min(
+        min(x - field[ARENA], field[ARENA + 2] - x),
+        min(y - field[ARENA + 1], field[ARENA + 3] - y),
+    )
+    nearest = circles + polygons
+    at = SHAPES
+    for i in range(circles):
+        distance = math.hypot(x - field[at], y - field[at + 1]) - field[at + 2]
+        at += 3
+        if distance < best:
+            best, nearest = distance, int(field[numbers + i])
+    for i in range(polygons):
+        edges = int(field[at])
+        distance = _polygon_distance(x, y, field, at + 1, edges)
+        at += 1 + 5 * edges
+        if distance < best:
+            best, nearest = distance, int(field[numbers + circles + i])
+    return best - radius, nearest
+
+
+@njit(float64[::1](float64[:, :], _field), cache=True, error_model="numpy", nogil=True)
+def clearances(points, field):
+    """`clearance` of many points, shape (N, >= 2) -> (N,)."""
+    result = np.empty(len(points))
+    for i in range(len(points)):
+        result[i] = clearance(points[i, 0], points[i, 1], field)[0]
+    return result
+
+
+@njit(float64(float64, float64, float64, float64, float64, _field), cache=True, error_model="numpy", nogil=True)
+def arc_clearance(x, y, heading, distance, turn, field):
+    """Smallest clearance (m) along a circular arc, exact to a millimetre.
+
+    The arc starts at a pose, is `distance` metres long (negative: backwards) and turns by `turn` radians. Clearance
+    changes by no more than the way driven, so the walk skips what cannot hold a smaller value.
+    """
+    total = abs(distance)
+    lowest, _ = clearance(x, y, field)
+    driven = 0.0
+    while driven < total:
+        part = driven / total
+        chord = distance * part * sinc(turn * part / 2)
+        middle = heading + turn * part / 2
+        here, _ = clearance(x + chord * math.cos(middle), y + chord * math.sin(middle), field)
+        lowest = min(lowest, here)
+        driven += max(here - lowest + 1e-3, 1e-3)
+    chord = distance * sinc(turn / 2)
+    here, _ = clearance(x + chord * math.cos(heading + turn / 2), y + chord * math.sin(heading + turn / 2), field)
+    return min(lowest, here)

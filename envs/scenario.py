@@ -1,0 +1,238 @@
+"""A navigation task: arena, robot, obstacles, start, goal, horizon and cost weights.
+
+A `Scenario` is immutable and validated on construction. The same object is the environment's task and, through
+`leapnav.experts`, the optimal control problem. Units are metres, seconds and radians throughout.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
+
+from leapnav.envs.obstacles import clearance, pack_field
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Point = tuple[Finite, Finite]
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be used. The message is one line that names the scenario, the field and the value."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class Robot(_Frozen):
+    """The robot's kind, its radius (m) and its limits (m/s, rad/s)."""
+
+    model: Literal["unicycle"] = "unicycle"
+    radius: Positive = 0.25
+    max_speed: Positive = 2.0
+    max_turn_rate: Positive = 3.0
+
+
+class Cost(_Frozen):
+    """Weights of the running cost 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(x, y)."""
+
+    speed_weight: Positive = 1.0
+    turn_weight: Positive = 0.5
+    proximity_weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    proximity_scale: Positive = 0.1
+
+
+class Circle(_Frozen):
+    """A disc obstacle: center (x, y) and radius, in metres."""
+
+    center: Point
+    radius: Positive
+
+
+class Polygon(_Frozen):
+    """A convex polygon obstacle: at least three vertices (x, y), in either orientation."""
+
+    vertices: tuple[Point, ...]
+
+    @field_validator("vertices")
+    @classmethod
+    def _check_convex(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
+        if len(vertices) < 3:
+            raise ValueError(f"a polygon needs at least 3 vertices, this one has {len(vertices)}")
+        points = np.asarray(vertices)
+        edges = np.roll(points, -1, axis=0) - points
+        following = np.roll(edges, -1, axis=0)
+        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+        angles = np.arctan2(turns, np.sum(edges * following, axis=1))
+        # A convex polygon turns one way at every vertex and once round in all (a star turns more than once).
+        same_way = bool(np.all(turns > 0) or np.all(turns < 0))
+        if not same_way or not math.isclose(abs(float(angles.sum())), 2 * math.pi, rel_tol=1e-6):
+            raise ValueError("the polygon is not strictly convex; write a non-convex obstacle as several convex ones")
+        return vertices
+
+
+class Obstacle(_Frozen):
+    """Exactly one of a circle or a polygon, as in the scenario file: `{"circle": {...}}` or `{"polygon": {...}}`."""
+
+    circle: Circle | None = None
+    polygon: Polygon | None = None
+
+    @model_validator(mode="after")
+    def _check_one_shape(self) -> Self:
+        if (self.circle is None) == (self.polygon is None):
+            raise ValueError("an obstacle is exactly one of 'circle' or 'polygon'")
+        return self
+
+
+class Scenario(_Frozen):
+    """One navigation task. Immutable; equal scenarios have equal fields.
+
+    Args:
+        name: label used in messages and tables.
+        arena: (x_min, y_min, x_max, y_max), the walls.
+        robot: kind, radius and limits of the robot.
+        start: (x, y, heading) at time 0.
+        goal: (x, y, heading) at the horizon; a heading of None is free.
+        horizon: duration of the task in seconds.
+        obstacles: circles and convex polygons.
+        cost: weights of the running cost.
+
+    Raises:
+        ScenarioError: a field is missing, unknown, not finite or impossible (one line: field and value).
+    """
+
+    name: str = "scenario"
+    arena: tuple[Finite, Finite, Finite, Finite]
+    robot: Robot = Robot()
+    start: tuple[Finite, Finite, Finite]
+    goal: tuple[Finite, Finite, Finite | None]
+    horizon: Positive
+    obstacles: tuple[Obstacle, ...] = ()
+    cost: Cost = Cost()
+
+    def __init__(self, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise ScenarioError(_one_line(fields.get("name", "scenario"), error)) from None
+
+    @field_validator("arena")
+    @classmethod
+    def _check_arena(cls, arena: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+        x_min, y_min, x_max, y_max = arena
+        if x_min >= x_max or y_min >= y_max:
+            raise ValueError("the arena needs x_min < x_max and y_min < y_max")
+        return arena
+
+    @model_validator(mode="after")
+    def _check_poses_are_free(self) -> Self:
+        names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
+        for field, pose in (("start", self.start), ("goal", self.goal)):
+            distance, nearest = clearance(pose[0], pose[1], self.field)
+            if not distance > 0:
+                raise ValueError(
+                    f"{field}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
+                )
+        return self
+
+    @cached_property
+    def field(self) -> np.ndarray:
+        """The obstacle field packed for the kernels of `leapnav.envs.obstacles` (read-only)."""
+        shapes = [
+            (o.circle.center, o.circle.radius) if o.circle is not None else np.asarray(o.polygon.vertices)
+            for o in self.obstacles
+            if o.circle is not None or o.polygon is not None
+        ]
+        cost = self.cost
+        return pack_field(shapes, self.arena, self.robot.radius, cost.proximity_weight, cost.proximity_scale)
+
+    def __eq__(self, other: object) -> bool:
+        # By field: pydantic would compare the cached arrays too.
+        return isinstance(other, Scenario) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, name) for name in type(self).model_fields)
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """The scenario as JSON text; also written to `path` if one is given."""
+        text = json.dumps(self.to_dict())
+        if path is not None:
+            Path(path).write_text(text + "\n")
+        return text
+
+    def to_dict(self) -> dict[str, Any]:
+        """The scenario as plain dictionaries, lists and numbers, in the layout of the scenario file."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @classmethod
+    def from_dict(cls, fields: Any) -> Scenario:
+        """The inverse of `to_dict`.
+
+        Raises:
+            ScenarioError: see the class.
+        """
+        if not isinstance(fields, dict):
+            raise ScenarioError(f"a scenario is a JSON object, got {_shorten(fields)}")
+        return cls(**_tuples(fields))
+
+    @classmethod
+    def from_json(cls, path_or_text: str | Path) -> Scenario:
+        """Reads a scenario from a file, or from JSON text (recognised by its opening brace).
+
+        Raises:
+            ScenarioError: the text is not JSON, or see the class.
+            OSError: the file cannot be read.
+        """
+        is_text = isinstance(path_or_text, str) and path_or_text.lstrip().startswith("{")
+        source, text = ("text", str(path_or_text)) if is_text else (str(path_or_text), None)
+        try:
+            text = Path(path_or_text).read_text(encoding="utf-8") if text is None else text
+            fields = json.loads(text, object_pairs_hook=_unique_keys)
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
+        return cls.from_dict(fields)
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        repeated = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
+        raise ScenarioError(f"scenario: {repeated}: the key appears more than once")
+    return fields
+
+
+def _tuples(value: Any) -> Any:
+    """JSON lists as tuples, which is what strict validation of immutable fields expects."""
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def _shorten(value: Any) -> str:
+    text = repr(value).replace("\n", " ")
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _one_line(name: Any, error: ValidationError) -> str:
+    """The first fault of a pydantic error as one line: scenario, field, what is wrong, value."""
+    faults = error.errors(include_url=False)
+    first: ErrorDetails = faults[0]
+    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in first["loc"]).lstrip(".")
+    message = first["msg"].removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
+    # Faults of the whole scenario name field and value themselves; a missing field has no value.
+    value = "" if not path or first["type"] == "missing" else f", got {_shorten(first['input'])}"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return f"Scenario {_shorten(name)}: {path}{': ' if path else ''}{message}{value}{more}"

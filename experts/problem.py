@@ -1,0 +1,196 @@
+"""The optimal control problem that every method takes, and the path that a method starts from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import ModuleType
+from typing import Any, cast
+
+import numpy as np
+import sympy as sp
+
+from leapnav.envs.scenario import Scenario
+from leapnav.experts.system import ControlAffineSystem, compile_flow, unicycle
+
+
+@dataclass(frozen=True)
+class Path:
+    """A guess of the solution: times (N,) from 0 to the horizon, states (N, n), costates (N, n) or None."""
+
+    times: np.ndarray
+    states: np.ndarray
+    costates: np.ndarray | None = None
+
+    def resample(self, times: np.ndarray) -> Path:
+        """The same path at other times, by linear interpolation."""
+        columns = [self.states] if self.costates is None else [self.states, self.costates]
+        values = [np.stack([np.interp(times, self.times, c) for c in array.T], axis=1) for array in columns]
+        return Path(times, *values)
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalControlProblem:
+    """minimise the integral of 1/2 u'Ru + Phi(q) over [0, horizon], subject to the system and both boundary conditions.
+
+    Args:
+        system: the dynamics, n states and m controls.
+        start: q(0), n numbers.
+        goal: q(T), n numbers; None leaves a component free (its costate vanishes at T).
+        horizon: T > 0.
+        control_weight: the diagonal of R, m positive numbers.
+        state_cost: Phi, a SymPy expression in the system's state symbols.
+        control_bounds: m pairs (lowest, highest), or None for unbounded controls.
+        field: a packed obstacle field (`Scenario.field`) whose proximity cost is added to Phi at the system's position.
+
+    Raises:
+        ValueError: a length or a value is impossible; the message names the argument and the value.
+    """
+
+    system: ControlAffineSystem
+    start: Sequence[float]
+    goal: Sequence[float | None]
+    horizon: float
+    control_weight: Sequence[float]
+    state_cost: Any = 0
+    control_bounds: Sequence[tuple[float, float]] | None = None
+    field: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n, m = self.system.n, self.system.m
+        for name, values, length in (
+            ("start", self.start, n), ("goal", self.goal, n), ("control_weight", self.control_weight, m)
+        ):
+            if len(values) != length:
+                raise ValueError(f"{name}: expected {length} numbers, got {len(values)}: {values!r}")
+            if not all(v is None and name == "goal" or v is not None and math.isfinite(v) for v in values):
+                raise ValueError(f"{name}: expected finite numbers, got {values!r}")
+        if not all(w > 0 for w in self.control_weight):
+            raise ValueError(f"control_weight: expected positive numbers, got {self.control_weight!r}")
+        if not (math.isfinite(self.horizon) and self.horizon > 0):
+            raise ValueError(f"horizon: expected a positive number, got {self.horizon!r}")
+        if self.control_bounds is not None:
+            if len(self.control_bounds) != m:
+                raise ValueError(f"control_bounds: expected {m} pairs, got {len(self.control_bounds)}")
+            for low, high in self.control_bounds:
+                if not low < high:
+                    raise ValueError(f"control_bounds: expected lowest < highest, got ({low!r}, {high!r})")
+        unknown = sp.sympify(self.state_cost).free_symbols - set(self.system.state)
+        if unknown:
+            raise ValueError(f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}")
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario) -> OptimalControlProblem:
+        """The problem of a scenario, with the robot's limits as control bounds."""
+        robot, cost = scenario.robot, scenario.cost
+        return cls(
+            system=_UNICYCLE,
+            start=scenario.start,
+            goal=scenario.goal,
+            horizon=scenario.horizon,
+            control_weight=(cost.speed_weight, cost.turn_weight),
+            control_bounds=((-robot.max_speed, robot.max_speed), (-robot.max_turn_rate, robot.max_turn_rate)),
+            field=scenario.field,
+        )
+
+    def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:
+        """The same problem with each goal angle moved by multiples of 2 pi to where the path `states` (N, n) ends."""
+        goal = list(self.goal)
+        for symbol in self.system.angles:
+            i = self.system.state.index(symbol)
+            value = goal[i]
+            if value is not None:
+                # The path ends on the goal modulo 2 pi only up to its own error.
+                goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
+        return replace(self, goal=tuple(goal))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions belong to this process; the receiving one makes its own.
+        return {name: value for name, value in self.__dict__.items() if name != "arrays"}
+
+    @property
+    def module(self) -> ModuleType:
+        """The compiled extremal flow."""
+        return compile_flow(self.system, sp.sympify(self.state_cost), self.field is not None)
+
+    @cached_property
+    def arrays(self) -> ProblemArrays:
+        """The problem as the arrays that the kernels take."""
+        m = self.system.m
+        bounds = np.array(self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float)
+        return ProblemArrays(
+            flow=self.module.flow,
+            control=self.module.control,
+            start=np.array(self.start, dtype=float),
+            goal=np.array([0.0 if g is None else g for g in self.goal], dtype=float),
+            free=np.array([g is None for g in self.goal]),
+            data=_constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1]]),
+            field=_constant([]) if self.field is None else self.field,
+        )
+
+    def estimate_costates(self, path: Path) -> np.ndarray:
+        """Costates (N, n) consistent with the minimum principle along a path without any.
+
+        The control that follows the path in the least-squares sense gives the switching functions p = -R u, and
+        lam = B (B'B)^-1 p is the smallest costate with these.
+        """
+        arrays = self.arrays
+        n, m = self.system.n, self.system.m
+        weight = np.asarray(self.control_weight, dtype=float)
+        probe = _constant([*np.ones(m), *np.full(m, -np.inf), *np.full(m, np.inf)])
+        rates = np.gradient(path.states, path.times, axis=0)
+        costates = np.empty_like(path.states)
+        empty, z, dz, u = np.empty((2 * n, 0)), np.empty(2 * n), np.empty(2 * n), np.empty(m)
+        B = np.empty((n, m))
+        for k, q in enumerate(path.states):
+            z[:n], z[n:] = q, 0.0
+            arrays.flow(z, probe, arrays.field, empty, dz, empty)
+            drift = dz[:n].copy()
+            for i in range(n):  # u = -B'lam for unit weights, so unit costates read B off row by row
+                z[n:] = 0.0
+                z[n + i] = 1.0
+                arrays.control(z, probe, u)
+                B[i] = -u
+            control = np.linalg.lstsq(B, rates[k] - drift, rcond=None)[0]
+            costates[k] = np.linalg.lstsq(B.T, -weight * control, rcond=None)[0]
+        return costates
+
+    def straight_line(self, points: int = 33) -> Path:
+        """The straight line from start to goal; free components stay at their start."""
+        start = np.array(self.start, dtype=float)
+        goal = np.array([s if g is None else g for s, g in zip(self.start, self.goal, strict=True)], dtype=float)
+        share = np.linspace(0.0, 1.0, points)[:, None]
+        return Path(np.linspace(0.0, self.horizon, points), start + share * (goal - start))
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemArrays:
+    """What the kernels read: compiled functions, boundary values (n,), free flags (n,), weights and bounds, field."""
+
+    flow: Any
+    control: Any
+    start: np.ndarray
+    goal: np.ndarray
+    free: np.ndarray
+    data: np.ndarray
+    field: np.ndarray
+
+
+def _constant(values: Sequence[float] | list[float]) -> np.ndarray:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+_UNICYCLE = unicycle()
+
+
+def as_problem(task: OptimalControlProblem | Scenario) -> OptimalControlProblem:
+    """A scenario's problem, or the problem itself."""
+    if isinstance(task, Scenario):
+        return OptimalControlProblem.from_scenario(task)
+    if isinstance(task, OptimalControlProblem):
+        return task
+    raise TypeError(f"expected a Scenario or an OptimalControlProblem, got {type(cast(object, task)).__name__}")
