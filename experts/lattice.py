@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -204,8 +205,8 @@ class Lattice:
                     costs.append(length * float(speed[2 * i, 2 * j]))
         return np.array(nodes, dtype=np.int64), np.array(costs)
 
-    def candidates(self, most: int) -> list[Candidate]:
-        """Up to `most` distinct paths, cheapest first; none if the goal cannot be reached."""
+    def candidates(self) -> Iterator[Candidate]:
+        """Distinct paths, cheapest first; none if the goal cannot be reached."""
         scenario = self.scenario
         weights = scenario.cost.speed_weight, scenario.cost.turn_weight
         for _ in range(3):
@@ -216,7 +217,7 @@ class Lattice:
             ahead, ahead_parent = _dijkstra(speed, self.free, *from_start, from_goal[0], *args)
             at_goal = ahead[from_goal[0]] + from_goal[1]
             if not np.isfinite(at_goal).any():
-                return []
+                return
             best = self._path(ahead_parent, np.full_like(ahead_parent, -1), int(from_goal[0][np.argmin(at_goal)]))
             old, self.energy = self.energy, self._energy(best)
             if abs(math.log(self.energy / old)) < 0.3:
@@ -227,17 +228,13 @@ class Lattice:
         order = order[: np.searchsorted(through[order], self.REACH * through[order[0]])]
         taken = np.zeros((*self.shape, HEADINGS), dtype=bool)
         flat = taken.ravel()
-        found: list[Candidate] = []
         for node in order:
             if flat[node]:
                 continue
             path = self._path(ahead_parent, behind_parent, int(node))
             for i, j, k in path[0]:
                 _mark(taken, i, j, k, self.SAME_CELLS, self.SAME_HEADINGS)
-            found.append(self._candidate(path, float(through[node])))
-            if len(found) == most:
-                break
-        return found
+            yield self._candidate(path, float(through[node]))
 
     def _path(self, ahead: np.ndarray, behind: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
         """The path through a node: lattice indices (N, 3) and poses (N + 2, 3) from start to goal."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -18,6 +20,8 @@ TOLERANCE = 1e-9
 NEWTON_ITERATIONS = 40
 # Three sweeps leave a path within a few per cent of its local optimum; what is dearer by more cannot become the best.
 SCREENING_MARGIN = 1.25
+SWEEPS, MORE_SWEEPS = 3, 8
+MOST_ROUNDS = 8
 # Two paths this near at all times (metres, and as much in radians) lead to the same extremal.
 SAME_PATH = 0.15
 
@@ -46,7 +50,7 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
     turn the promising ones into extremals; the cheapest whose certificate holds is returned.
 
     Args:
-        candidates: how many distinct paths to try.
+        candidates: how many distinct paths to try at once; more are tried only as long as none of them is certified.
 
     Returns:
         An `Extremal`; if none is certified, the cheapest failure, or one with status NO_PATH.
@@ -57,43 +61,48 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
     if candidates < 1:
         raise ValueError(f"candidates: expected at least 1, got {candidates!r}")
     problem = OptimalControlProblem.from_scenario(scenario)
-    paths = [Path(c.times, c.poses) for c in Lattice(scenario).candidates(candidates)]
-    if not paths:
-        return failure(problem, Status.NO_PATH)
+    paths = Lattice(scenario).candidates()
+    failed: list[Extremal] = []
+    for _ in range(MOST_ROUNDS):
+        batch = [Path(c.times, c.poses) for c in islice(paths, candidates)]
+        if not batch:
+            break
+        for extremal in _extremals(problem, batch, scenario):
+            if extremal.success:
+                return extremal
+            failed.append(extremal)
+    return min(failed, key=lambda extremal: extremal.cost, default=failure(problem, Status.NO_PATH))
+
+
+def _extremals(problem: OptimalControlProblem, paths: list[Path], scenario: Scenario) -> Iterator[Extremal]:
+    """Extremals of the promising paths, cheapest first; a failure if there is none."""
     attempts = sorted((_sweep(problem, path) for path in paths), key=lambda attempt: attempt.cost)
     polished: list[tuple[float, _Attempt]] = []
-    stalled: list[_Attempt] = []
-    for attempt in attempts:
+
+    def promising(attempt: _Attempt) -> bool:
         best = min((cost for cost, _ in polished), default=np.inf)
-        if attempt.cost > SCREENING_MARGIN * best or any(_same(attempt, other) for _, other in polished):
-            continue
-        if not _polish(attempt, scenario, polished):
-            stalled.append(attempt)
+        return attempt.cost <= SCREENING_MARGIN * best and not any(_same(attempt, other) for _, other in polished)
+
+    stalled = [a for a in attempts if promising(a) and not _polish(a, scenario, polished)]
     for attempt in stalled:
-        best = min((cost for cost, _ in polished), default=np.inf)
-        if attempt.cost > SCREENING_MARGIN * best or any(_same(attempt, other) for _, other in polished):
-            continue
-        # Nearer to the extremal, or onto another one.
-        rows, work = sweep(attempt.problem, attempt.times, attempt.nodes, attempt.costs, 8)
-        attempt.history += rows
-        attempt.work += work
-        _polish(attempt, scenario, polished)
-    worst: Extremal | None = None
+        if promising(attempt):  # more sweeps: nearer to the extremal, or onto another one
+            rows, work = sweep(attempt.problem, attempt.times, attempt.nodes, attempt.costs, MORE_SWEEPS)
+            attempt.history += rows
+            attempt.work += work
+            _polish(attempt, scenario, polished)
     for _, attempt in sorted(polished, key=lambda pair: pair[0]):
-        extremal = certify(
+        yield certify(
             attempt.problem, attempt.times, attempt.nodes, Status.SUCCESS, tuple(attempt.history), attempt.work
         )
-        if extremal.success:
-            return extremal
-        worst = worst or extremal
-    return worst or failure(problem, Status.STALLED, tuple(attempts[0].history))
+    if not polished:
+        yield failure(problem, Status.STALLED, tuple(attempts[0].history), sum(attempt.work for attempt in attempts))
 
 
 def _sweep(problem: OptimalControlProblem, path: Path) -> _Attempt:
     problem = problem.with_winding_of(path.states)
     times, nodes = start_nodes(problem, path, default_segments(path))
     costs = connect(problem, times, nodes)
-    rows, work = sweep(problem, times, nodes, costs, 3)
+    rows, work = sweep(problem, times, nodes, costs, SWEEPS)
     return _Attempt(problem, times, nodes, costs, rows, work)
 
 

@@ -71,10 +71,10 @@ def solve(
         path = guess
         _check_path(path, task)
     elif isinstance(problem, Scenario):
-        candidates = Lattice(problem).candidates(1)
-        if not candidates:
+        candidate = next(Lattice(problem).candidates(), None)
+        if candidate is None:
             return failure(task, Status.NO_PATH)
-        path = Path(candidates[0].times, candidates[0].poses)
+        path = Path(candidate.times, candidate.poses)
     else:
         path = task.straight_line()
     return METHODS[method](task.with_winding_of(path.states), path, tol, max_iterations, segments)
@@ -94,8 +94,8 @@ def start_nodes(problem: OptimalControlProblem, path: Path, segments: int) -> tu
 
 
 def default_segments(path: Path) -> int:
-    """About one segment per three points of a lattice path, which is one per 0.6 to 1 m."""
-    return int(np.clip(len(path.times) // 3, 8, 96))
+    """One segment per half second or per two points of a lattice path (0.4 to 0.7 m), whichever is more."""
+    return int(np.clip(max(len(path.times) / 2, path.times[-1] / 0.5), 8, 128))
 
 
 def single_shooting(
