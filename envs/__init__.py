@@ -1,0 +1,18 @@
+"""Gymnasium environments of a two-wheeled robot among obstacles, and the scenarios that they play."""
+
+from leapnav.envs.families import FAMILIES, sample_scenario
+from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario, ScenarioError
+
+__all__ = [
+    "FAMILIES",
+    "Circle",
+    "Cost",
+    "NavigateEnv",
+    "Obstacle",
+    "Polygon",
+    "Robot",
+    "Scenario",
+    "ScenarioError",
+    "sample_scenario",
+]

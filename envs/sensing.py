@@ -73,7 +73,7 @@ def observe(x, y, heading, goal_x, goal_y, goal_heading, time_left, shortest_tim
     cos, sin = math.cos(heading), math.sin(heading)
     dx, dy = goal_x - x, goal_y - y
     ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-    turn = 0.0 if math.isnan(goal_heading) else math.remainder(goal_heading - heading, 2 * math.pi)
+    turn = 0.0 if math.isnan(goal_heading) else (goal_heading - heading + math.pi) % (2 * math.pi) - math.pi
     time = max(time_left, shortest_time)
     out[0] = ahead
     out[1] = left
