@@ -63,8 +63,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
     | `miss` | `-miss_penalty` | the horizon is reached away from the goal |
 
     ## Starting state
-    The scenario's start. The scenario is `options["scenario"]` (a `Scenario` or a dict in the layout of its file), else
-    the argument `scenario`, else a fresh one of the argument `family` drawn from the environment's own generator.
+    The scenario's start. The scenario is `options["scenario"]` (a `Scenario`, a dict in the layout of its file, or its
+    JSON text), else the argument `scenario`, else a fresh one of the argument `family` drawn from the environment's own generator.
 
     ## Episode end
     `terminated` at the horizon, which is part of the task (the time left is observed), or when something is touched
@@ -95,7 +95,7 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
     def __init__(
         self,
         family: str = "clutter",
-        scenario: Scenario | Mapping[str, Any] | None = None,
+        scenario: Scenario | Mapping[str, Any] | str | None = None,
         *,
         control_period: float = 0.05,
         position_tolerance: float = 0.1,
@@ -274,12 +274,14 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
 _NO_REWARD = {"effort": 0.0, "proximity": 0.0, "collision": 0.0, "miss": 0.0}
 
 
-def _as_scenario(value: Scenario | Mapping[str, Any]) -> Scenario:
+def _as_scenario(value: Scenario | Mapping[str, Any] | str) -> Scenario:
     if isinstance(value, Scenario):
         return value
     if isinstance(value, Mapping):
         return Scenario.from_dict(dict(value))
-    raise ScenarioError(f"expected a Scenario or a dict in the layout of its file, got {type(value).__name__}")
+    if isinstance(value, str):  # as datasets store it
+        return Scenario.from_json(value)
+    raise ScenarioError(f"scenario: expected a Scenario, a dict or JSON text, got {type(value).__name__}")
 
 
 @njit(float64(float64, float64, float64, float64, float64, _field), cache=True, error_model="numpy", nogil=True)
