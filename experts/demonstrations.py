@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import count as count_from
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
@@ -172,24 +171,24 @@ def rollout(
     for name, value, least in (("count", count, 1), ("recoveries", recoveries, 0), ("workers", workers, 1), ("seed", seed, 0)):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value!r}")
-    folder = FilePath(out)
+    folder = FilePath(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder}: exists and is not empty; choose another folder or remove it")
     found: list[Demonstration] = []
     solved = unsolved = failed = 0
-    jobs = (delayed(_demonstrations_of_seed)(family, seed + i, recoveries) for i in count_from())
-    results = Parallel(n_jobs=workers, return_as="generator")(jobs)
+    following = seed
+    pool = Parallel(n_jobs=workers, return_as="generator")
     with tqdm(total=count, desc=f"Solving {family}", unit="scenario", disable=not progress) as bar:
-        for demonstrations in results:
-            unsolved += not demonstrations
-            failed += sum(not d.is_success for d in demonstrations)
-            if demonstrations and demonstrations[0].is_success:
-                solved += 1
-                found += [d for d in demonstrations if d.is_success]
-                bar.update()
-            if solved == count:
-                break
-    results.close()
+        while solved < count:  # once, and again for the few that had no certified optimum
+            seeds = range(following, following + count - solved)
+            following = seeds.stop
+            for demonstrations in pool(delayed(_demonstrations_of_seed)(family, s, recoveries) for s in seeds):
+                unsolved += not demonstrations
+                failed += sum(not d.is_success for d in demonstrations)
+                if demonstrations and demonstrations[0].is_success:
+                    solved += 1
+                    found += [d for d in demonstrations if d.is_success]
+                    bar.update()
     write_demonstrations(found, folder, family)
     return RolloutSummary(len(found), unsolved, failed, sum(len(d.actions) for d in found))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -12,7 +13,9 @@ import numpy as np
 from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
-from leapnav.experts.demonstrations import Demonstration
+from leapnav.experts.demonstrations import ENVIRONMENT, Demonstration
+from leapnav.experts.policy import ExpertPolicy
+from leapnav.training.policies import load_policy
 
 RESAMPLES = 2000
 CONFIDENCE = 0.95
@@ -166,3 +169,37 @@ def score(name: str, episodes: Sequence[Episode], seed: int = 0) -> Score:
         regret=interval([e.regret for e in episodes if e.success], np.median),
         mean_return=interval([e.episode_return for e in episodes]),
     )
+
+
+def evaluate(
+    entrants: Sequence[str], references: Sequence[Demonstration], *, seed: int = 0, progress: bool = True
+) -> tuple[list[Score], dict[str, list[Episode]]]:
+    """Plays policies side by side on the same scenarios.
+
+    Args:
+        entrants: folders that `save_policy` wrote, or "expert" (drives the references), or "random".
+        references: the expert's demonstrations of the scenarios.
+        seed: of the random policy and the bootstrap.
+
+    Returns:
+        A score for each entrant, and its episodes by name.
+
+    Raises:
+        FileNotFoundError, ValueError: a policy cannot be loaded, see `load_policy`.
+    """
+    env = gym.make(ENVIRONMENT)
+    # All are loaded before the first is played: a broken file is told at once.
+    policies = {name: _entrant(name, env, references, seed) for name in entrants}
+    episodes = {
+        name: run_episodes(policy, env, references, label=f"Evaluating {Path(name).name}", progress=progress)
+        for name, policy in policies.items()
+    }
+    return [score(name, played, seed) for name, played in episodes.items()], episodes
+
+
+def _entrant(name: str, env: gym.Env, references: Sequence[Demonstration], seed: int) -> Policy:
+    if name == "expert":
+        return ExpertPolicy(env, {reference.scenario: reference.actions for reference in references})
+    if name == "random":
+        return RandomPolicy(env.action_space, seed)
+    return load_policy(name, env)

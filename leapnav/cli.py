@@ -1,0 +1,225 @@
+"""The command line: `leapnav solve | rollout | train | evaluate | demo`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from leapnav.training.config import CloningConfig
+
+FAILED, BAD_INPUT = 1, 2  # exit codes
+DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
+
+
+@dataclass(frozen=True)
+class Solve:
+    """Find the optimum of a scenario, or one extremal with a method of your choice.
+
+    Exit code 0: certified; 1: no certified solution; 2: bad input.
+    """
+
+    scenario: tyro.conf.Positional[Path]
+    """Scenario file (JSON)."""
+    method: Literal["optimum", "leapfrog", "multiple_shooting", "single_shooting"] = "optimum"
+    """"optimum" searches globally; the others solve from the best path of the lattice search."""
+    plot: Path | None = None
+    """Write a picture of the solution (.png, .pdf or .svg)."""
+    json: Path | None = None
+    """Write the solution: cost, certificate, states, controls, costates, history."""
+
+    def run(self) -> int:
+        """Solves and reports."""
+        from leapnav.envs.scenario import Scenario
+        from leapnav.experts import find_optimum, solve
+        from leapnav.experts.plotting import plot_solution
+
+        scenario = Scenario.from_json(self.scenario)
+        for path in (self.plot, self.json):
+            _check_parent(path)
+        extremal = find_optimum(scenario) if self.method == "optimum" else solve(scenario, method=self.method)
+        print(f"{scenario.name}: {extremal.status.name}: {extremal.status.value}")
+        certificate = extremal.certificate
+        if certificate is not None:
+            conjugate = certificate.conjugate_point
+            print(f"  cost               {extremal.cost:.9f}")
+            print(f"  residual           {certificate.residual:.1e}")
+            print(f"  defect             {certificate.defect:.1e}")
+            print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")
+            print(f"  conjugate point    {'none' if conjugate is None else f'{conjugate:.3f} s'}")
+            print(f"  clearance          {certificate.clearance:.3f} m")
+        if self.json is not None:
+            self.json.write_text(extremal.to_json() + "\n")
+            print(f"wrote {self.json}")
+        if self.plot is not None and len(extremal.times):
+            plot_solution(scenario, extremal, self.plot)
+            print(f"wrote {self.plot}")
+        return 0 if extremal.success else FAILED
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Sample scenarios, find their optima, drive them in the environment and write a Minari dataset."""
+
+    out: Path
+    """New folder for the dataset."""
+    family: str = "clutter"
+    """Family of the scenarios: open or clutter."""
+    count: int = 100
+    """How many scenarios."""
+    seed: int = 0
+    """Scenario i has seed SEED + i."""
+    recoveries: int = 0
+    """For each scenario, demonstrations that start from states pushed off its optimum."""
+    workers: int = os.cpu_count() or 1
+    """Processes."""
+
+    def run(self) -> int:
+        """Writes the dataset."""
+        from leapnav.experts.demonstrations import dataset_id, rollout
+
+        summary = rollout(
+            self.family, self.count, self.out, seed=self.seed, recoveries=self.recoveries, workers=self.workers
+        )
+        print(
+            f"wrote {self.out}: {summary.demonstrations} demonstrations, {summary.steps} steps "
+            f"({summary.unsolved} scenarios without a certified optimum, {summary.failed_replays} failed replays left out)"
+        )
+        print(f"MINARI_DATASETS_PATH={self.out} python -c \"import minari; minari.load_dataset('{dataset_id(self.family)}')\"")
+        return 0
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy on demonstrations. "bc": behaviour cloning."""
+
+    algorithm: tyro.conf.Positional[Literal["bc"]]
+    """Learning algorithm."""
+    demos: Path
+    """Folder that `leapnav rollout` wrote."""
+    out: Path
+    """New folder for the policy."""
+    cloning: Annotated[CloningConfig, tyro.conf.arg(name="")] = field(default_factory=CloningConfig)
+    """Settings of the fit."""
+
+    def run(self) -> int:
+        """Trains and saves."""
+        import gymnasium as gym
+
+        from leapnav.experts.demonstrations import load_demonstrations
+        from leapnav.training.cloning import behaviour_clone
+        from leapnav.training.policies import make_policy, save_policy
+
+        if self.out.exists():
+            raise FileExistsError(f"{self.out}: exists; choose another folder or remove it")
+        demonstrations = load_demonstrations(self.demos)
+        env = gym.make("leapnav/Navigate-v0")
+        policy = make_policy(env.observation_space, env.action_space, seed=self.cloning.seed)
+        losses = behaviour_clone(policy, demonstrations, self.cloning)
+        save_policy(policy, self.out, {"id": "leapnav/Navigate-v0"})
+        print(f"wrote {self.out}: validation loss {losses[-1].validation:.4f} after {len(losses)} epochs")
+        return 0
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score policies against the optimum, on scenarios that they have never seen."""
+
+    policies: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of policies, or "expert", or "random"."""
+    references: Path | None = None
+    """Demonstrations of the test scenarios (from `leapnav rollout`); without it, --count scenarios are solved first."""
+    family: str = "clutter"
+    """Family of the scenarios."""
+    count: int = 200
+    """How many scenarios."""
+    seed: int = 1_000_000
+    """Scenario i has seed SEED + i. Keep it away from the training's."""
+    workers: int = os.cpu_count() or 1
+    """Processes that solve the scenarios."""
+    json: Path | None = None
+    """Write the table and every episode."""
+    plot: Path | None = None
+    """Write a picture of the first policy's first episodes."""
+
+    def run(self) -> int:
+        """Plays and reports."""
+        from tempfile import TemporaryDirectory
+
+        from leapnav.experts.demonstrations import load_demonstrations, rollout
+        from leapnav.training.evaluation import evaluate
+        from leapnav.training.reports import plot_gallery, print_scores, write_scores
+
+        if not self.policies:
+            raise ValueError("policies: name at least one folder, or expert, or random")
+        for path in (self.plot, self.json):
+            _check_parent(path)
+        for name in self.policies:  # before minutes are spent on the references
+            if name not in ("expert", "random") and not (Path(name) / "policy.json").is_file():
+                raise FileNotFoundError(f"policies: {name}: no policy.json there; expected a policy's folder, expert or random")
+        if self.references is not None:
+            references = load_demonstrations(self.references)
+        else:
+            with TemporaryDirectory() as scratch:
+                folder = Path(scratch) / "references"
+                rollout(self.family, self.count, folder, seed=self.seed, workers=self.workers)
+                references = load_demonstrations(folder)
+        scores, episodes = evaluate(self.policies, references)
+        print_scores(scores)
+        if self.json is not None:
+            write_scores(scores, episodes, self.json)
+            print(f"wrote {self.json}")
+        if self.plot is not None:
+            plot_gallery(references[:8], episodes[self.policies[0]][:8], self.plot)
+            print(f"wrote {self.plot}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The whole way on clutter scenarios: optima, demonstrations, a clone, and its score against the optimum."""
+
+    out: Path = Path("runs/demo")
+    """Folder of the results; what is there already is used again."""
+
+    def run(self) -> int:
+        """Runs the demo."""
+        from leapnav.demo import run_demo
+
+        run_demo(self.out)
+        return 0
+
+
+COMMANDS = {
+    "solve": Solve,
+    "rollout": Rollout,
+    "train": Train,
+    "evaluate": Evaluate,
+    "demo": Demo,
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs a command and returns its exit code; bad input is one line on standard error and exit code 2."""
+    command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="leapnav", description=DESCRIPTION, args=arguments)
+    try:
+        return command.run()
+    except (ValueError, OSError) as error:
+        print(f"leapnav: {_message(error)}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def _check_parent(path: Path | None) -> None:
+    """Output into a folder that does not exist is told before the work, not after."""
+    if path is not None and not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: its folder does not exist")
