@@ -29,7 +29,9 @@ def _open(rng: np.random.Generator) -> list[Obstacle]:
 def _clutter(rng: np.random.Generator) -> list[Obstacle]:
     """6 to 12 discs of 0.3 to 1 m, which may overlap."""
     return [
-        Obstacle(circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=round(float(rng.uniform(0.3, 1.0)), DECIMALS)))
+        Obstacle(
+            circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=round(float(rng.uniform(0.3, 1.0)), DECIMALS))
+        )
         for _ in range(rng.integers(6, 13))
     ]
 
@@ -49,6 +51,7 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
 
     Raises:
         ValueError: the family is unknown.
+
     """
     if family not in FAMILIES:
         raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
@@ -57,12 +60,9 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     robot, cost = Robot(), Cost()
     while True:  # a third of the draws has no path; each draw is independent, so this ends
         obstacles = FAMILIES[family](rng)
-        shapes = [
-            (o.circle.center, o.circle.radius) if o.circle is not None else np.asarray(o.polygon.vertices)
-            for o in obstacles
-            if o.circle is not None or o.polygon is not None
-        ]
-        field = pack_field(shapes, ARENA, robot.radius, cost.proximity_weight, cost.proximity_scale)
+        field = pack_field(
+            [obstacle.shape for obstacle in obstacles], ARENA, robot.radius, cost.proximity_weight, cost.proximity_scale
+        )
         poses = np.column_stack([rng.uniform(0.5, 9.5, (2, 2)), rng.uniform(-math.pi, math.pi, 2)])
         if math.dist(poses[0, :2], poses[1, :2]) < SHORTEST_TASK or clearances(poses, field).min() < POSE_CLEARANCE:
             continue
@@ -71,8 +71,14 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
             break
     start, goal = ((*_point(pose), round(float(pose[2]), DECIMALS)) for pose in poses)
     return Scenario(
-        name=name, arena=ARENA, robot=robot, start=start, goal=goal, horizon=round(length / PACE, 1),
-        obstacles=tuple(obstacles), cost=cost,
+        name=name,
+        arena=ARENA,
+        robot=robot,
+        start=start,
+        goal=goal,
+        horizon=round(length / PACE, 1),
+        obstacles=tuple(obstacles),
+        cost=cost,
     )
 
 
@@ -81,7 +87,7 @@ def _point(values: np.ndarray) -> tuple[float, float]:
 
 
 def _grid_edges() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points of the grid, and its edges to the eight neighbours and the eight knight's moves (heads, tails, lengths)."""
+    """The grid's points, and its edges to neighbours and by knight's moves (heads, tails, lengths)."""
     steps = np.arange(ARENA[0] + GRID, ARENA[2], GRID)
     n = len(steps)
     points = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -64,7 +64,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Starting state
     The scenario's start. The scenario is `options["scenario"]` (a `Scenario`, a dict in the layout of its file, or its
-    JSON text), else the argument `scenario`, else a fresh one of the argument `family` drawn from the environment's own generator.
+    JSON text), else the argument `scenario`, else a fresh one of the argument `family` drawn from the environment's
+    own generator.
 
     ## Episode end
     `terminated` at the horizon, which is part of the task (the time left is observed), or when something is touched
@@ -90,7 +91,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
     * v0: initial version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    # Gymnasium declares it without ClassVar.
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -158,6 +160,7 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ScenarioError: the scenario is not a valid one.
             ValueError: an unknown option.
+
         """
         super().reset(seed=seed)
         unknown = set(options or {}) - {"scenario"}
@@ -255,7 +258,14 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         observation = np.empty(POSE_ENTRIES + self.lidar_beams, np.float32)
         left = self.scenario.horizon - self.time
         observe(
-            *self._pose, *self._goal, left, self.control_period, FASTEST, self.scenario.field, self.lidar_range, observation
+            *self._pose,
+            *self._goal,
+            left,
+            self.control_period,
+            FASTEST,
+            self.scenario.field,
+            self.lidar_range,
+            observation,
         )
         return np.clip(observation, self._low, self._high, out=observation)
 

@@ -33,17 +33,17 @@ def pack_field(
     weight: float,
     scale: float,
 ) -> np.ndarray:
-    """Packs circles `(center, radius)` and polygons (array `(m, 2)`) into the flat array that the kernels read."""
+    """Packs shapes (with `center` and `radius`, or with `vertices`) into the flat array that the kernels read."""
     circles: list[float] = []
     polygons: list[float] = []
     circle_numbers: list[int] = []
     polygon_numbers: list[int] = []
     for number, shape in enumerate(shapes):
-        if isinstance(shape, tuple):
-            circles += [*shape[0], shape[1]]
+        if hasattr(shape, "radius"):
+            circles += [*shape.center, shape.radius]
             circle_numbers.append(number)
         else:
-            polygons += _pack_polygon(np.asarray(shape, dtype=float))
+            polygons += _pack_polygon(np.asarray(shape.vertices, dtype=float))
             polygon_numbers.append(number)
     header = [weight, scale, radius, len(circle_numbers), len(polygon_numbers), *arena]
     field = np.array(header + circles + polygons + circle_numbers + polygon_numbers, dtype=np.float64)

@@ -16,7 +16,7 @@ CONTACT_SUBSTEPS = 20
 
 
 class World:
-    """One episode's physics. A fresh Space each time: one that is re-used is not bit for bit the same after contacts."""
+    """One episode's physics, in a Space of its own: one that is re-used differs in the last bits after contacts."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._field = scenario.field
@@ -34,8 +34,10 @@ class World:
         x_min, y_min, x_max, y_max = scenario.arena
         t = WALL_THICKNESS
         for left, below, right, above in (
-            (x_min - t, y_min - t, x_min, y_max + t), (x_max, y_min - t, x_max + t, y_max + t),
-            (x_min - t, y_min - t, x_max + t, y_min), (x_min - t, y_max, x_max + t, y_max + t),
+            (x_min - t, y_min - t, x_min, y_max + t),
+            (x_max, y_min - t, x_max + t, y_max + t),
+            (x_min - t, y_min - t, x_max + t, y_min),
+            (x_min - t, y_max, x_max + t, y_max + t),
         ):
             self.space.add(pymunk.Poly(static, [(left, below), (right, below), (right, above), (left, above)]))
         radius = scenario.robot.radius

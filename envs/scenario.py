@@ -90,6 +90,13 @@ class Obstacle(_Frozen):
             raise ValueError("an obstacle is exactly one of 'circle' or 'polygon'")
         return self
 
+    @property
+    def shape(self) -> Circle | Polygon:
+        """The circle or the polygon."""
+        shape = self.circle or self.polygon
+        assert shape is not None  # validated
+        return shape
+
 
 class Scenario(_Frozen):
     """One navigation task. Immutable; equal scenarios have equal fields.
@@ -106,6 +113,7 @@ class Scenario(_Frozen):
 
     Raises:
         ScenarioError: a field is missing, unknown, not finite or impossible (one line: field and value).
+
     """
 
     name: str = "scenario"
@@ -145,12 +153,8 @@ class Scenario(_Frozen):
     @cached_property
     def field(self) -> np.ndarray:
         """The obstacle field packed for the kernels of `leapnav.envs.obstacles` (read-only)."""
-        shapes = [
-            (o.circle.center, o.circle.radius) if o.circle is not None else np.asarray(o.polygon.vertices)
-            for o in self.obstacles
-            if o.circle is not None or o.polygon is not None
-        ]
         cost = self.cost
+        shapes = [obstacle.shape for obstacle in self.obstacles]
         return pack_field(shapes, self.arena, self.robot.radius, cost.proximity_weight, cost.proximity_scale)
 
     def __eq__(self, other: object) -> bool:
@@ -180,6 +184,7 @@ class Scenario(_Frozen):
 
         Raises:
             ScenarioError: see the class.
+
         """
         if not isinstance(fields, dict):
             raise ScenarioError(f"a scenario is a JSON object, got {_shorten(fields)}")
@@ -192,6 +197,7 @@ class Scenario(_Frozen):
         Raises:
             ScenarioError: the text is not JSON, or see the class.
             OSError: the file cannot be read.
+
         """
         is_text = isinstance(path_or_text, str) and path_or_text.lstrip().startswith("{")
         source, text = ("text", str(path_or_text)) if is_text else (str(path_or_text), None)

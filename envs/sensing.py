@@ -60,7 +60,9 @@ def cast_ray(x, y, dx, dy, field, reach):
 
 
 @njit(
-    types.none(float64, float64, float64, float64, float64, float64, float64, float64, float64, _field, float64, float32[::1]),
+    types.none(
+        float64, float64, float64, float64, float64, float64, float64, float64, float64, _field, float64, float32[::1]
+    ),
     cache=True,
     error_model="numpy",
     nogil=True,

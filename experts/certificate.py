@@ -136,6 +136,7 @@ def certify(
         times: (K,) from 0 to the horizon.
         nodes: (K, 2n), q and lambda.
         converged: the solver's own verdict. Anything but SUCCESS stays; SUCCESS has to be confirmed here.
+
     """
     arrays = problem.arrays
     n = problem.system.n
@@ -198,5 +199,18 @@ def failure(
     n, m = problem.system.n, problem.system.m
     empty, none = np.empty((0, n)), np.empty((0, 2 * n))
     return Extremal(
-        problem, status, np.inf, np.empty(0), empty, np.empty((0, m)), empty, np.empty(0), none, none, history, None, 0, work
+        problem,
+        status,
+        np.inf,
+        np.empty(0),
+        empty,
+        np.empty((0, m)),
+        empty,
+        np.empty(0),
+        none,
+        none,
+        history,
+        None,
+        0,
+        work,
     )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 import gymnasium as gym
 import minari
@@ -102,7 +103,9 @@ def demonstrate(env: gym.Env, scenario: Scenario, extremal: Extremal) -> Demonst
     )
 
 
-def recovery(scenario: Scenario, extremal: Extremal, rng: np.random.Generator, name: str) -> tuple[Scenario, Extremal] | None:
+def recovery(
+    scenario: Scenario, extremal: Extremal, rng: np.random.Generator, name: str
+) -> tuple[Scenario, Extremal] | None:
     """The optimum from a state pushed off another optimum, re-solved from there; None if that is not possible."""
     pushed_at = rng.uniform(0.0, max(scenario.horizon - LAST_PUSH, 0.0))
     push = rng.normal(size=3) * PUSH
@@ -110,8 +113,14 @@ def recovery(scenario: Scenario, extremal: Extremal, rng: np.random.Generator, n
     if clearance(state[0], state[1], scenario.field)[0] < PUSH_CLEARANCE or pushed_at == 0.0:
         return None
     task = Scenario(
-        name=name, arena=scenario.arena, robot=scenario.robot, start=tuple(state.tolist()), goal=scenario.goal,
-        horizon=float(scenario.horizon - pushed_at), obstacles=scenario.obstacles, cost=scenario.cost,
+        name=name,
+        arena=scenario.arena,
+        robot=scenario.robot,
+        start=tuple(state.tolist()),
+        goal=scenario.goal,
+        horizon=float(scenario.horizon - pushed_at),
+        obstacles=scenario.obstacles,
+        cost=scenario.cost,
     )
     times = np.concatenate([[0.0], extremal.times[extremal.times > pushed_at + 1e-6] - pushed_at])
     states, _, costates = extremal.evaluate(times + pushed_at)
@@ -165,10 +174,16 @@ def rollout(
     Raises:
         ValueError: an argument is impossible.
         FileExistsError: `out` holds something already.
+
     """
     if family not in FAMILIES:
         raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
-    for name, value, least in (("count", count, 1), ("recoveries", recoveries, 0), ("workers", workers, 1), ("seed", seed, 0)):
+    for name, value, least in (
+        ("count", count, 1),
+        ("recoveries", recoveries, 0),
+        ("workers", workers, 1),
+        ("seed", seed, 0),
+    ):
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value!r}")
     folder = FilePath(out).absolute()
@@ -182,7 +197,8 @@ def rollout(
         while solved < count:  # once, and again for the few that had no certified optimum
             seeds = range(following, following + count - solved)
             following = seeds.stop
-            for demonstrations in pool(delayed(_demonstrations_of_seed)(family, s, recoveries) for s in seeds):
+            results = pool(delayed(_demonstrations_of_seed)(family, s, recoveries) for s in seeds)
+            for demonstrations in cast(Iterator[list[Demonstration]], results):
                 unsolved += not demonstrations
                 failed += sum(not d.is_success for d in demonstrations)
                 if demonstrations and demonstrations[0].is_success:
@@ -207,8 +223,9 @@ def write_demonstrations(demonstrations: Sequence[Demonstration], folder: FilePa
             EpisodeBuffer(
                 id=number,
                 options={"scenario": demonstration.scenario.to_json()},
-                observations=demonstration.observations,
-                actions=demonstration.actions,
+                # Minari declares lists, and takes arrays as well.
+                observations=cast(list[Any], demonstration.observations),
+                actions=cast(list[Any], demonstration.actions),
                 rewards=demonstration.rewards.tolist(),
                 terminations=terminations.tolist(),
                 truncations=[False] * steps,
@@ -233,8 +250,8 @@ def write_demonstrations(demonstrations: Sequence[Demonstration], folder: FilePa
             author="leapnav",
             author_email="",
             code_permalink="",
-            description="Certified optima driven in the environment. Infos: state (x, y, heading), costate, cost_to_go, "
-            "running_cost; the episode's scenario is options['scenario'] as JSON.",
+            description="Certified optima driven in the environment. Infos: state (x, y, heading), "
+            "costate, cost_to_go, running_cost; the episode's scenario is options['scenario'] as JSON.",
             requirements=[f"leapnav=={leapnav.__version__}"],
         )
         if folder.is_dir():
@@ -269,6 +286,7 @@ def open_dataset(folder: str | os.PathLike[str]) -> minari.MinariDataset:
 
     Raises:
         FileNotFoundError: there is none, or more than one.
+
     """
     found = sorted(path.parent for path in FilePath(folder).glob("**/data/metadata.json"))
     if len(found) != 1:
@@ -282,15 +300,20 @@ def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
     Raises:
         FileNotFoundError: see `open_dataset`.
         ValueError: the dataset holds something else; the message names what is missing.
+
     """
     dataset = open_dataset(folder)
     demonstrations = []
-    for episode, metadata in zip(dataset.iterate_episodes(), dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True):
+    for episode, metadata in zip(
+        dataset.iterate_episodes(), dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True
+    ):
         infos = episode.infos or {}
         missing = sorted({"state", "costate", "cost_to_go", "running_cost"} - set(infos))
         text = (metadata.get("options") or {}).get("scenario")
         if missing or text is None:
-            raise ValueError(f"{os.fspath(folder)}: episode {episode.id} has no {missing[0] if missing else 'scenario'}")
+            raise ValueError(
+                f"{os.fspath(folder)}: episode {episode.id} has no {missing[0] if missing else 'scenario'}"
+            )
         demonstrations.append(
             Demonstration(
                 scenario=Scenario.from_json(str(text)),

@@ -36,6 +36,7 @@ class Certificate:
         hamiltonian_drift: largest minus smallest H along the extremal (H is constant on an extremal).
         conjugate_point: first time (s) before the horizon at which dq(t)/dlambda(0) loses rank; None: a local minimum.
         clearance: smallest distance (m) to an obstacle or wall on the dense path; None without obstacles.
+
     """
 
     residual: float
@@ -81,6 +82,7 @@ class Extremal:
         certificate: see `Certificate`; None if the solver returned no path.
         nodes: how many nodes the solver used.
         work: integration steps taken by the solver.
+
     """
 
     problem: OptimalControlProblem
@@ -115,7 +117,9 @@ class Extremal:
         h = (self.times[k + 1] - self.times[k])[:, None]
         s = (times - self.times[k])[:, None] / h
         z = np.concatenate([self.states, self.costates], axis=1)
-        values = _quintic(s, h, z[k], self.rates[k], self.curvatures[k], z[k + 1], self.rates[k + 1], self.curvatures[k + 1])
+        values = _quintic(
+            s, h, z[k], self.rates[k], self.curvatures[k], z[k + 1], self.rates[k + 1], self.curvatures[k + 1]
+        )
         arrays = self.problem.arrays
         controls = np.empty((len(times), self.problem.system.m))
         for row, value in zip(controls, values, strict=True):
@@ -139,7 +143,9 @@ class Extremal:
             "states": self.states.tolist(),
             "controls": self.controls.tolist(),
             "costates": self.costates.tolist(),
-            "history": [{**asdict(row), "residual": _number(row.residual), "cost": _number(row.cost)} for row in self.history],
+            "history": [
+                {**asdict(row), "residual": _number(row.residual), "cost": _number(row.cost)} for row in self.history
+            ],
         }
 
     def to_json(self) -> str:

@@ -81,9 +81,7 @@ def propagate(flow, z, S, duration, data, field, tolerance, first_step, once):
         for i in range(size):
             zt[i] = z[i] + h * (A51 * K[0, i] + A52 * K[1, i] + A53 * K[2, i] + A54 * K[3, i])
             for c in range(columns):
-                St[i, c] = S[i, c] + h * (
-                    A51 * KS[0, i, c] + A52 * KS[1, i, c] + A53 * KS[2, i, c] + A54 * KS[3, i, c]
-                )
+                St[i, c] = S[i, c] + h * (A51 * KS[0, i, c] + A52 * KS[1, i, c] + A53 * KS[2, i, c] + A54 * KS[3, i, c])
         L5 = flow(zt, data, field, St, K[4], KS[4])
         for i in range(size):
             zt[i] = z[i] + h * (A61 * K[0, i] + A62 * K[1, i] + A63 * K[2, i] + A64 * K[3, i] + A65 * K[4, i])

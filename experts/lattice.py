@@ -22,11 +22,9 @@ from leapnav.envs.scenario import Scenario
 from leapnav.experts.integrator import constant, matrix, vector
 
 # 16 headings whose directions are exact lattice vectors, so a straight move never drifts off its line.
-DIRECTIONS = np.array(
-    [(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)]
-    + [(-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)],
-    dtype=np.int64,
-)
+_QUADRANT = np.array([(1, 0), (2, 1), (1, 1), (1, 2)], dtype=np.int64)
+_QUARTER_TURN = np.array([(0, 1), (-1, 0)], dtype=np.int64)
+DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
 ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
 HEADINGS = len(ANGLES)
 CELL = 0.2  # m; half of it is the resolution at which obstacles are seen
@@ -34,6 +32,8 @@ MOST_CELLS = 150  # per side; larger arenas get larger cells
 # How far (m) a lattice point may lie inside an obstacle: a gap that the robot just passes can lie between two points.
 TOLERATED_DEPTH = 0.1
 MOVES = 12  # per node, see `_move`
+ENERGY_CORRECTIONS, ENERGY_TOLERANCE = 2, 0.3  # the latter of log E: the order of candidates hardly depends on it
+Pose = tuple[float, float, float | None]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,9 @@ def _sample_field(field, x0, y0, spacing, columns, rows):
 
 
 @njit(
-    types.Tuple((vector, int32[::1]))(matrix, matrix, int64[::1], vector, int64[::1], float64, float64, float64, float64),
+    types.Tuple((vector, int32[::1]))(
+        matrix, matrix, int64[::1], vector, int64[::1], float64, float64, float64, float64
+    ),
     cache=True,
     error_model="numpy",
     nogil=True,
@@ -99,9 +101,7 @@ def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_
             dx, dy, change, _ = _move(k, number)
             turn = abs(ANGLES[(k + change) % HEADINGS] - ANGLES[k])
             turn = min(turn, 2 * math.pi - turn)
-            lengths[k, number] = math.sqrt(
-                speed_weight * (dx * dx + dy * dy) * cell * cell + turn_weight * turn * turn
-            )
+            lengths[k, number] = math.sqrt(speed_weight * (dx * dx + dy * dy) * cell * cell + turn_weight * turn * turn)
     queue = [(0.0, 0)]
     queue.pop()
     for k in range(len(seeds)):
@@ -207,22 +207,17 @@ class Lattice:
 
     def candidates(self) -> Iterator[Candidate]:
         """Distinct paths, cheapest first; none if the goal cannot be reached."""
-        scenario = self.scenario
-        weights = scenario.cost.speed_weight, scenario.cost.turn_weight
-        for _ in range(3):
-            speed = np.sqrt(2.0 * (self.energy + self.phi))
-            from_start = self._seeds(*scenario.start, speed)
-            from_goal = self._seeds(*scenario.goal, speed)
-            args = (self.cell, *weights, self.REACH)
-            ahead, ahead_parent = _dijkstra(speed, self.free, *from_start, from_goal[0], *args)
-            at_goal = ahead[from_goal[0]] + from_goal[1]
-            if not np.isfinite(at_goal).any():
+        no_parent = np.full(self.shape[0] * self.shape[1] * HEADINGS, -1, dtype=np.int32)
+        ahead, parents_ahead, at_goal = self._tree(self.scenario.start, self.scenario.goal)
+        for _ in range(ENERGY_CORRECTIONS):
+            if at_goal is None:
                 return
-            best = self._path(ahead_parent, np.full_like(ahead_parent, -1), int(from_goal[0][np.argmin(at_goal)]))
-            old, self.energy = self.energy, self._energy(best)
-            if abs(math.log(self.energy / old)) < 0.3:
+            energy = self._energy(self._path(parents_ahead, no_parent, at_goal))
+            if abs(math.log(energy / self.energy)) < ENERGY_TOLERANCE:
                 break
-        behind, behind_parent = _dijkstra(speed, self.free, *from_goal, from_start[0], *args)
+            self.energy = energy
+            ahead, parents_ahead, at_goal = self._tree(self.scenario.start, self.scenario.goal)
+        behind, parents_behind, _ = self._tree(self.scenario.goal, self.scenario.start)
         through = ahead + behind
         order = np.argsort(through)
         order = order[: np.searchsorted(through[order], self.REACH * through[order[0]])]
@@ -231,10 +226,23 @@ class Lattice:
         for node in order:
             if flat[node]:
                 continue
-            path = self._path(ahead_parent, behind_parent, int(node))
+            path = self._path(parents_ahead, parents_behind, int(node))
             for i, j, k in path[0]:
                 _mark(taken, i, j, k, self.SAME_CELLS, self.SAME_HEADINGS)
             yield self._candidate(path, float(through[node]))
+
+    def _tree(self, root: Pose, target: Pose) -> tuple[np.ndarray, np.ndarray, int | None]:
+        """Cost and predecessor of every node from one pose out, and the best node at the other (None: unreached)."""
+        cost = self.scenario.cost
+        speed = np.sqrt(2.0 * (self.energy + self.phi))
+        seeds, seed_costs = self._seeds(*root, speed)
+        ends, end_costs = self._seeds(*target, speed)
+        costs, parents = _dijkstra(
+            speed, self.free, seeds, seed_costs, ends, self.cell, cost.speed_weight, cost.turn_weight, self.REACH
+        )
+        totals = costs[ends] + end_costs
+        best = int(np.argmin(totals))
+        return costs, parents, int(ends[best]) if np.isfinite(totals[best]) else None
 
     def _path(self, ahead: np.ndarray, behind: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
         """The path through a node: lattice indices (N, 3) and poses (N + 2, 3) from start to goal."""

@@ -2,8 +2,8 @@
 
 J. L. Noakes, A global algorithm for geodesics, J. Austral. Math. Soc. A 65 (1998); C. Y. Kaya and J. L. Noakes,
 Leapfrog for optimal control, SIAM J. Numer. Anal. 46 (2008). Nodes z_0..z_p stand on a feasible path at times
-t_0..t_p. A sweep goes through i = 1..p-1, solves the sub-problem from node i-1 to node i+1 by simple shooting, and moves
-node i onto the sub-problem's extremal: at half its cost, or at the mean time. The path stays feasible, meets both
+t_0..t_p. A sweep goes through i = 1..p-1, solves the sub-problem from node i-1 to node i+1 by simple shooting, and
+moves node i onto the sub-problem's extremal: at half its cost, or at the mean time. The path stays feasible, meets both
 boundary conditions, and its cost never rises: a move that would raise it is rejected. Costates need no guess: they
 come from the chord between two nodes, and later from the last sweep.
 """
@@ -21,9 +21,7 @@ SUBPROBLEM_ITERATIONS = 12
 
 
 @njit(
-    types.Tuple((int64, int64))(
-        FLOW, vector, matrix, vector, flags, constant, constant, float64, float64, vector
-    ),
+    types.Tuple((int64, int64))(FLOW, vector, matrix, vector, flags, constant, constant, float64, float64, vector),
     cache=True,
     error_model="numpy",
     nogil=True,
@@ -42,8 +40,17 @@ def connect(flow, times, Z, goal, free, data, field, tolerance, accuracy, costs)
         z = Z[k].copy()
         # Only at the horizon may a component be free.
         status, _, _, cost, steps = shoot(
-            flow, z, Z[k + 1, :n].copy(), end, free if k == p - 1 else fixed, times[k + 1] - times[k], data, field,
-            tolerance, accuracy, SUBPROBLEM_ITERATIONS,
+            flow,
+            z,
+            Z[k + 1, :n].copy(),
+            end,
+            free if k == p - 1 else fixed,
+            times[k + 1] - times[k],
+            data,
+            field,
+            tolerance,
+            accuracy,
+            SUBPROBLEM_ITERATIONS,
         )
         work += steps
         costs[k] = np.inf
@@ -81,8 +88,17 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
         z = Z[i - 1].copy()
         duration = times[i + 1] - times[i - 1]
         status, _, _, cost, steps = shoot(
-            flow, z, Z[i + 1, :n].copy(), end, free if i == p - 1 else fixed, duration, data, field,
-            tolerance, accuracy, SUBPROBLEM_ITERATIONS,
+            flow,
+            z,
+            Z[i + 1, :n].copy(),
+            end,
+            free if i == p - 1 else fixed,
+            duration,
+            data,
+            field,
+            tolerance,
+            accuracy,
+            SUBPROBLEM_ITERATIONS,
         )
         work += steps
         before = costs[i - 1] + costs[i]
@@ -93,6 +109,7 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
         middle = z.copy()
         if half_cost:
             reached, elapsed, step, target = 0.0, 0.0, duration / 16.0, cost / 2.0
+            part, taken = 0.0, 0.0
             here = middle.copy()
             while elapsed < duration:
                 part, taken, following, steps = propagate(

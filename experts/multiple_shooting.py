@@ -21,7 +21,7 @@ flags = types.Array(boolean, 1, "C")
     nogil=True,
 )
 def _residual(flow, times, Z, start, goal, free, data, field, accuracy, rows, rhs, costs, steps_hint):
-    """Fills the Newton system at Z: boundary rows, then n end rows. Returns (norm^2, largest, work), norm inf if diverged.
+    """Fills the Newton system at Z and returns (norm^2, largest residual, work); the norm is infinite if it diverged.
 
     Row order: n start conditions, 2n continuity conditions per segment, n end conditions; the band's half-width is
     then 3n - 1 with the unknowns in order of time.

@@ -57,6 +57,7 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
 
     Raises:
         ValueError: candidates < 1.
+
     """
     if candidates < 1:
         raise ValueError(f"candidates: expected at least 1, got {candidates!r}")

@@ -50,6 +50,7 @@ def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLik
 
     Raises:
         ValueError: the extremal has no path, or the file's ending is no picture format.
+
     """
     if len(extremal.times) == 0:
         raise ValueError(f"there is no path to draw: {extremal.status.value}")

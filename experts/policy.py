@@ -38,6 +38,7 @@ class ExpertPolicy:
     Args:
         env: the (wrapped) environment that the actions are for; the scenario and the time are read from it.
         plans: actions (K, 2) of scenarios whose optimum is known already; others are solved at their first step.
+
     """
 
     def __init__(self, env: gym.Env[Any, Any], plans: Mapping[Scenario, np.ndarray] | None = None) -> None:
@@ -57,6 +58,7 @@ class ExpertPolicy:
 
         Raises:
             NoOptimumError: the scenario has no certified optimum.
+
         """
         scenario = self._env.scenario
         if scenario not in self._plans:

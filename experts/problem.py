@@ -47,6 +47,7 @@ class OptimalControlProblem:
 
     Raises:
         ValueError: a length or a value is impossible; the message names the argument and the value.
+
     """
 
     system: ControlAffineSystem
@@ -61,11 +62,13 @@ class OptimalControlProblem:
     def __post_init__(self) -> None:
         n, m = self.system.n, self.system.m
         for name, values, length in (
-            ("start", self.start, n), ("goal", self.goal, n), ("control_weight", self.control_weight, m)
+            ("start", self.start, n),
+            ("goal", self.goal, n),
+            ("control_weight", self.control_weight, m),
         ):
             if len(values) != length:
                 raise ValueError(f"{name}: expected {length} numbers, got {len(values)}: {values!r}")
-            if not all(v is None and name == "goal" or v is not None and math.isfinite(v) for v in values):
+            if not all((v is None and name == "goal") or (v is not None and math.isfinite(v)) for v in values):
                 raise ValueError(f"{name}: expected finite numbers, got {values!r}")
         if not all(w > 0 for w in self.control_weight):
             raise ValueError(f"control_weight: expected positive numbers, got {self.control_weight!r}")
@@ -79,7 +82,9 @@ class OptimalControlProblem:
                     raise ValueError(f"control_bounds: expected lowest < highest, got ({low!r}, {high!r})")
         unknown = sp.sympify(self.state_cost).free_symbols - set(self.system.state)
         if unknown:
-            raise ValueError(f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}")
+            raise ValueError(
+                f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}"
+            )
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> OptimalControlProblem:
@@ -119,7 +124,9 @@ class OptimalControlProblem:
     def arrays(self) -> ProblemArrays:
         """The problem as the arrays that the kernels take."""
         m = self.system.m
-        bounds = np.array(self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float)
+        bounds = np.array(
+            self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
+        )
         return ProblemArrays(
             flow=self.module.flow,
             control=self.module.control,

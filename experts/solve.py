@@ -55,6 +55,7 @@ def solve(
 
     Raises:
         ValueError: an argument is impossible; the message names it.
+
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
@@ -106,8 +107,17 @@ def single_shooting(
     _, nodes = start_nodes(problem, path, segments or default_segments(path))
     z, end = nodes[0].copy(), nodes[0].copy()
     code, iterations, residual, cost, work = single_shooting_kernels.shoot(
-        arrays.flow, z, arrays.goal, end, arrays.free, problem.horizon, arrays.data, arrays.field,
-        tol, tol * ACCURACY, max_iterations,
+        arrays.flow,
+        z,
+        arrays.goal,
+        end,
+        arrays.free,
+        problem.horizon,
+        arrays.data,
+        arrays.field,
+        tol,
+        tol * ACCURACY,
+        max_iterations,
     )
     history = (Iteration("newton", 1, cost, residual, 0),) * min(iterations, 1)
     times = np.array([0.0, problem.horizon])
@@ -154,8 +164,16 @@ def connect(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray
     arrays = problem.arrays
     costs = np.empty(len(times) - 1)
     leapfrog_kernels.connect(
-        arrays.flow, times, nodes, arrays.goal, arrays.free, arrays.data, arrays.field,
-        SWEEP_TOLERANCE, SWEEP_TOLERANCE, costs,
+        arrays.flow,
+        times,
+        nodes,
+        arrays.goal,
+        arrays.free,
+        arrays.data,
+        arrays.field,
+        SWEEP_TOLERANCE,
+        SWEEP_TOLERANCE,
+        costs,
     )
     return costs
 
@@ -168,8 +186,19 @@ def sweep(
     rows, work = [], 0
     for _ in range(sweeps):
         rejected, steps = leapfrog_kernels.sweep(
-            arrays.flow, times, nodes, arrays.goal, arrays.free, arrays.data, arrays.field,
-            SWEEP_TOLERANCE, SWEEP_TOLERANCE, False, costs, 1, 1,
+            arrays.flow,
+            times,
+            nodes,
+            arrays.goal,
+            arrays.free,
+            arrays.data,
+            arrays.field,
+            SWEEP_TOLERANCE,
+            SWEEP_TOLERANCE,
+            False,
+            costs,
+            1,
+            1,
         )
         rows.append(Iteration("sweep", len(costs), float(costs.sum()), math.nan, rejected))
         work += steps
@@ -184,8 +213,19 @@ def polish(
     costs = np.empty(len(times) - 1)
     log = np.zeros((max_iterations + 1, 3))
     code, iterations, _, work = multiple_shooting_kernels.newton(
-        arrays.flow, times, nodes, arrays.start, arrays.goal, arrays.free, arrays.data, arrays.field,
-        tol, tol * ACCURACY, max_iterations, costs, log,
+        arrays.flow,
+        times,
+        nodes,
+        arrays.start,
+        arrays.goal,
+        arrays.free,
+        arrays.data,
+        arrays.field,
+        tol,
+        tol * ACCURACY,
+        max_iterations,
+        costs,
+        log,
     )
     rows = tuple(Iteration("newton", len(costs), row[1], row[0], 0) for row in log[: iterations + 1].tolist())
     return STATUS[code], rows, work

@@ -47,6 +47,7 @@ class ControlAffineSystem:
 
         >>> x1, x2 = sympy.symbols("x1 x2")
         >>> grushin = ControlAffineSystem(state=(x1, x2), drift=(0, 0), fields=((1, 0), (0, x1)))
+
     """
 
     state: tuple[sp.Symbol, ...]
@@ -80,10 +81,15 @@ class ControlAffineSystem:
             "angles": tuple(angles),
             "position": None if position is None else tuple(position),
         }
-        for where, expressions in [("drift", values["drift"]), *((f"fields[{j}]", c) for j, c in enumerate(values["fields"]))]:
+        for where, expressions in [
+            ("drift", values["drift"]),
+            *((f"fields[{j}]", c) for j, c in enumerate(values["fields"])),
+        ]:
             unknown = set().union(*(e.free_symbols for e in expressions)) - set(state)
             if unknown:
-                raise ValueError(f"{where}: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {tuple(state)}")
+                raise ValueError(
+                    f"{where}: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {tuple(state)}"
+                )
         for where, chosen in (("angles", values["angles"]), ("position", values["position"] or ())):
             if not set(chosen) <= set(state):
                 raise ValueError(f"{where}: {chosen} is not among the state symbols {tuple(state)}")
@@ -161,12 +167,12 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
     slope = sp.symbols(f"slope:{m}", real=True)  # h_j'': 1 / r_j inside the control bounds, 0 beyond
     z = (*q, *lam)
     rename = dict(zip(system.state, q, strict=True))
-    drift = sum((sp.sympify(a).subs(rename) * p for a, p in zip(system.drift, lam, strict=True)), sp.Integer(0))
+    drift = sum((sp.sympify(a).xreplace(rename) * p for a, p in zip(system.drift, lam, strict=True)), sp.Integer(0))
     switching = [
-        sum((sp.sympify(b).subs(rename) * p for b, p in zip(column, lam, strict=True)), sp.Integer(0))
+        sum((sp.sympify(b).xreplace(rename) * p for b, p in zip(column, lam, strict=True)), sp.Integer(0))
         for column in system.fields
     ]
-    cost = sp.sympify(state_cost).subs(rename)
+    cost = sp.sympify(state_cost).xreplace(rename)
 
     value, gradient, hessian = cost, [sp.diff(drift + cost, s) for s in z], {}
     for j in range(m):
@@ -178,6 +184,7 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
                 p = switching[j]
                 entry += u[j] * sp.diff(p, z[a], z[b]) - slope[j] * sp.diff(p, z[a]) * sp.diff(p, z[b])
             hessian[a, b] = hessian[b, a] = entry
+    at: list[int] = []
     if in_field:
         if system.position is None:
             raise ValueError("the system has no position, so it cannot move among obstacles")
@@ -196,21 +203,28 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
             entry = hessian[a + n, b] if a < n else -hessian[a - n, b]
             if entry != 0:
                 jacobian[a, b] = entry
-    return _render(n, m, switching, value, rate, jacobian, system.position and at if in_field else None)
+    return _render(n, m, switching, value, rate, jacobian, at)
 
 
 def _render(
     n: int,
     m: int,
-    switching: list[sp.Expr],
-    value: sp.Expr,
+    switching: Sequence[Any],
+    value: Any,
     rate: list[sp.Expr],
     jacobian: dict[tuple[int, int], sp.Expr],
-    position: list[int] | None,
+    position: list[int],
 ) -> str:
-    names = [*(f"p{j}" for j in range(m)), "value", *(f"rate{i}" for i in range(2 * n)), *(f"A{a}_{b}" for a, b in jacobian)]
-    shared, reduced = sp.cse([*switching, value, *rate, *jacobian.values()], symbols=sp.numbered_symbols("w"), order="none")
-    expressions = dict(zip(names, reduced, strict=True))
+    names = [
+        *(f"p{j}" for j in range(m)),
+        "value",
+        *(f"rate{i}" for i in range(2 * n)),
+        *(f"A{a}_{b}" for a, b in jacobian),
+    ]
+    shared, reduced = sp.cse(
+        [*switching, value, *rate, *jacobian.values()], symbols=sp.numbered_symbols("w"), order="none"
+    )
+    expressions: dict[str, Any] = dict(zip(names, reduced, strict=True))
 
     emitted: set[sp.Symbol] = set()
 
@@ -227,7 +241,10 @@ def _render(
         require(expression)
         return [*lines, f"{indent}{target} = {sp.pycode(expression)}"]
 
-    unpack = ["    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)), "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n))]
+    unpack = [
+        "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
+        "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n)),
+    ]
     controls: list[str] = []
     for j in range(m):
         controls += assign(f"p{j}", expressions[f"p{j}"], "    ")
@@ -239,8 +256,10 @@ def _render(
     control_body = [*controls, *(f"    u[{j}] = u{j}" for j in range(m))]
 
     lines = [*unpack, *controls]
-    if position is not None:
-        lines.append(f"    phi, phi_x, phi_y, phi_xx, phi_xy, phi_yy = proximity(q{position[0]}, q{position[1]}, field)")
+    if position:
+        lines.append(
+            f"    phi, phi_x, phi_y, phi_xx, phi_xy, phi_yy = proximity(q{position[0]}, q{position[1]}, field)"
+        )
     lines += assign("value", expressions["value"], "    ")
     for i in range(2 * n):
         lines += assign(f"dz[{i}]", expressions[f"rate{i}"], "    ")

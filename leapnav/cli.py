@@ -87,9 +87,10 @@ class Rollout:
         )
         print(
             f"wrote {self.out}: {summary.demonstrations} demonstrations, {summary.steps} steps "
-            f"({summary.unsolved} scenarios without a certified optimum, {summary.failed_replays} failed replays left out)"
+            f"({summary.unsolved} scenarios without a certified optimum and "
+            f"{summary.failed_replays} failed replays left out)"
         )
-        print(f"MINARI_DATASETS_PATH={self.out} python -c \"import minari; minari.load_dataset('{dataset_id(self.family)}')\"")
+        print(f"minari.load_dataset({dataset_id(self.family)!r}) reads it with MINARI_DATASETS_PATH={self.out}")
         return 0
 
 
@@ -129,7 +130,7 @@ class Train:
 class Evaluate:
     """Score policies against the optimum, on scenarios that they have never seen."""
 
-    policies: tyro.conf.Positional[tuple[str, ...]]
+    policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...")]
     """Folders of policies, or "expert", or "random"."""
     references: Path | None = None
     """Demonstrations of the test scenarios (from `leapnav rollout`); without it, --count scenarios are solved first."""
@@ -160,7 +161,9 @@ class Evaluate:
             _check_parent(path)
         for name in self.policies:  # before minutes are spent on the references
             if name not in ("expert", "random") and not (Path(name) / "policy.json").is_file():
-                raise FileNotFoundError(f"policies: {name}: no policy.json there; expected a policy's folder, expert or random")
+                raise FileNotFoundError(
+                    f"policies: {name}: no policy.json there; expected a policy's folder, expert or random"
+                )
         if self.references is not None:
             references = load_demonstrations(self.references)
         else:

@@ -36,6 +36,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
 
     Raises:
         ValueError: the folder holds the results of other settings.
+
     """
     settings = settings or DemoSettings()
     out.mkdir(parents=True, exist_ok=True)
@@ -78,4 +79,4 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
         ("scores.json", "the table, and every episode"),
         ("episodes.png", "test scenarios: the optimum dashed, the clone's path in blue, red where it failed"),
     ):
-        console.print(f"  {name:<15} {what}")
+        console.print(f"  {name:<15} {what}", soft_wrap=True)

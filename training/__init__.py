@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from leapnav.training.cloning import EpochLoss, behaviour_clone
     from leapnav.training.config import CloningConfig
-    from leapnav.training.evaluation import Episode, Interval, Policy, RandomPolicy, Score, evaluate, run_episodes, score
+    from leapnav.training.evaluation import (
+        Episode,
+        Interval,
+        Policy,
+        RandomPolicy,
+        Score,
+        evaluate,
+        run_episodes,
+        score,
+    )
     from leapnav.training.policies import NavigationFeatures, load_policy, make_policy, save_policy
 
 __all__ = [

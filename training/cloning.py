@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -42,6 +43,7 @@ def behaviour_clone(
 
     Raises:
         ValueError: there are no demonstrations, or a setting is impossible.
+
     """
     config = config or CloningConfig()
     if not demonstrations:
@@ -90,7 +92,7 @@ def behaviour_clone(
 
 
 def _mean_action(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
-    features = policy.extract_features(observations, policy.pi_features_extractor)
+    features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
     return policy.action_net(policy.mlp_extractor.forward_actor(features))
 
 

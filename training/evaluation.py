@@ -30,7 +30,9 @@ class Policy(Protocol):
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]: ...
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions for observations, and the policy's own state."""
+        ...
 
 
 class RandomPolicy:
@@ -102,7 +104,12 @@ class Score:
 
 
 def run_episodes(
-    policy: Policy, env: gym.Env, references: Sequence[Demonstration], *, label: str = "Evaluating", progress: bool = True
+    policy: Policy,
+    env: gym.Env,
+    references: Sequence[Demonstration],
+    *,
+    label: str = "Evaluating",
+    progress: bool = True,
 ) -> list[Episode]:
     """Plays each reference's scenario once with deterministic actions.
 
@@ -110,6 +117,7 @@ def run_episodes(
         policy: for `ExpertPolicy`, one made for this same `env`.
         env: an environment of `leapnav/Navigate-v0`.
         references: the expert's demonstrations of the scenarios, which carry their optimal costs.
+
     """
     episodes = []
     for reference in tqdm(references, desc=label, unit="episode", disable=not progress):
@@ -143,6 +151,7 @@ def score(name: str, episodes: Sequence[Episode], seed: int = 0) -> Score:
 
     Raises:
         ValueError: there are no episodes.
+
     """
     if not episodes:
         raise ValueError("episodes: expected at least one, got none")
@@ -186,6 +195,7 @@ def evaluate(
 
     Raises:
         FileNotFoundError, ValueError: a policy cannot be loaded, see `load_policy`.
+
     """
     env = gym.make(ENVIRONMENT)
     # All are loaded before the first is played: a broken file is told at once.

@@ -47,13 +47,26 @@ class NavigationFeatures(BaseFeaturesExtractor):
         ranges = observations[:, POSE_ENTRIES:]
         return th.cat(
             [
-                goal / 5, distance / 5, facing, time / 10,
-                needed.clamp(-3, 3), (needed_turn / 2).clamp(-3, 3), th.tanh(needed[:, :2]),
-                goal / (distance + 0.1), th.log(distance + 0.05), th.log(time + 0.05), th.exp(-time),
-                th.tanh(goal / 0.3), th.tanh(error / 0.3), error,
+                goal / 5,
+                distance / 5,
+                facing,
+                time / 10,
+                needed.clamp(-3, 3),
+                (needed_turn / 2).clamp(-3, 3),
+                th.tanh(needed[:, :2]),
+                goal / (distance + 0.1),
+                th.log(distance + 0.05),
+                th.log(time + 0.05),
+                th.exp(-time),
+                th.tanh(goal / 0.3),
+                th.tanh(error / 0.3),
+                error,
                 # Zero where one circular arc ends in the goal pose: its chord halves the turn.
-                th.cos(error - 2 * bearing), th.sin(error - 2 * bearing),
-                ranges / 5, th.exp(-(ranges - ROBOT_RADIUS) / 0.3), ROBOT_RADIUS / ranges.clamp(min=0.1),
+                th.cos(error - 2 * bearing),
+                th.sin(error - 2 * bearing),
+                ranges / 5,
+                th.exp(-(ranges - ROBOT_RADIUS) / 0.3),
+                ROBOT_RADIUS / ranges.clamp(min=0.1),
             ],
             dim=1,
         )
@@ -64,6 +77,7 @@ def make_policy(observation_space: spaces.Space, action_space: spaces.Space, see
 
     Raises:
         ValueError: the spaces are not the environment's.
+
     """
     box = isinstance(observation_space, spaces.Box) and observation_space.shape[0] > POSE_ENTRIES
     if not box or not isinstance(action_space, spaces.Box):
@@ -86,6 +100,7 @@ def save_policy(policy: ActorCriticPolicy, folder: str | Path, environment: dict
 
     Args:
         environment: the arguments of `gym.make` that the policy was trained for.
+
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -110,6 +125,7 @@ def load_policy(folder: str | Path, env: gym.Env | None = None) -> ActorCriticPo
     Raises:
         FileNotFoundError: the folder holds no policy.
         ValueError: the files are broken, of another format or for another observation; the message says which.
+
     """
     folder = Path(folder)
     try:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -23,27 +24,32 @@ POLICY_COLOR, FAILURE_COLOR = "#2662ab", "#c0392b"
 
 def print_scores(scores: Sequence[Score], console: Console | None = None) -> None:
     """The table of policies, each figure with its 95 % bootstrap interval."""
-    table = Table(title=f"{scores[0].episodes} scenarios; brackets: 95 % bootstrap interval")
-    table.add_column("policy")
-    for column in ("success", "collision", "SOC", "median regret", "mean return"):
-        table.add_column(column, justify="right")
+    table = Table(
+        title=f"{scores[0].episodes} scenarios; brackets: 95 % bootstrap interval",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    table.add_column("policy", min_width=6, overflow="fold")
+    for column in ("success\n%", "collision\n%", "SOC\n", "regret\n%, median", "return\nmean"):
+        table.add_column(column, justify="right", no_wrap=True)
     for row in scores:
         table.add_row(
             row.policy,
-            _cell(row.success, 100, " %"),
-            _cell(row.collision, 100, " %"),
-            _cell(row.soc, 1, "", 3),
-            _cell(row.regret, 100, " %", 2),
-            _cell(row.mean_return, 1, "", 2),
+            _cell(row.success, 100, 1, 0),
+            _cell(row.collision, 100, 1, 0),
+            _cell(row.soc, 1, 3, 2),
+            _cell(row.regret, 100, 2, 2),
+            _cell(row.mean_return, 1, 1, 1),
         )
     (console or Console()).print(table)
 
 
-def _cell(interval: Interval, factor: float, unit: str, digits: int = 1) -> str:
+def _cell(interval: Interval, factor: float, digits: int, interval_digits: int) -> str:
     if math.isnan(interval.value):
         return "-"
-    value, low, high = (f"{factor * v:.{digits}f}" for v in (interval.value, interval.low, interval.high))
-    return f"{value}{unit} [{low}, {high}]"
+    low, high = (f"{factor * bound:.{interval_digits}f}" for bound in (interval.low, interval.high))
+    return f"{factor * interval.value:.{digits}f}\n[{low}, {high}]"
 
 
 def write_scores(
@@ -55,8 +61,12 @@ def write_scores(
         "episodes": {
             name: [
                 {
-                    "scenario": e.scenario, "success": e.success, "collision": e.collision, "cost": e.cost,
-                    "return": e.episode_return, "reference_cost": e.reference_cost,
+                    "scenario": e.scenario,
+                    "success": e.success,
+                    "collision": e.collision,
+                    "cost": e.cost,
+                    "return": e.episode_return,
+                    "reference_cost": e.reference_cost,
                     "reached_reference": e.reached_reference,
                 }
                 for e in played
@@ -87,7 +97,11 @@ def plot_gallery(
         draw_scenario(axes, reference.scenario)
         axes.plot(*reference.states[:, :2].T, color=OPTIMUM, linewidth=1.2, linestyle="--")
         axes.plot(*episode.states[:, :2].T, color=POLICY_COLOR if episode.success else FAILURE_COLOR, linewidth=1.8)
-        outcome = f"regret {100 * episode.regret:.1f} %" if episode.success else ("collision" if episode.collision else "missed")
+        outcome = (
+            f"regret {100 * episode.regret:.1f} %"
+            if episode.success
+            else ("collision" if episode.collision else "missed")
+        )
         axes.set_title(f"{episode.scenario}: {outcome}", fontsize=9)
     for axes in grid[len(references) :]:
         axes.set_visible(False)
