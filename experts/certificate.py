@@ -15,6 +15,8 @@ from leapnav.experts.problem import OptimalControlProblem
 
 # Tighter than any solver's own integration, and about what double precision allows.
 ACCURACY = 1e-12
+ROUGH_ACCURACY = 1e-6
+MOST_ROWS = 100_000  # steps of an extremal; one that needs more has diverged
 POINTS_PER_STEP = 4  # of the dense path on which clearance is taken: a few millimetres apart
 
 
@@ -77,7 +79,7 @@ def _trace(flow, times, Z, data, field, accuracy, out):
     d_one = np.empty((size, 1))
     dz = np.empty(size)
     z = np.empty(size)
-    rows, gap, conjugate, total, sign = 0, 0.0, np.inf, 0.0, 0.0
+    rows, gap, conjugate, total, sign, before = 0, 0.0, np.inf, 0.0, 0.0, 0.0
     last = len(times) - 2
     step = 0.0
     for k in range(last + 1):
@@ -115,8 +117,11 @@ def _trace(flow, times, Z, data, field, accuracy, out):
             if abs(determinant) > 1e-9 and conjugate == np.inf:
                 if sign == 0.0:
                     sign = math.copysign(1.0, determinant)
-                elif sign * determinant < 0.0 and times[k] + elapsed < times[last + 1] * (1 - 1e-9):
-                    conjugate = times[k] + elapsed
+                elif sign * determinant < 0.0:
+                    crossing = times[k] + elapsed - taken * determinant / (determinant - before)
+                    if crossing < times[last + 1] * (1 - 1e-9):
+                        conjugate = crossing
+                before = determinant
         for i in range(size):
             gap = max(gap, abs(z[i] - Z[k + 1, i]))
     return rows, gap, conjugate
@@ -140,14 +145,16 @@ def certify(
     """
     arrays = problem.arrays
     n = problem.system.n
+    # A path that did not converge is only looked at, so it need not be exact.
+    accuracy = ACCURACY if converged is Status.SUCCESS else ROUGH_ACCURACY
     rows = 2048
     while True:
         out = np.empty((rows, 3 + 6 * n))
-        count, gap, conjugate = _trace(arrays.flow, times, nodes, arrays.data, arrays.field, ACCURACY, out)
-        if count != -1:
+        count, gap, conjugate = _trace(arrays.flow, times, nodes, arrays.data, arrays.field, accuracy, out)
+        if count != -1 or rows > MOST_ROWS:
             break
         rows *= 4
-    if count == -2:
+    if count < 0:
         return failure(problem, Status.DIVERGED if converged is Status.SUCCESS else converged, history, work)
     out = out[:count]
     states, costates = out[:, 3 : 3 + n].copy(), out[:, 3 + n : 3 + 2 * n].copy()

@@ -28,6 +28,7 @@ STATUS = {
 }
 # The integrator is this much more accurate than the residual that Newton's method is asked for.
 ACCURACY = 1e-2
+SMALLEST_TOLERANCE = 1e-13  # of the integrator, near rounding
 # Sweeps need no accuracy beyond what the next sweep changes; Newton's method polishes the result.
 SWEEP_TOLERANCE = 1e-4
 
@@ -116,7 +117,8 @@ def single_shooting(
         arrays.data,
         arrays.field,
         tol,
-        tol * ACCURACY,
+        # Over the whole horizon the integration errors of all steps add up and grow.
+        max(tol * ACCURACY**2, SMALLEST_TOLERANCE),
         max_iterations,
     )
     history = (Iteration("newton", 1, cost, residual, 0),) * min(iterations, 1)
@@ -159,7 +161,9 @@ METHODS: dict[str, Callable[[OptimalControlProblem, Path, float, int, int | None
 }
 
 
-def connect(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def connect(
+    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, tolerance: float = SWEEP_TOLERANCE
+) -> np.ndarray:
     """Makes a path of nodes feasible in place; returns the cost of each segment, infinite where that failed."""
     arrays = problem.arrays
     costs = np.empty(len(times) - 1)
@@ -171,15 +175,21 @@ def connect(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray
         arrays.free,
         arrays.data,
         arrays.field,
-        SWEEP_TOLERANCE,
-        SWEEP_TOLERANCE,
+        tolerance,
+        tolerance,
         costs,
     )
     return costs
 
 
 def sweep(
-    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, costs: np.ndarray, sweeps: int
+    problem: OptimalControlProblem,
+    times: np.ndarray,
+    nodes: np.ndarray,
+    costs: np.ndarray,
+    sweeps: int,
+    half_cost: bool = False,
+    tolerance: float = SWEEP_TOLERANCE,
 ) -> tuple[list[Iteration], int]:
     """Leapfrog sweeps in place; returns a row for each, and the integration steps."""
     arrays = problem.arrays
@@ -193,9 +203,9 @@ def sweep(
             arrays.free,
             arrays.data,
             arrays.field,
-            SWEEP_TOLERANCE,
-            SWEEP_TOLERANCE,
-            False,
+            tolerance,
+            tolerance,
+            half_cost,
             costs,
             1,
             1,

@@ -1,0 +1,43 @@
+# `make demo` and `make test` work in a fresh clone; both set up .venv first.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+SOURCES := $(sort $(wildcard leapnav/* envs/*.py experts/*.py training/*.py))
+
+.PHONY: demo test lint types bench clean
+.DELETE_ON_ERROR:
+
+demo: .venv/installed
+	$(BIN)/leapnav demo
+
+test: lint types
+	$(BIN)/pytest
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: .venv/installed
+	$(BIN)/basedpyright
+
+bench: .venv/installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]" --config-settings editable_mode=strict
+	$(BIN)/python benchmarks/environment.py
+	$(BIN)/python benchmarks/solvers.py
+
+clean:
+	rm -rf .venv build *.egg-info
+
+# A strict editable install, so that type checkers and editors resolve every import; it links the files that exist, so
+# it is made again whenever one is added or removed.
+.venv/installed: pyproject.toml constraints.txt .venv/sources
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]" --config-settings editable_mode=strict
+	touch $@
+
+.venv/sources: .venv/bin/python FORCE
+	@echo "$(SOURCES)" | cmp --silent - $@ || echo "$(SOURCES)" > $@
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --upgrade pip
+
+FORCE:

@@ -1,0 +1,144 @@
+import json
+import subprocess
+import sys
+
+import pytest
+from helpers import best_known, scenario_fields
+
+from leapnav.cli import main
+from leapnav.demo import DemoSettings, run_demo
+from leapnav.training.config import CloningConfig
+
+
+@pytest.fixture
+def scenario_file(tmp_path):
+    scenario, cost = best_known()[0]
+    path = tmp_path / "scenario.json"
+    scenario.to_json(path)
+    return path, cost
+
+
+def failing(arguments, capsys):
+    """Runs a command that must fail: its exit code and its one line on standard error."""
+    capsys.readouterr()
+    code = main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    assert "Traceback" not in captured.err
+    return code, captured.err
+
+
+@pytest.mark.parametrize("method", ["optimum", "leapfrog", "multiple_shooting"])
+def test_solve_prints_draws_and_writes(method, scenario_file, tmp_path, capsys):
+    path, cost = scenario_file
+    plot, out = tmp_path / "path.png", tmp_path / "out.json"
+    assert main(["solve", str(path), "--method", method, "--plot", str(plot), "--json", str(out)]) == 0
+    assert "SUCCESS" in capsys.readouterr().out
+    solution = json.loads(out.read_text())
+    assert solution["success"] is True
+    assert solution["cost"] == pytest.approx(cost, rel=1e-4)
+    assert len(solution["times"]) == len(solution["states"]) == len(solution["costates"])
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_solve_without_a_solution_is_exit_code_1(tmp_path, capsys):
+    walls = [{"polygon": {"vertices": [[5, y], [5.5, y], [5.5, y + 5], [5, y + 5]]}} for y in (0, 5)]
+    path, out = tmp_path / "shut.json", tmp_path / "out.json"
+    path.write_text(json.dumps(scenario_fields(obstacles=walls, start=[2, 5, 0], goal=[8, 5, 0])))
+    assert main(["solve", str(path), "--json", str(out), "--plot", str(tmp_path / "p.png")]) == 1
+    assert "NO_PATH" in capsys.readouterr().out
+    assert json.loads(out.read_text())["cost"] is None
+    assert not (tmp_path / "p.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("{", "not valid JSON"),
+        (json.dumps(scenario_fields(horizon=-1)), "horizon: input should be greater than 0, got -1"),
+        (json.dumps(scenario_fields(colour="red")), "colour: extra inputs are not permitted, got 'red'"),
+        (json.dumps(scenario_fields(start=[4.0, 4.5, 0])), "start: (4, 4.5) is inside obstacles[0]"),
+        (json.dumps(scenario_fields(horizon=float("nan"))), "horizon: input should be a finite number, got nan"),
+        ("\xff\xfe", "not valid JSON"),
+        ("[]", "a scenario is a JSON object, got []"),
+    ],
+)
+def test_a_faulty_scenario_file_is_one_line_and_exit_code_2(content, expected, tmp_path, capsys):
+    path = tmp_path / "scenario.json"
+    path.write_bytes(content.encode("latin-1"))
+    code, line = failing(["solve", path], capsys)
+    assert code == 2
+    assert expected in line
+
+
+def test_missing_files_and_folders_are_named_before_the_work(scenario_file, tmp_path, capsys):
+    missing = tmp_path / "missing"
+    for arguments in (
+        ["solve", missing / "scenario.json"],
+        ["solve", tmp_path],
+        ["solve", scenario_file[0], "--json", missing / "out.json"],
+        ["solve", scenario_file[0], "--plot", missing / "out.png"],
+        ["evaluate", missing],
+        ["evaluate", "expert", "--references", missing],
+        ["evaluate"],
+        ["evaluate", "expert", "--json", missing / "out.json"],
+        ["rollout", "--out", tmp_path / "out", "--family", "maze"],
+        ["rollout", "--out", tmp_path / "out", "--count", "-3"],
+        ["rollout", "--out", tmp_path],
+        ["train", "bc", "--demos", missing, "--out", tmp_path / "policy"],
+        ["train", "bc", "--demos", missing, "--out", tmp_path],
+    ):
+        code, line = failing(arguments, capsys)
+        assert code == 2, arguments
+        assert "missing" in line or "maze" in line or "-3" in line or str(tmp_path) in line or "policies" in line
+
+
+def test_a_plot_in_an_unknown_format_is_refused(scenario_file, tmp_path, capsys):
+    code, line = failing(["solve", scenario_file[0], "--plot", tmp_path / "path.xyz"], capsys)
+    assert code == 2
+    assert "xyz" in line
+
+
+def test_rollout_train_and_evaluate_work_together(tmp_path, capsys):
+    demos, policy, table = tmp_path / "demos", tmp_path / "policy", tmp_path / "scores.json"
+    assert main(["rollout", "--family", "open", "--count", "6", "--workers", "1", "--out", str(demos)]) == 0
+    assert main(["train", "bc", "--demos", str(demos), "--out", str(policy), "--epochs", "2"]) == 0
+    arguments = ["evaluate", "expert", str(policy), "--references", str(demos), "--json", str(table)]
+    assert main([*arguments, "--plot", str(tmp_path / "plot.png")]) == 0
+    rows = json.loads(table.read_text())["scores"]
+    assert [row["policy"] for row in rows] == ["expert", str(policy)]
+    assert rows[0]["success"]["value"] == 1.0
+    assert (tmp_path / "plot.png").exists()
+    assert failing(["train", "bc", "--demos", demos, "--out", policy], capsys)[0] == 2
+    assert failing(["rollout", "--count", "1", "--out", demos], capsys)[0] == 2
+
+
+def test_evaluate_solves_its_own_references(capsys):
+    assert main(["evaluate", "expert", "--family", "open", "--count", "2", "--workers", "1"]) == 0
+    assert "expert" in capsys.readouterr().out
+
+
+def test_the_demo_runs_and_a_second_run_uses_what_is_there(tmp_path, capsys):
+    settings = DemoSettings(
+        training_scenarios=4, recoveries=1, test_scenarios=3, workers=1, cloning=CloningConfig(epochs=1)
+    )
+    run_demo(tmp_path, settings)
+    weights = (tmp_path / "policy" / "weights.pt").stat().st_mtime_ns
+    scores = (tmp_path / "scores.json").read_text()
+    assert "clone" in capsys.readouterr().out
+    assert (tmp_path / "episodes.png").exists()
+    run_demo(tmp_path, settings)
+    assert "Using" in capsys.readouterr().out
+    assert (tmp_path / "policy" / "weights.pt").stat().st_mtime_ns == weights
+    assert (tmp_path / "scores.json").read_text() == scores
+    with pytest.raises(ValueError, match="other settings"):
+        run_demo(tmp_path, DemoSettings())
+
+
+@pytest.mark.parametrize("command", [[], ["solve"], ["rollout"], ["train"], ["evaluate"], ["demo"]])
+def test_every_command_has_help(command):
+    done = subprocess.run(
+        [sys.executable, "-m", "leapnav", *command, "--help"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert "usage: leapnav" in done.stdout

@@ -1,0 +1,290 @@
+import math
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from helpers import best_known, scenario_fields
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import leapnav  # noqa: F401 (registers)
+from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
+from leapnav.envs.obstacles import clearance, clearances
+from leapnav.envs.sensing import POSE_ENTRIES, cast_ray
+
+ID = "leapnav/Navigate-v0"
+EMPTY = {"start": [5.0, 5.0, 0.3], "goal": [6.0, 5.0, 0.0], "obstacles": []}
+
+
+def scenario(**changes):
+    return Scenario.from_dict(scenario_fields(**{**EMPTY, **changes}))
+
+
+def play(env, actions, **reset):
+    observation, info = env.reset(**reset)
+    rows = [(observation, 0.0, False, info["cost"], info["pose"])]
+    for action in actions:
+        observation, reward, terminated, _, info = env.step(action)
+        rows.append((observation, reward, terminated, info["cost"], info["pose"]))
+        if terminated:
+            break
+    return rows
+
+
+def actions(count, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 2)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"family": "clutter"}, {"family": "open"}, {"scenario": scenario()}, {"lidar_beams": 7}]
+)
+def test_both_checkers_accept_the_environment_without_a_warning(arguments):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(ID, render_mode="rgb_array", **arguments).unwrapped)
+        check_env_sb3(gym.make(ID, **arguments))
+
+
+def test_the_same_seed_gives_the_same_episode_bit_for_bit():
+    one, other = (play(gym.make(ID), actions(300), seed=7) for _ in range(2))
+    assert len(one) == len(other)
+    for (observation, *rest), (again, *rest_again) in zip(one, other, strict=True):
+        assert observation.tobytes() == again.tobytes()
+        assert rest == rest_again
+
+
+def test_an_episode_does_not_depend_on_those_before_it():
+    fresh = gym.make(ID)
+    used = gym.make(ID, terminate_on_collision=False)
+    task = sample_scenario("clutter", 3)
+    play(used, [np.array([1.0, 0.1], np.float32)] * 200, seed=1)  # runs into something
+    used.unwrapped.terminate_on_collision = True
+    for one, other in zip(
+        play(fresh, actions(300), options={"scenario": task}),
+        play(used, actions(300), options={"scenario": task}),
+        strict=True,
+    ):
+        assert one[0].tobytes() == other[0].tobytes()
+        assert one[1:] == other[1:]
+
+
+def test_unseeded_resets_differ():
+    env = gym.make(ID)
+    tasks = {env.reset()[1]["scenario"].start for _ in range(5)} | {gym.make(ID).reset()[1]["scenario"].start}
+    assert len(tasks) == 6
+
+
+def test_the_global_generator_is_neither_read_nor_changed():
+    np.random.seed(0)
+    before = np.random.get_state()[1].copy()
+    first = play(gym.make(ID), actions(20), seed=1)
+    assert np.array_equal(before, np.random.get_state()[1])
+    np.random.seed(99)
+    assert first[-1][0].tobytes() == play(gym.make(ID), actions(20), seed=1)[-1][0].tobytes()
+
+
+def test_a_pickled_environment_starts_the_same_episodes():
+    env = NavigateEnv("clutter")
+    env.reset(seed=3)
+    copy = pickle.loads(pickle.dumps(env))
+    for one, other in zip(play(env, actions(50)), play(copy, actions(50)), strict=True):
+        assert one[0].tobytes() == other[0].tobytes()
+
+
+def test_a_pickled_environment_goes_on_in_the_middle_of_an_episode():
+    env = NavigateEnv(scenario=scenario())
+    play(env, actions(10))
+    copy = pickle.loads(pickle.dumps(env))
+    for action in actions(50, seed=1):
+        one, other = env.step(action), copy.step(action)
+        assert one[0].tobytes() == other[0].tobytes()
+        assert one[1:3] == other[1:3]
+
+
+def test_commands_are_driven_as_exact_arcs():
+    env = NavigateEnv(scenario=scenario())
+    env.reset()
+    x, y, heading = env.pose
+    for action in actions(100) * (0.5, 1.0):
+        _, _, terminated, _, _ = env.step(action)
+        v, w, h = action[0] * 2.0, action[1] * 3.0, 0.05
+        x += v / w * (math.sin(heading + w * h) - math.sin(heading))
+        y -= v / w * (math.cos(heading + w * h) - math.cos(heading))
+        heading += w * h
+        assert not terminated
+        assert env.pose == pytest.approx((x, y, heading), abs=1e-9)
+
+
+def test_actions_are_clipped_on_both_sides():
+    for sign in (-1.0, 1.0):
+        one = play(NavigateEnv(scenario=scenario()), [np.array([sign, sign])])
+        beyond = play(NavigateEnv(scenario=scenario()), [np.array([5 * sign, 7 * sign])])
+        assert one[-1][1:] == beyond[-1][1:]
+
+
+def test_the_return_is_minus_the_cost_minus_the_penalties():
+    env = NavigateEnv(scenario=scenario(goal=[8.0, 8.0, 1.0], horizon=3.0), miss_penalty=11.0)
+    rows = play(env, 0.2 * actions(100))
+    assert rows[-1][2]
+    assert sum(row[1] for row in rows) == pytest.approx(-rows[-1][3] - 11.0)
+    assert env.time == 3.0
+
+
+def test_the_running_cost_is_the_integral_along_the_path():
+    # Past a disc at 0.1 m, so that the proximity cost matters.
+    task = scenario(start=[2.8, 3.2, 1.57], obstacles=[{"circle": {"center": [4.0, 4.0], "radius": 0.85}}])
+    coarse = play(NavigateEnv(scenario=task), [np.array([0.4, 0.0])] * 40)
+    fine = play(NavigateEnv(scenario=task, control_period=0.001), [np.array([0.4, 0.0])] * 2000)
+    effort = 0.5 * 0.8**2 * 2.0
+    assert coarse[-1][3] - effort > 0.1
+    assert coarse[-1][3] == pytest.approx(fine[-1][3], rel=1e-6)
+
+
+def test_the_last_period_ends_at_the_horizon():
+    env = NavigateEnv(scenario=scenario(horizon=0.12))
+    rows = play(env, [np.array([0.5, 0.0])] * 10)
+    assert len(rows) == 1 + 3
+    assert rows[-1][4][0] == pytest.approx(5.0 + 0.12 * 1.0 * math.cos(0.3))
+
+
+@pytest.mark.parametrize(("offset", "success"), [(0.09, True), (0.11, False)])
+def test_success_is_within_the_position_tolerance(offset, success):
+    env = NavigateEnv(scenario=scenario(start=[5, 5, 0], goal=[6.0 + offset, 5, 0], horizon=1.0))
+    env.reset()
+    for _ in range(20):
+        _, _reward, _, _, info = env.step(np.array([0.5, 0.0]))
+    assert info["is_success"] is success
+    assert info["reward_parts"]["miss"] == (0.0 if success else -50.0)
+
+
+@pytest.mark.parametrize(
+    ("heading", "success"), [(0.09, True), (0.11, False), (2 * math.pi - 0.05, True), (None, True)]
+)
+def test_success_is_within_the_heading_tolerance_modulo_a_turn(heading, success):
+    env = NavigateEnv(scenario=scenario(start=[5, 5, 0], goal=[6.0, 5, heading], horizon=1.0))
+    env.reset()
+    for _ in range(20):
+        *_, info = env.step(np.array([0.5, 0.0]))
+    assert info["is_success"] is success
+
+
+def test_a_touch_ends_the_episode_and_is_charged():
+    wall = {"polygon": {"vertices": [[6, 4], [6.05, 4], [6.05, 6], [6, 6]]}}
+    task = scenario(start=[5, 5, 0], goal=[8, 5, 0], obstacles=[wall])
+    env = NavigateEnv(scenario=task)
+    rows = play(env, [np.array([1.0, 0.0])] * 100)
+    assert rows[-1][2]
+    assert rows[-1][1] < -49
+    assert rows[-1][4][0] == pytest.approx(5.75, abs=0.1)
+
+
+def test_a_robot_that_goes_on_after_a_touch_does_not_pass_through():
+    wall = {"polygon": {"vertices": [[6, 4], [6.05, 4], [6.05, 6], [6, 6]]}}
+    task = scenario(start=[5, 5, 0], goal=[8, 5, 0], obstacles=[wall], horizon=10.0)
+    env = NavigateEnv(scenario=task, terminate_on_collision=False)
+    env.reset()
+    total, terminated = 0.0, False
+    while not terminated:
+        _, _, terminated, _, info = env.step(np.array([1.0, 0.0]))
+        total += info["reward_parts"]["collision"]
+        assert clearance(*env.pose[:2], task.field)[0] > -0.06
+    assert total == -50.0  # once
+    assert info["collision"]
+    assert not info["is_success"]
+
+
+def test_lidar_ranges_agree_with_a_fine_walk():
+    for task, _ in best_known()[::4]:
+        x, y, heading = task.start
+        # The robot's radius is taken off in `clearances`, not in a ray.
+        steps = np.arange(0, 10, 2e-3)
+        for k in range(0, 32, 3):
+            angle = heading + 2 * math.pi * k / 32
+            ray = np.stack([x + steps * math.cos(angle), y + steps * math.sin(angle)], axis=1)
+            free = clearances(ray, task.field) + task.robot.radius > 0
+            walked = steps[np.argmin(free)] if not free.all() else 10.0
+            found = cast_ray(x, y, math.cos(angle), math.sin(angle), task.field, 10.0)
+            assert found == pytest.approx(walked, abs=3e-3)
+
+
+def test_the_observation_says_what_the_docstring_promises():
+    task = scenario(start=[2.0, 3.0, math.pi / 2], goal=[1.0, 6.0, math.pi], horizon=4.0)
+    observation, _ = NavigateEnv(scenario=task).reset()
+    assert observation[:POSE_ENTRIES] == pytest.approx(
+        [3.0, 1.0, 0.0, 1.0, 4.0, 0.75, 0.25, math.sqrt(10) / 4, math.pi / 8], abs=1e-6
+    )
+    ahead, left, behind, right = observation[POSE_ENTRIES::8]
+    assert (ahead, left, behind, right) == pytest.approx((7.0, 2.0, 3.0, 8.0), abs=1e-5)
+
+
+def test_a_free_goal_heading_shows_as_zeros():
+    observation, _ = NavigateEnv(scenario=scenario(goal=[8.0, 8.0, None])).reset()
+    assert observation[2] == observation[3] == observation[8] == 0.0
+
+
+def test_observations_stay_in_their_space():
+    env = NavigateEnv("clutter", terminate_on_collision=False)
+    for seed in range(3):
+        for row in play(env, actions(400, seed), seed=seed):
+            assert env.observation_space.contains(row[0])
+
+
+def test_the_scenario_option_takes_every_form_and_is_reported():
+    task = scenario()
+    env = gym.make(ID)
+    for form in (task, task.to_dict(), task.to_json()):
+        assert env.reset(options={"scenario": form})[1]["scenario"] == task
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gym.make(ID, family="maze"), "family: expected one of .*'maze'"),
+        (lambda: gym.make(ID, control_period=0.0), "control_period: .*0.0"),
+        (lambda: gym.make(ID, miss_penalty=-1), "miss_penalty: .*-1"),
+        (lambda: gym.make(ID, lidar_beams=-1), "lidar_beams: .*-1"),
+        (lambda: gym.make(ID, scenario=scenario_fields(horizon=-1)), "horizon"),
+        (lambda: gym.make(ID).reset(options={"seed": 1}), "options: .*'seed'"),
+        (lambda: gym.make(ID).reset(options={"scenario": 3}), "scenario: expected .* int"),
+    ],
+)
+def test_bad_arguments_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_a_bad_scenario_is_a_scenario_error():
+    with pytest.raises(ScenarioError):
+        gym.make(ID).reset(options={"scenario": scenario_fields(start=[4.0, 4.5, 0.0])})
+
+
+def test_an_action_that_is_not_finite_is_refused_and_changes_nothing():
+    env = NavigateEnv(scenario=scenario())
+    env.reset()
+    with pytest.raises(ValueError, match="action: expected two finite numbers"):
+        env.step(np.array([np.nan, 0.0]))
+    assert env.time == 0.0
+    assert env.pose == (5.0, 5.0, 0.3)
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    with pytest.raises(gym.error.ResetNeeded):
+        NavigateEnv().step(np.zeros(2))
+
+
+def test_frames_show_the_robot_where_it_is():
+    env = gym.make(
+        ID, scenario=scenario(start=[5.0, 5.0, 0.0], goal=[9.0, 9.0, 0.0], obstacles=[]), render_mode="rgb_array"
+    )
+    env.reset()
+    frame = env.render()
+    assert frame.shape == (600, 600, 3)
+    assert frame.dtype == np.uint8
+    robot = np.abs(frame.astype(int) - (38, 98, 171)).sum(axis=2) < 20
+    rows, columns = np.nonzero(robot)
+    assert (rows.mean(), columns.mean()) == pytest.approx((300, 300), abs=3)
+    for _ in range(20):
+        env.step(np.array([0.5, 0.0], np.float32))
+    assert np.nonzero(np.abs(env.render().astype(int) - (38, 98, 171)).sum(axis=2) < 20)[1].mean() > columns.mean() + 10

@@ -1,0 +1,44 @@
+import math
+
+import numpy as np
+import pytest
+
+from leapnav.envs import FAMILIES, sample_scenario
+from leapnav.envs.obstacles import clearance
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_same_seed_gives_the_same_scenario(family):
+    assert sample_scenario(family, 3) == sample_scenario(family, 3)
+    assert sample_scenario(family, 3) != sample_scenario(family, 4)
+    first, second = (sample_scenario(family, np.random.default_rng(5)) for _ in range(2))
+    assert first == second
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_sampling_leaves_the_global_generator_alone(family):
+    before = np.random.get_state()[1].copy()
+    sample_scenario(family, 0)
+    assert np.array_equal(before, np.random.get_state()[1])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_scenarios_are_neither_trivial_nor_rushed(family):
+    for seed in range(50):
+        scenario = sample_scenario(family, seed)
+        distance = math.dist(scenario.start[:2], scenario.goal[:2])
+        assert distance >= 4.0
+        assert distance / scenario.horizon <= 0.81  # 0.8 m/s, and the horizon is rounded to 0.1 s
+        for pose in (scenario.start, scenario.goal):
+            assert clearance(pose[0], pose[1], scenario.field)[0] >= 0.24  # 0.25 m before rounding
+
+
+def test_clutter_is_6_to_12_discs_and_open_is_empty():
+    counts = {len(sample_scenario("clutter", seed).obstacles) for seed in range(100)}
+    assert counts == set(range(6, 13))
+    assert sample_scenario("open", 0).obstacles == ()
+
+
+def test_an_unknown_family_is_named():
+    with pytest.raises(ValueError, match="family: expected one of open, clutter, got 'maze'"):
+        sample_scenario("maze", 0)

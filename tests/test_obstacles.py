@@ -1,0 +1,128 @@
+import math
+
+import numpy as np
+import pytest
+from helpers import best_known
+
+from leapnav.envs.obstacles import arc_clearance, clearance, clearances, proximity
+
+SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
+
+
+def plain_proximity(scenario, x, y):
+    """The formulas of the design, written out without care for overflow."""
+    cost, radius = scenario.cost, scenario.robot.radius
+    k, sigma = cost.proximity_weight, cost.proximity_scale
+    x_min, y_min, x_max, y_max = scenario.arena
+    total = sum(k * math.exp(-(d - radius) / sigma) for d in (x - x_min, x_max - x, y - y_min, y_max - y))
+    for obstacle in scenario.obstacles:
+        if obstacle.circle:
+            cx, cy = obstacle.circle.center
+            distance = math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + 1e-6)
+            total += k * math.exp(-(distance - obstacle.circle.radius - radius) / sigma)
+        else:
+            v = np.array(obstacle.polygon.vertices)
+            centre = v.mean(axis=0)
+            share = 0.0
+            for a, b in zip(v, np.roll(v, -1, axis=0), strict=True):
+                normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
+                normal *= np.sign(normal @ (a - centre))
+                share += math.exp((normal @ (np.array([x, y]) - a) - radius) / sigma)
+            total += k / share
+    return total
+
+
+def points(scenario, count, seed=0):
+    x_min, y_min, x_max, y_max = scenario.arena
+    return np.random.default_rng(seed).uniform((x_min, y_min), (x_max, y_max), (count, 2))
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+def test_the_proximity_cost_is_the_formula(scenario):
+    for x, y in points(scenario, 100):
+        assert proximity(x, y, scenario.field)[0] == pytest.approx(plain_proximity(scenario, x, y), rel=1e-9, abs=1e-15)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+def test_gradient_and_hessian_agree_with_finite_differences(scenario):
+    h = 1e-5
+    for x, y in points(scenario, 100):
+        _, gx, gy, hxx, hxy, hyy = values = proximity(x, y, scenario.field)
+        right, left = (proximity(x + s, y, scenario.field) for s in (h, -h))
+        above, below = (proximity(x, y + s, scenario.field) for s in (h, -h))
+        differences = [(a[i] - b[i]) / (2 * h) for a, b, i in ((right, left, 0), (above, below, 0))]
+        differences += [(right[1] - left[1]) / (2 * h), (right[2] - left[2]) / (2 * h), (above[2] - below[2]) / (2 * h)]
+        # The difference quotient's own error, relative to the largest derivative there.
+        assert [gx, gy, hxx, hxy, hyy] == pytest.approx(differences, rel=1e-5, abs=1e-6 * max(1, *map(abs, values)))
+
+
+def test_the_proximity_cost_does_not_overflow_far_inside_or_far_away():
+    from leapnav.envs import Scenario
+
+    wide = [[2.0, 2.0], [98.0, 2.0], [98.0, 98.0], [2.0, 98.0]]
+    scenario = Scenario(
+        arena=(0.0, 0.0, 100.0, 100.0),
+        start=(1.0, 1.0, 0.0),
+        goal=(99.0, 99.0, 0.0),
+        horizon=1.0,
+        obstacles=({"polygon": {"vertices": tuple(map(tuple, wide))}},),
+    )
+    assert np.isfinite(proximity(99.0, 99.0, scenario.field)).all()
+    assert np.isfinite(proximity(30.0, 50.0, scenario.field)).all()
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+def test_clearance_is_the_distance_to_the_nearest_rim(scenario):
+    rims = []
+    for obstacle in scenario.obstacles:
+        share = np.linspace(0, 1, 4001)[:, None]
+        if obstacle.circle:
+            turn = 2 * np.pi * share
+            rims.append(obstacle.circle.center + obstacle.circle.radius * np.hstack([np.cos(turn), np.sin(turn)]))
+        else:
+            v = np.array(obstacle.polygon.vertices)
+            rims += [a + share * (b - a) for a, b in zip(v, np.roll(v, -1, axis=0), strict=True)]
+    x_min, y_min, x_max, y_max = scenario.arena
+    for x, y in points(scenario, 60):
+        distance, _ = clearance(x, y, scenario.field)
+        if distance < 0:  # inside something: only the sign is compared
+            continue
+        walls = min(x - x_min, x_max - x, y - y_min, y_max - y)
+        nearest = min(walls, *(np.hypot(*(rim - (x, y)).T).min() for rim in rims)) - scenario.robot.radius
+        assert distance == pytest.approx(nearest, abs=2e-3)  # the rim's points stand 2 mm apart
+
+
+def test_clearance_names_the_nearest_obstacle():
+    scenario = SCENARIOS[0]
+    for number, obstacle in enumerate(scenario.obstacles):
+        distance, nearest = clearance(*obstacle.circle.center, scenario.field)
+        assert nearest == number
+        assert distance == pytest.approx(-obstacle.circle.radius - scenario.robot.radius)
+    assert clearance(0.0, 5.0, scenario.field)[1] == len(scenario.obstacles)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+def test_the_clearance_of_an_arc_is_the_smallest_of_its_points(scenario):
+    rng = np.random.default_rng(3)
+    share = np.linspace(0, 1, 5001)
+    for x, y in points(scenario, 40, seed=1):
+        heading, distance, turn = rng.uniform(-3, 3), rng.uniform(-1, 1), rng.uniform(-2, 2)
+        chord = distance * share * np.sinc(turn * share / (2 * np.pi))
+        middle = heading + turn * share / 2
+        arc = np.stack([x + chord * np.cos(middle), y + chord * np.sin(middle)], axis=1)
+        lowest = clearances(arc, scenario.field).min()
+        found = arc_clearance(x, y, heading, distance, turn, scenario.field)
+        assert found == pytest.approx(lowest, abs=2e-3)
+
+
+def test_an_arc_does_not_jump_a_thin_obstacle():
+    from leapnav.envs import Scenario
+
+    scenario = Scenario(
+        arena=(0.0, 0.0, 10.0, 10.0),
+        start=(1.0, 5.0, 0.0),
+        goal=(9.0, 5.0, 0.0),
+        horizon=1.0,
+        obstacles=({"polygon": {"vertices": ((5.0, 0.0), (5.01, 0.0), (5.01, 10.0), (5.0, 10.0))}},),
+    )
+    assert arc_clearance(1.0, 5.0, 0.0, 8.0, 0.0, scenario.field) < 0

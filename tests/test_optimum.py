@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+from helpers import best_known
+from scipy.integrate import solve_ivp
+
+from leapnav.envs import Scenario, sample_scenario
+from leapnav.experts import find_optimum
+from leapnav.experts.lattice import Lattice
+
+BEST_KNOWN = best_known()
+
+
+@pytest.mark.parametrize(("scenario", "cost"), BEST_KNOWN, ids=[s.name for s, _ in BEST_KNOWN])
+def test_the_best_known_cost_is_reached(scenario, cost):
+    extremal = find_optimum(scenario)
+    assert extremal.success, (extremal.status, extremal.certificate)
+    assert extremal.cost <= cost * 1.001
+    assert extremal.certificate.residual <= 1e-8
+
+
+@pytest.mark.parametrize("family", ["open", "clutter"])
+def test_fresh_scenarios_are_solved_and_certified(family):
+    for seed in range(20):
+        extremal = find_optimum(sample_scenario(family, 9000 + seed))
+        assert extremal.success, (seed, extremal.status, extremal.certificate)
+        certificate = extremal.certificate
+        assert certificate.residual <= 1e-8
+        assert certificate.defect <= 1e-8
+        assert certificate.hamiltonian_drift <= 1e-8
+        assert certificate.clearance > 0
+        assert certificate.conjugate_point is None
+
+
+def test_the_certificate_agrees_with_an_independent_integrator():
+    """Each half second of the optimum, re-integrated by SciPy from its own dense states and costates."""
+    for scenario, _ in BEST_KNOWN[::5]:
+        extremal = find_optimum(scenario)
+        arrays = extremal.problem.arrays
+        dz, empty = np.empty(6), np.empty((6, 0))
+
+        def flow(_, y, arrays=arrays, dz=dz, empty=empty):
+            running = arrays.flow(y[:6], arrays.data, arrays.field, empty, dz, empty)
+            return np.append(dz, running)
+
+        times = np.append(np.arange(0, scenario.horizon, 0.5), scenario.horizon)
+        states, _, costates = extremal.evaluate(times)
+        total = 0.0
+        for k in range(len(times) - 1):
+            start = np.concatenate([states[k], costates[k], [0.0]])
+            end = solve_ivp(flow, times[k : k + 2], start, "DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+            assert end[:6] == pytest.approx(np.concatenate([states[k + 1], costates[k + 1]]), abs=1e-7)
+            total += end[6]
+        assert total == pytest.approx(extremal.cost, rel=1e-8)
+
+
+def test_the_optimum_of_the_mirrored_scenario_is_the_mirrored_optimum():
+    scenario = BEST_KNOWN[1][0]
+    fields = scenario.to_dict()
+
+    def mirror(pose):
+        return [10.0 - pose[0], pose[1], np.pi - pose[2]]
+
+    fields["start"], fields["goal"] = mirror(fields["start"]), mirror(fields["goal"])
+    for obstacle in fields["obstacles"]:
+        x, y = obstacle["circle"]["center"]
+        obstacle["circle"]["center"] = [10.0 - x, y]
+    assert find_optimum(Scenario.from_dict(fields)).cost == pytest.approx(find_optimum(scenario).cost, rel=1e-8)
+
+
+def test_the_optimum_backwards_in_time_costs_the_same():
+    scenario = BEST_KNOWN[2][0]
+    fields = scenario.to_dict()
+    fields["start"], fields["goal"] = fields["goal"], fields["start"]
+    assert find_optimum(Scenario.from_dict(fields)).cost == pytest.approx(find_optimum(scenario).cost, rel=1e-8)
+
+
+def test_the_same_scenario_gives_the_same_optimum_bit_for_bit():
+    scenario = BEST_KNOWN[3][0]
+    one, other = find_optimum(scenario), find_optimum(scenario)
+    assert one.states.tobytes() == other.states.tobytes()
+    assert one.cost == other.cost
+
+
+def test_candidates_are_distinct_and_in_order():
+    candidates = [c for c, _ in zip(Lattice(BEST_KNOWN[0][0]).candidates(), range(6), strict=False)]
+    assert [c.cost for c in candidates] == sorted(c.cost for c in candidates)
+    for candidate in candidates:
+        assert candidate.times[-1] == pytest.approx(BEST_KNOWN[0][0].horizon)
+        assert candidate.poses[0] == pytest.approx(BEST_KNOWN[0][0].start)
+        turn = candidate.poses[-1, 2] - BEST_KNOWN[0][0].goal[2]
+        assert turn == pytest.approx(2 * np.pi * round(turn / (2 * np.pi)))
+
+
+def test_other_arenas_and_robots_are_solved_too():
+    # Three times larger in every length: the same problem in another unit.
+    scenario = BEST_KNOWN[0][0]
+    fields = scenario.to_dict()
+    factor = 3.0
+    fields["arena"] = [-5.0, -7.0, -5.0 + 10 * factor, -7.0 + 10 * factor]
+
+    def move(point):
+        return [-5.0 + factor * point[0], -7.0 + factor * point[1], *point[2:]]
+
+    fields["start"], fields["goal"] = move(fields["start"]), move(fields["goal"])
+    for obstacle in fields["obstacles"]:
+        obstacle["circle"] = {
+            "center": move(obstacle["circle"]["center"]),
+            "radius": factor * obstacle["circle"]["radius"],
+        }
+    fields["robot"] |= {"radius": factor * 0.25, "max_speed": factor * 2.0}
+    fields["cost"] |= {"proximity_scale": factor * 0.1, "speed_weight": 1.0 / factor**2}
+    scaled = find_optimum(Scenario.from_dict(fields))
+    assert scaled.success
+    # Differences: the smoothing of |p - c| is in metres, 1e-6.
+    assert scaled.cost == pytest.approx(find_optimum(scenario).cost, rel=1e-4)
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="candidates: expected at least 1, got 0"):
+        find_optimum(BEST_KNOWN[0][0], candidates=0)

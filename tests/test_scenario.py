@@ -1,0 +1,111 @@
+import json
+import math
+import pickle
+
+import pytest
+from helpers import scenario_fields
+
+from leapnav.envs import Scenario, ScenarioError
+
+
+def square(x, y, side=1.0):
+    return {"polygon": {"vertices": [[x, y], [x + side, y], [x + side, y + side], [x, y + side]]}}
+
+
+def test_a_scenario_survives_json_pickle_and_dict_unchanged():
+    fields = scenario_fields(goal=[8.0, 8.0, None], horizon=11.3)
+    scenario = Scenario.from_dict(fields)
+    assert scenario.to_dict() == fields
+    assert Scenario.from_json(scenario.to_json()) == scenario
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+    assert hash(Scenario.from_dict(fields)) == hash(scenario)
+
+
+def test_a_scenario_is_read_from_and_written_to_a_file(tmp_path):
+    scenario = Scenario.from_dict(scenario_fields())
+    path = tmp_path / "scenario.json"
+    scenario.to_json(path)
+    assert Scenario.from_json(path) == scenario
+    assert Scenario.from_json(str(path)) == scenario
+
+
+def test_a_scenario_cannot_be_changed():
+    scenario = Scenario.from_dict(scenario_fields())
+    with pytest.raises(Exception, match="frozen"):
+        scenario.horizon = 3.0  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValueError, match="read-only"):
+        scenario.field[0] = 1.0
+
+
+def test_orientation_of_a_polygon_does_not_matter():
+    vertices = [[6.0, 3.0], [7.0, 3.5], [6.5, 5.0]]
+    one, other = (
+        Scenario.from_dict(scenario_fields(obstacles=[{"polygon": {"vertices": v}}]))
+        for v in (vertices, vertices[::-1])
+    )
+    assert sorted(one.field) == pytest.approx(sorted(other.field))
+
+
+FAULTS = [
+    ({"horizon": 0}, "horizon", "0"),
+    ({"horizon": -1.5}, "horizon", "-1.5"),
+    ({"horizon": math.nan}, "horizon", "nan"),
+    ({"horizon": math.inf}, "horizon", "inf"),
+    ({"horizon": "12"}, "horizon", "'12'"),
+    ({"horizon": True}, "horizon", "True"),
+    ({"start": [1.0, math.nan, 0.0]}, "start[1]", "nan"),
+    ({"start": [1.0, 1.0]}, "start", "required"),
+    ({"start": [1.0, 1.0, None]}, "start[2]", "None"),
+    ({"start": [4.0, 4.6, 0.0]}, "start", "(4, 4.6) is inside obstacles[0] (clearance -0.95 m)"),
+    ({"start": [6.5, 3.7, 0.0]}, "start", "obstacles[1]"),
+    ({"start": [0.1, 5.0, 0.0]}, "start", "the arena wall (clearance -0.15 m)"),
+    ({"goal": [4.0, 4.5, 0.0]}, "goal", "obstacles[0]"),
+    ({"arena": [0, 0, 0, 10]}, "arena", "(0, 0, 0, 10)"),
+    ({"speed": 3}, "speed", "3"),
+    ({"robot": {"radius": 0.2, "colour": "red"}}, "robot.colour", "'red'"),
+    ({"robot": {"model": "car"}}, "robot.model", "'car'"),
+    ({"robot": {"radius": 0}}, "robot.radius", "0"),
+    ({"cost": {"proximity_scale": 0.0}}, "cost.proximity_scale", "0.0"),
+    ({"cost": {"turn_weight": -1}}, "cost.turn_weight", "-1"),
+    ({"obstacles": [{}]}, "obstacles[0]", "exactly one"),
+    ({"obstacles": [{**square(5, 5), "circle": {"center": [5, 5], "radius": 1}}]}, "obstacles[0]", "exactly one"),
+    ({"obstacles": [{"circle": {"center": [5, 5], "radius": -1}}]}, "obstacles[0].circle.radius", "-1"),
+    (
+        {"obstacles": [square(2, 2), {"polygon": {"vertices": [[5, 5], [6, 5], [5.1, 5.1], [5, 6]]}}]},
+        "obstacles[1].polygon.vertices",
+        "not strictly convex",
+    ),
+    (
+        {"obstacles": [{"polygon": {"vertices": [[5, 6], [5.6, 4.2], [4.1, 5.3], [5.9, 5.3], [4.4, 4.2]]}}]},
+        "obstacles[0].polygon.vertices",
+        "not strictly convex",
+    ),
+    ({"obstacles": [{"polygon": {"vertices": [[5, 5], [6, 5]]}}]}, "obstacles[0].polygon.vertices", "2"),
+    ({"obstacles": [{"polygon": {"vertices": [[5, 5], [6, 6], [7, 7]]}}]}, "vertices", "not strictly convex"),
+    ({"obstacles": 3}, "obstacles", "3"),
+    ({"name": 3}, "name", "3"),
+]
+
+
+@pytest.mark.parametrize(("changes", "field", "value"), FAULTS, ids=lambda v: v if isinstance(v, str) else "")
+def test_a_fault_is_told_in_one_line_with_field_and_value(changes, field, value):
+    with pytest.raises(ScenarioError) as error:
+        Scenario.from_dict(scenario_fields(**changes))
+    message = str(error.value)
+    assert "\n" not in message
+    assert f" {field}" in message or field in message
+    assert value in message
+
+
+@pytest.mark.parametrize("text", ["{", '{"horizon": 1, "horizon": 2}', "{'a': 1}", '{"a": ' * 5000])
+def test_text_that_is_no_scenario_is_told_in_one_line(text):
+    with pytest.raises(ScenarioError) as error:
+        Scenario.from_json(text)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_field_is_named():
+    fields = scenario_fields()
+    del fields["goal"]
+    with pytest.raises(ScenarioError, match=r"Scenario 'small': goal: field required"):
+        Scenario.from_json(json.dumps(fields))

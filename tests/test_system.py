@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+import sympy as sp
+from helpers import best_known, published_problems
+
+from leapnav.experts import ControlAffineSystem, OptimalControlProblem
+
+x, v = sp.symbols("x v")
+
+PROBLEMS = {name: problem for name, (problem, _, _) in published_problems().items()}
+PROBLEMS["unicycle among discs"] = OptimalControlProblem.from_scenario(best_known()[0][0])
+
+
+def reduced_hamiltonian(problem, z):
+    """H* = a'lam + Phi + sum of 1/2 r u^2 + u p, from the flow itself: H = L + lam'q'."""
+    arrays, n = problem.arrays, problem.system.n
+    empty, dz = np.empty((2 * n, 0)), np.empty(2 * n)
+    running = arrays.flow(z, arrays.data, arrays.field, empty, dz, empty)
+    return running + z[n:] @ dz[:n]
+
+
+def rates(problem, z):
+    n = problem.system.n
+    empty, dz = np.empty((2 * n, 0)), np.empty(2 * n)
+    problem.arrays.flow(z, problem.arrays.data, problem.arrays.field, empty, dz, empty)
+    return dz
+
+
+def sample_points(problem, count=20):
+    rng = np.random.default_rng(0)
+    n = problem.system.n
+    start = np.array(problem.start, dtype=float)
+    return [np.concatenate([start + 0.3 * rng.normal(size=n), rng.normal(size=n)]) for _ in range(count)]
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_flow_is_the_symplectic_gradient_of_the_reduced_hamiltonian(name):
+    problem = PROBLEMS[name]
+    n, h = problem.system.n, 1e-6
+    for z in sample_points(problem):
+        gradient = np.array(
+            [
+                (reduced_hamiltonian(problem, z + e) - reduced_hamiltonian(problem, z - e)) / (2 * h)
+                for e in h * np.eye(2 * n)
+            ]
+        )
+        assert rates(problem, z) == pytest.approx(np.concatenate([gradient[n:], -gradient[:n]]), abs=1e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_sensitivity_equations_are_the_derivative_of_the_flow(name):
+    problem = PROBLEMS[name]
+    n, h = problem.system.n, 1e-6
+    for z in sample_points(problem):
+        identity, jacobian, dz = np.eye(2 * n), np.empty((2 * n, 2 * n)), np.empty(2 * n)
+        problem.arrays.flow(z, problem.arrays.data, problem.arrays.field, identity, dz, jacobian)
+        differences = [(rates(problem, z + e) - rates(problem, z - e)) / (2 * h) for e in h * np.eye(2 * n)]
+        assert jacobian == pytest.approx(np.array(differences).T, abs=2e-6, rel=2e-6)
+
+
+def test_bounded_controls_saturate_and_the_flow_follows():
+    system = ControlAffineSystem(state=(x, v), drift=(v, 0), fields=((0, 1),))
+    problem = OptimalControlProblem(system, (0, 0), (1, 0), 1.0, (2.0,), control_bounds=((-0.5, 1.0),))
+    u = np.empty(1)
+    for costate, expected in ((0.4, -0.2), (5.0, -0.5), (-1.0, 0.5), (-5.0, 1.0)):
+        problem.arrays.control(np.array([0.0, 0.0, 0.3, costate]), problem.arrays.data, u)
+        assert u[0] == expected
+        assert rates(problem, np.array([0.0, 0.0, 0.3, costate]))[1] == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"state": (x, x)}, "state: expected distinct"),
+        ({"state": ("x", "v")}, "state: expected distinct SymPy symbols"),
+        ({"drift": (0,)}, "drift: expected 2 expressions, one per state, got 1"),
+        ({"fields": ()}, "fields: expected at least one"),
+        ({"fields": ((0, 1), (1,))}, r"fields\[1\]: expected 2"),
+        ({"fields": ((0, sp.Symbol("k")),)}, r"fields\[0\]: unknown symbol 'k'"),
+        ({"angles": (sp.Symbol("theta"),)}, "angles: .*theta"),
+    ],
+)
+def test_a_wrong_declaration_is_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ControlAffineSystem(**{"state": (x, v), "drift": (v, 0), "fields": ((0, 1),), **arguments})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"start": (0,)}, "start: expected 2 numbers, got 1"),
+        ({"start": (0, None)}, "start: expected finite"),
+        ({"goal": (0, float("nan"))}, "goal: expected finite"),
+        ({"horizon": 0.0}, "horizon: expected a positive number, got 0.0"),
+        ({"control_weight": (-1,)}, "control_weight: .*-1"),
+        ({"control_bounds": ((1, 0),)}, r"control_bounds: .*\(1, 0\)"),
+        ({"control_bounds": ()}, "control_bounds: expected 1 pairs"),
+        ({"state_cost": sp.Symbol("k")}, "state_cost: unknown symbol 'k'"),
+    ],
+)
+def test_a_wrong_problem_is_named(arguments, message):
+    system = ControlAffineSystem(state=(x, v), drift=(v, 0), fields=((0, 1),))
+    good = {"start": (0, 0), "goal": (1, 0), "horizon": 1.0, "control_weight": (1,)}
+    with pytest.raises(ValueError, match=message):
+        OptimalControlProblem(system, **{**good, **arguments})
