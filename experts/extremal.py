@@ -68,7 +68,7 @@ class Iteration:
     rejected: int
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Extremal:
     """The result of `solve` and `find_optimum`.
 
@@ -99,6 +99,9 @@ class Extremal:
     certificate: Certificate | None = None
     nodes: int = 0
     work: int = 0
+
+    def __repr__(self) -> str:
+        return f"Extremal({self.status.name}, cost={self.cost:.9g}, {len(self.times)} points, {self.certificate})"
 
     @property
     def success(self) -> bool:
