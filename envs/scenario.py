@@ -18,8 +18,10 @@ from pydantic_core import ErrorDetails
 
 from leapnav.envs.obstacles import clearance, pack_field
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+# Squares of larger numbers, in metres or seconds, would leave nothing of a double's precision for the robot.
+LARGEST = 1e6
+Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 Point = tuple[Finite, Finite]
 
 
@@ -45,7 +47,7 @@ class Cost(_Frozen):
 
     speed_weight: Positive = 1.0
     turn_weight: Positive = 0.5
-    proximity_weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    proximity_weight: Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)] = 1.0
     proximity_scale: Positive = 0.1
 
 

@@ -17,6 +17,7 @@ class Status(Enum):
 
     SUCCESS = "certified: a local minimum, to the tolerance"
     NO_PATH = "no path from start to goal was found. Check that the gaps between the obstacles let the robot through."
+    HORIZON_TOO_SHORT = "the robot cannot get there in time at its limits. Try a longer horizon or higher limits."
     STALLED = "Newton's method made no more progress. Try method='leapfrog', a better guess, or find_optimum."
     DIVERGED = "the extremal flow diverged from the guess. Try a guess nearer to the solution or method='leapfrog'."
     SINGULAR = "the Newton matrix is singular: the solution is not isolated. Move the start or the goal a little."

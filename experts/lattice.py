@@ -27,8 +27,9 @@ _QUARTER_TURN = np.array([(0, 1), (-1, 0)], dtype=np.int64)
 DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
 ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
 HEADINGS = len(ANGLES)
-CELL = 0.2  # m; half of it is the resolution at which obstacles are seen
-MOST_CELLS = 150  # per side; larger arenas get larger cells
+# The cell (m) is small enough to manoeuvre over a short way; half of it is the resolution at which obstacles are seen.
+SMALLEST_CELL, LARGEST_CELL, CELLS_ON_THE_WAY = 0.05, 0.2, 20
+MOST_CELLS = 250  # per side; larger arenas get larger cells
 # How far (m) a lattice point may lie inside an obstacle: a gap that the robot just passes can lie between two points.
 TOLERATED_DEPTH = 0.1
 MOVES = 12  # per node, see `_move`
@@ -76,17 +77,17 @@ def _sample_field(field, x0, y0, spacing, columns, rows):
 
 @njit(
     types.Tuple((vector, int32[::1]))(
-        matrix, matrix, int64[::1], vector, int64[::1], float64, float64, float64, float64
+        matrix, matrix, int64[::1], vector, int64[::1], float64, float64, float64, float64, float64
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_weight, reach):
+def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_weight, reach, slack):
     """Cost to every node (nx * ny * HEADINGS) and its predecessor, from the seeds out.
 
     `speed` = sqrt(2 (E + Phi)) and `free` = clearance on the half-cell grid. Stops beyond `reach` times the cost of the
-    first target.
+    first target, and `slack` more.
     """
     nx, ny = (speed.shape[0] + 1) // 2, (speed.shape[1] + 1) // 2
     cost = np.full(nx * ny * HEADINGS, np.inf)
@@ -117,7 +118,8 @@ def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_
             break
         done[node] = True
         if is_target[node] and limit == np.inf:
-            limit = reach * key
+            # A metre more than a multiple of the best: manoeuvres around a goal near by are long compared with it.
+            limit = reach * key + slack
         k = node % HEADINGS
         j = (node // HEADINGS) % ny
         i = node // (HEADINGS * ny)
@@ -163,10 +165,12 @@ class Lattice:
     # Candidates this much dearer than the first, in the lattice's own cost, are not worth a look.
     REACH = 1.6
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, refinement: int = 1) -> None:
         self.scenario = scenario
         x_min, y_min, x_max, y_max = scenario.arena
-        self.cell = max(CELL, (x_max - x_min) / MOST_CELLS, (y_max - y_min) / MOST_CELLS)
+        distance = math.dist(scenario.start[:2], scenario.goal[:2])
+        cell = min(max(distance / CELLS_ON_THE_WAY, SMALLEST_CELL), LARGEST_CELL) / refinement
+        self.cell = max(cell, (x_max - x_min) / MOST_CELLS, (y_max - y_min) / MOST_CELLS)
         # The start is a lattice point.
         x, y, _ = scenario.start
         left, below = int((x - x_min) / self.cell), int((y - y_min) / self.cell)
@@ -185,6 +189,11 @@ class Lattice:
         # Paths are longer than the straight line; the search corrects this.
         length = 1.3 * math.sqrt(cost.speed_weight * math.hypot(x1 - x0, y1 - y0) ** 2 + cost.turn_weight * turn**2)
         return max(0.5 * (length / self.scenario.horizon) ** 2, 1e-4)
+
+    @property
+    def slack(self) -> float:
+        """Cost of a metre in the open, at the current energy."""
+        return math.sqrt(2 * self.energy * self.scenario.cost.speed_weight)
 
     def _seeds(self, x: float, y: float, heading: float | None, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes around a pose and the cost to reach them from it."""
@@ -220,7 +229,7 @@ class Lattice:
         behind, parents_behind, _ = self._tree(self.scenario.goal, self.scenario.start)
         through = ahead + behind
         order = np.argsort(through)
-        order = order[: np.searchsorted(through[order], self.REACH * through[order[0]])]
+        order = order[: np.searchsorted(through[order], self.REACH * through[order[0]] + self.slack)]
         taken = np.zeros((*self.shape, HEADINGS), dtype=bool)
         flat = taken.ravel()
         for node in order:
@@ -238,7 +247,16 @@ class Lattice:
         seeds, seed_costs = self._seeds(*root, speed)
         ends, end_costs = self._seeds(*target, speed)
         costs, parents = _dijkstra(
-            speed, self.free, seeds, seed_costs, ends, self.cell, cost.speed_weight, cost.turn_weight, self.REACH
+            speed,
+            self.free,
+            seeds,
+            seed_costs,
+            ends,
+            self.cell,
+            cost.speed_weight,
+            cost.turn_weight,
+            self.REACH,
+            self.slack,
         )
         totals = costs[ends] + end_costs
         best = int(np.argmin(totals))
@@ -284,6 +302,7 @@ class Lattice:
 
     def _candidate(self, path: tuple[np.ndarray, np.ndarray], cost: float) -> Candidate:
         length, phi = self._segments(path[1])
-        durations = length / np.sqrt(2 * (self._energy(path) + phi))
+        # A path of no length (the goal is the start) still takes time: spread it evenly.
+        durations = np.maximum(length, 1e-9) / np.sqrt(2 * (self._energy(path) + phi))
         times = np.concatenate([[0.0], np.cumsum(durations)])
         return Candidate(times * (self.scenario.horizon / times[-1]), path[1], cost)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 
@@ -21,7 +20,7 @@ NEWTON_ITERATIONS = 40
 # Three sweeps leave a path within a few per cent of its local optimum; what is dearer by more cannot become the best.
 SCREENING_MARGIN = 1.25
 SWEEPS, MORE_SWEEPS = 3, 8
-MOST_ROUNDS = 8
+MOST_ROUNDS = 4
 # Two paths this near at all times (metres, and as much in radians) lead to the same extremal.
 SAME_PATH = 0.15
 
@@ -41,6 +40,9 @@ class _Attempt:
     def cost(self) -> float:
         return float(self.costs.sum())
 
+    def certify(self, converged: Status) -> Extremal:
+        return certify(self.problem, self.times, self.nodes, converged, tuple(self.history), self.work)
+
 
 def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
     """The reference of a scenario: the cheapest certified extremal among many.
@@ -53,7 +55,7 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
         candidates: how many distinct paths to try at once; more are tried only as long as none of them is certified.
 
     Returns:
-        An `Extremal`; if none is certified, the cheapest failure, or one with status NO_PATH.
+        An `Extremal`; if none is certified, a failure whose status says why.
 
     Raises:
         ValueError: candidates < 1.
@@ -62,41 +64,85 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
     if candidates < 1:
         raise ValueError(f"candidates: expected at least 1, got {candidates!r}")
     problem = OptimalControlProblem.from_scenario(scenario)
-    paths = Lattice(scenario).candidates()
-    failed: list[Extremal] = []
-    for _ in range(MOST_ROUNDS):
-        batch = [Path(c.times, c.poses) for c in islice(paths, candidates)]
-        if not batch:
-            break
-        for extremal in _extremals(problem, batch, scenario):
+    search = _Search(scenario)
+    shortest_time = np.inf
+    for refinement in (1, 2):  # a narrow gap or a short way may need a finer lattice
+        paths = Lattice(scenario, refinement).candidates()
+        for _ in range(MOST_ROUNDS):
+            batch = [Path(c.times, c.poses) for c in islice(paths, candidates)]
+            if not batch:
+                break
+            shortest_time = min(shortest_time, *(_shortest_time(path, scenario) for path in batch))
+            search.add([_sweep(problem, path) for path in batch])
+            if search.best is not None:
+                return search.best
+    if shortest_time == np.inf:
+        return failure(problem, Status.NO_PATH)
+    if shortest_time > scenario.horizon:
+        return failure(problem, Status.HORIZON_TOO_SHORT)
+    return search.failure()
+
+
+class _Search:
+    """The extremals found so far in a scenario, and the best of them whose certificate holds."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.best: Extremal | None = None
+        self._solved: list[_Attempt] = []
+        self._stalled: list[_Attempt] = []
+        self._refused: list[Extremal] = []
+
+    def add(self, attempts: list[_Attempt]) -> None:
+        """Polishes what is promising, the cheapest first."""
+        attempts = sorted(attempts, key=lambda attempt: attempt.cost)
+        stalled = [attempt for attempt in attempts if self._promising(attempt) and not self._polish(attempt)]
+        for attempt in stalled:
+            if self._promising(attempt):  # more sweeps: nearer to the extremal, or onto another one
+                rows, work = sweep(attempt.problem, attempt.times, attempt.nodes, attempt.costs, MORE_SWEEPS)
+                attempt.history += rows
+                attempt.work += work
+                if not self._polish(attempt):
+                    self._stalled.append(attempt)
+
+    def failure(self) -> Extremal:
+        """What to return if nothing was certified: the cheapest extremal that was refused, or what stalled."""
+        if self._refused:
+            return min(self._refused, key=lambda extremal: extremal.cost)
+        collided = [a for a in self._solved if clearances(a.nodes, self.scenario.field).min() <= 0]
+        attempts = sorted(collided or self._stalled, key=lambda attempt: attempt.cost)
+        converged = Status.SUCCESS if collided else Status.STALLED
+        return attempts[0].certify(converged)
+
+    def _promising(self, attempt: _Attempt) -> bool:
+        bound = np.inf if self.best is None else SCREENING_MARGIN * self.best.cost
+        return attempt.cost <= bound and not any(_same(attempt, other) for other in self._solved)
+
+    def _polish(self, attempt: _Attempt) -> bool:
+        """Newton on an attempt's nodes; False if it does not converge."""
+        nodes = attempt.nodes.copy()
+        status, rows, work = polish(attempt.problem, attempt.times, nodes, TOLERANCE, NEWTON_ITERATIONS)
+        attempt.history += rows
+        attempt.work += work
+        if status is not Status.SUCCESS:
+            return False
+        attempt.nodes = nodes
+        self._solved.append(attempt)
+        clear = clearances(nodes, self.scenario.field).min() > 0
+        if clear and (self.best is None or rows[-1].cost < self.best.cost):
+            extremal = attempt.certify(Status.SUCCESS)
             if extremal.success:
-                return extremal
-            failed.append(extremal)
-    return min(failed, key=lambda extremal: extremal.cost, default=failure(problem, Status.NO_PATH))
+                self.best = extremal
+            else:
+                self._refused.append(extremal)
+        return True
 
 
-def _extremals(problem: OptimalControlProblem, paths: list[Path], scenario: Scenario) -> Iterator[Extremal]:
-    """Extremals of the promising paths, cheapest first; a failure if there is none."""
-    attempts = sorted((_sweep(problem, path) for path in paths), key=lambda attempt: attempt.cost)
-    polished: list[tuple[float, _Attempt]] = []
-
-    def promising(attempt: _Attempt) -> bool:
-        best = min((cost for cost, _ in polished), default=np.inf)
-        return attempt.cost <= SCREENING_MARGIN * best and not any(_same(attempt, other) for _, other in polished)
-
-    stalled = [a for a in attempts if promising(a) and not _polish(a, scenario, polished)]
-    for attempt in stalled:
-        if promising(attempt):  # more sweeps: nearer to the extremal, or onto another one
-            rows, work = sweep(attempt.problem, attempt.times, attempt.nodes, attempt.costs, MORE_SWEEPS)
-            attempt.history += rows
-            attempt.work += work
-            _polish(attempt, scenario, polished)
-    for _, attempt in sorted(polished, key=lambda pair: pair[0]):
-        yield certify(
-            attempt.problem, attempt.times, attempt.nodes, Status.SUCCESS, tuple(attempt.history), attempt.work
-        )
-    if not polished:
-        yield failure(problem, Status.STALLED, tuple(attempts[0].history), sum(attempt.work for attempt in attempts))
+def _shortest_time(path: Path, scenario: Scenario) -> float:
+    """How long (s) a path takes at the robot's limits."""
+    step = np.abs(np.diff(path.states, axis=0))
+    driving = np.hypot(step[:, 0], step[:, 1]) / scenario.robot.max_speed
+    return float(np.maximum(driving, step[:, 2] / scenario.robot.max_turn_rate).sum())
 
 
 def _sweep(problem: OptimalControlProblem, path: Path) -> _Attempt:
@@ -105,20 +151,6 @@ def _sweep(problem: OptimalControlProblem, path: Path) -> _Attempt:
     costs = connect(problem, times, nodes)
     rows, work = sweep(problem, times, nodes, costs, SWEEPS)
     return _Attempt(problem, times, nodes, costs, rows, work)
-
-
-def _polish(attempt: _Attempt, scenario: Scenario, polished: list[tuple[float, _Attempt]]) -> bool:
-    """Newton on an attempt's nodes; a solution that is clear of the obstacles at its nodes joins `polished`."""
-    nodes = attempt.nodes.copy()
-    status, rows, work = polish(attempt.problem, attempt.times, nodes, TOLERANCE, NEWTON_ITERATIONS)
-    attempt.history += rows
-    attempt.work += work
-    if status is not Status.SUCCESS:
-        return False
-    if clearances(nodes, scenario.field).min() > 0:
-        attempt.nodes = nodes
-        polished.append((rows[-1].cost, attempt))
-    return True
 
 
 def _same(attempt: _Attempt, other: _Attempt) -> bool:

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from helpers import best_known
+from helpers import best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
 from leapnav.envs import Scenario, sample_scenario
-from leapnav.experts import find_optimum
+from leapnav.experts import Status, find_optimum
 from leapnav.experts.lattice import Lattice
 
 BEST_KNOWN = best_known()
@@ -113,6 +113,47 @@ def test_other_arenas_and_robots_are_solved_too():
     assert scaled.success
     # Differences: the smoothing of |p - c| is in metres, 1e-6.
     assert scaled.cost == pytest.approx(find_optimum(scenario).cost, rel=1e-4)
+
+
+def changed(**changes):
+    return Scenario.from_dict(scenario_fields(**changes))
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        changed(obstacles=[], start=[1, 1, 0.0], goal=[1, 1.1, 0.0], horizon=5.0),
+        changed(obstacles=[], start=[1, 1, 0.0], goal=[1, 1, 3.0], horizon=5.0),
+        changed(obstacles=[], start=[0.5, 0.5, 0.0], goal=[1.5, 1.5, 0.0], horizon=5.0, arena=[0, 0, 2, 2]),
+        changed(goal=[8.0, 8.0, 50.0]),
+        changed(horizon=100.0),
+    ],
+    ids=["beside", "turn", "small arena", "many turns", "long horizon"],
+)
+def test_unusual_scenarios_are_solved_too(scenario):
+    assert find_optimum(scenario).success
+
+
+@pytest.mark.parametrize(
+    ("scenario", "status"),
+    [
+        (changed(horizon=3.0), Status.HORIZON_TOO_SHORT),
+        (changed(horizon=1e-9), Status.HORIZON_TOO_SHORT),
+        # Without a proximity cost the way leads straight through the obstacle.
+        (changed(cost={"proximity_weight": 0.0}, start=[1, 4.5, 0.0], goal=[8, 4.5, 0.0]), Status.COLLISION),
+    ],
+    ids=["too fast", "no time", "collision"],
+)
+def test_what_cannot_be_solved_says_why(scenario, status):
+    extremal = find_optimum(scenario)
+    assert extremal.status is status
+    assert not extremal.success
+
+
+def test_a_goal_at_the_start_is_no_crash_and_no_wrong_success():
+    extremal = find_optimum(changed(start=[1, 1, 0.0], goal=[1, 1, 0.0]))
+    assert extremal.status is not Status.NO_PATH
+    assert not extremal.success or extremal.certificate.residual <= 1e-8
 
 
 def test_bad_arguments_are_named():

@@ -51,6 +51,8 @@ FAULTS = [
     ({"horizon": -1.5}, "horizon", "-1.5"),
     ({"horizon": math.nan}, "horizon", "nan"),
     ({"horizon": math.inf}, "horizon", "inf"),
+    ({"horizon": 1e300}, "horizon", "1e+300"),
+    ({"arena": [0, 0, 1e308, 10]}, "arena[2]", "1e+308"),
     ({"horizon": "12"}, "horizon", "'12'"),
     ({"horizon": True}, "horizon", "True"),
     ({"start": [1.0, math.nan, 0.0]}, "start[1]", "nan"),
