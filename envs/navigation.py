@@ -19,6 +19,7 @@ from leapnav.envs.sensing import POSE_ENTRIES, observe
 
 # Bounds of the observation that no scenario of a sensible size reaches; values beyond are clipped.
 FARTHEST, LONGEST, FASTEST = 1000.0, 10_000.0, 20.0
+SHORTEST_PERIOD = 1e-4  # s
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
 
@@ -60,7 +61,7 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
     | `effort` | minus the integral of 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
     | `proximity` | minus the integral of Phi, the scenario's proximity cost | always |
     | `collision` | `-collision_penalty` | the first time that something is touched |
-    | `miss` | `-miss_penalty` | the horizon is reached away from the goal |
+    | `miss` | `-miss_penalty` | the episode ends away from the goal, by the horizon or by a touch |
 
     ## Starting state
     The scenario's start. The scenario is `options["scenario"]` (a `Scenario`, a dict in the layout of its file, or its
@@ -82,7 +83,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
     * `scenario`: the one scenario of all episodes, instead of a family.
     * `control_period` (s): how long an action is held. The last period of an episode ends at the horizon.
     * `position_tolerance` (m), `heading_tolerance` (rad): of success.
-    * `collision_penalty`, `miss_penalty`: larger than the optimum's cost, so that neither ever pays.
+    * `collision_penalty`, `miss_penalty`: should be larger than the optimum's cost, or standing still pays; 50 is, for
+      the families.
     * `terminate_on_collision`: whether a touch ends the episode.
     * `lidar_beams`, `lidar_range` (m).
     * `render_mode`: `"rgb_array"` or None.
@@ -122,8 +124,10 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         for name, value in (("collision_penalty", collision_penalty), ("miss_penalty", miss_penalty)):
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name}: expected a number >= 0, got {value!r}")
-        if lidar_beams < 0:
-            raise ValueError(f"lidar_beams: expected a number >= 0, got {lidar_beams!r}")
+        if control_period < SHORTEST_PERIOD:
+            raise ValueError(f"control_period: expected at least {SHORTEST_PERIOD} s, got {control_period!r}")
+        if not isinstance(lidar_beams, int) or lidar_beams < 0:
+            raise ValueError(f"lidar_beams: expected an integer >= 0, got {lidar_beams!r}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}")
         self.family = family
@@ -134,7 +138,7 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         self.collision_penalty = float(collision_penalty)
         self.miss_penalty = float(miss_penalty)
         self.terminate_on_collision = terminate_on_collision
-        self.lidar_beams = int(lidar_beams)
+        self.lidar_beams = lidar_beams
         self.lidar_range = float(lidar_range)
         self.render_mode = render_mode
 
@@ -166,7 +170,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         unknown = set(options or {}) - {"scenario"}
         if unknown:
             raise ValueError(f"options: expected 'scenario', got {sorted(unknown)[0]!r}")
-        chosen = (options or {}).get("scenario", self.fixed_scenario)
+        chosen = (options or {}).get("scenario")
+        chosen = self.fixed_scenario if chosen is None else chosen
         self.scenario = sample_scenario(self.family, self.np_random) if chosen is None else _as_scenario(chosen)
         self._begin()
         info = self._info(clearance(self.pose[0], self.pose[1], self.scenario.field)[0], False, dict(_NO_REWARD))
@@ -191,6 +196,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         """Holds an action for one control period."""
         if self._world is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
+        if len(action) != 2:
+            raise ValueError(f"action: expected two finite numbers, got {action!r}")
         speed = min(max(float(action[0]), -1.0), 1.0) * self._limits[0]
         turn_rate = min(max(float(action[1]), -1.0), 1.0) * self._limits[1]
         if not (math.isfinite(speed) and math.isfinite(turn_rate)):
@@ -213,13 +220,13 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         first_touch = touched and not self._collided
         self._collided = self._collided or touched
         success = last and not self._collided and self.at_goal
+        terminated = last or (self._collided and self.terminate_on_collision)
         parts = {
             "effort": -effort,
             "proximity": -near,
             "collision": -self.collision_penalty if first_touch else 0.0,
-            "miss": -self.miss_penalty if last and not self.at_goal else 0.0,
+            "miss": -self.miss_penalty if terminated and not (last and self.at_goal) else 0.0,
         }
-        terminated = last or (self._collided and self.terminate_on_collision)
         reward = parts["effort"] + parts["proximity"] + parts["collision"] + parts["miss"]
         return self._observation(), reward, terminated, False, self._info(nearest, success, parts)
 

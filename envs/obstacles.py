@@ -198,12 +198,13 @@ def arc_clearance(x, y, heading, distance, turn, field):
     """Smallest clearance (m) along a circular arc, exact to a millimetre.
 
     The arc starts at a pose, is `distance` metres long (negative: backwards) and turns by `turn` radians. Clearance
-    changes by no more than the way driven, so the walk skips what cannot hold a smaller value.
+    changes by no more than the way driven, so the walk skips what cannot hold a smaller value. It ends at the first
+    touch: how deep the arc goes from there does not matter.
     """
     total = abs(distance)
     lowest, _ = clearance(x, y, field)
     driven = 0.0
-    while driven < total:
+    while driven < total and lowest > 0.0:
         part = driven / total
         chord = distance * part * sinc(turn * part / 2)
         middle = heading + turn * part / 2

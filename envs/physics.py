@@ -59,7 +59,7 @@ class World:
         return x, y, self.body.angle
 
     def drive(self, speed: float, turn_rate: float, duration: float) -> tuple[float, bool]:
-        """Holds a command for `duration` seconds: (smallest clearance on the arc in m, whether anything was touched).
+        """Holds a command for `duration` seconds: (smallest clearance on the arc in m, whether it touched anything).
 
         The exact arc of a command is a chord of length v h sinc(omega h / 2) at the mean heading. A body that is given
         the chord as its velocity ends where the arc ends, because Chipmunk moves bodies by an Euler step.
@@ -68,13 +68,13 @@ class World:
         heading = self.body.angle
         turn = turn_rate * duration
         clear = arc_clearance(x, y, heading, speed * duration, turn, self._field)
-        along = speed * sinc(turn / 2)
-        self.body.velocity = along * math.cos(heading + turn / 2), along * math.sin(heading + turn / 2)
+        self._touched = clear <= 0
+        pieces = 1 if clear > CONTACT_MARGIN else CONTACT_SUBSTEPS
+        along = speed * sinc(turn / pieces / 2)
         self.body.angular_velocity = turn_rate
-        if clear > CONTACT_MARGIN:
-            self.space.step(duration)
-        else:
-            for _ in range(CONTACT_SUBSTEPS):
-                self.space.step(duration / CONTACT_SUBSTEPS)
-            self._touched = self._touched or clear <= 0
+        for piece in range(pieces):
+            if not self._touched or piece == 0:  # from the first touch on, the velocity is what the contact leaves
+                middle = heading + turn * (piece + 0.5) / pieces
+                self.body.velocity = along * math.cos(middle), along * math.sin(middle)
+            self.space.step(duration / pieces)
         return clear, self._touched

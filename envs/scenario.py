@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -127,7 +128,7 @@ class Scenario(_Frozen):
     obstacles: tuple[Obstacle, ...] = ()
     cost: Cost = Cost()
 
-    def __init__(self, **fields: Any) -> None:
+    def __init__(self, /, **fields: Any) -> None:
         try:
             super().__init__(**fields)
         except ValidationError as error:
@@ -169,6 +170,16 @@ class Scenario(_Frozen):
     def _key(self) -> tuple[Any, ...]:
         return tuple(getattr(self, name) for name in type(self).model_fields)
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """The scenario with some fields changed, validated like any other."""
+        fields = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**fields, **(update or {})})
+
+    def __getstate__(self) -> dict[Any, Any]:
+        state = super().__getstate__()
+        # The packed field is made again where the scenario arrives: pickled arrays come out writeable.
+        return {**state, "__dict__": {k: v for k, v in state["__dict__"].items() if k != "field"}}
+
     def to_json(self, path: str | Path | None = None) -> str:
         """The scenario as JSON text; also written to `path` if one is given."""
         text = json.dumps(self.to_dict())
@@ -188,9 +199,12 @@ class Scenario(_Frozen):
             ScenarioError: see the class.
 
         """
-        if not isinstance(fields, dict):
+        if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
             raise ScenarioError(f"a scenario is a JSON object, got {_shorten(fields)}")
-        return cls(**_tuples(fields))
+        try:
+            return cls(**_tuples(fields))
+        except RecursionError:
+            raise ScenarioError(f"Scenario {_shorten(fields.get('name'))}: the fields are nested too deeply") from None
 
     @classmethod
     def from_json(cls, path_or_text: str | Path) -> Scenario:
@@ -204,9 +218,11 @@ class Scenario(_Frozen):
         is_text = isinstance(path_or_text, str) and path_or_text.lstrip().startswith("{")
         source, text = ("text", str(path_or_text)) if is_text else (str(path_or_text), None)
         try:
-            text = Path(path_or_text).read_text(encoding="utf-8") if text is None else text
+            text = Path(path_or_text).read_text(encoding="utf-8-sig") if text is None else text
             fields = json.loads(text, object_pairs_hook=_unique_keys)
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except ScenarioError:
+            raise
+        except (ValueError, RecursionError) as error:  # syntax, encoding, a number of thousands of digits, nesting
             raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
         return cls.from_dict(fields)
 
@@ -243,4 +259,5 @@ def _one_line(name: Any, error: ValidationError) -> str:
     # Faults of the whole scenario name field and value themselves; a missing field has no value.
     value = "" if not path or first["type"] == "missing" else f", got {_shorten(first['input'])}"
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    return f"Scenario {_shorten(name)}: {path}{': ' if path else ''}{message}{value}{more}"
+    line = f"Scenario {_shorten(name)}: {path}{': ' if path else ''}{message}{value}{more}"
+    return " ".join(line.splitlines())  # an unknown key may hold anything

@@ -17,7 +17,8 @@ from leapnav.experts.problem import OptimalControlProblem
 ACCURACY = 1e-12
 ROUGH_ACCURACY = 1e-6
 MOST_ROWS = 100_000  # steps of an extremal; one that needs more has diverged
-POINTS_PER_STEP = 4  # of the dense path on which clearance is taken: a few millimetres apart
+# The dense path has a point every SPACING metres; where it comes nearer to something than that, every tenth of that.
+SPACING = 5e-3
 
 
 @njit(float64(matrix), cache=True, error_model="numpy", nogil=True)
@@ -179,11 +180,15 @@ def certify(
         nodes=len(times),
         work=work,
     )
+    if arrays.free.any():
+        conjugate_point = _first_focal_time(extremal, arrays.free)
+    else:
+        conjugate_point = None if conjugate == np.inf else float(conjugate)
     certificate = Certificate(
         residual=float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max())),
         defect=float(gap),
         hamiltonian_drift=float(np.ptp(hamiltonian)),
-        conjugate_point=None if conjugate == np.inf else float(conjugate),
+        conjugate_point=conjugate_point,
         clearance=None if problem.field is None else _dense_clearance(extremal, problem),
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
@@ -192,11 +197,55 @@ def certify(
 
 def _dense_clearance(extremal: Extremal, problem: OptimalControlProblem) -> float:
     assert problem.field is not None and problem.system.position is not None
-    share = np.arange(POINTS_PER_STEP) / POINTS_PER_STEP
-    times = (extremal.times[:-1, None] + share * np.diff(extremal.times)[:, None]).ravel()
+    field = problem.field
     at = [problem.system.state.index(symbol) for symbol in problem.system.position]
-    states = extremal.evaluate(np.append(times, extremal.times[-1]))[0]
-    return float(clearances(np.ascontiguousarray(states[:, at]), problem.field).min())
+
+    def look(times: np.ndarray) -> np.ndarray:
+        return clearances(np.ascontiguousarray(extremal.interpolate(times)[:, at]), field)
+
+    # Speeds at both ends of a step bound the way driven in it, up to a factor that steps this accurate stay below.
+    speeds = np.linalg.norm(extremal.rates[:, at], axis=1)
+    way = 1.5 * np.maximum(speeds[1:], speeds[:-1]) * np.diff(extremal.times)
+    times = _subdivide(extremal.times, np.ceil(way / SPACING).astype(int).clip(1))
+    found = look(times)
+    near = (found[1:] < SPACING) | (found[:-1] < SPACING)
+    if near.any():
+        found = np.append(found, look(_subdivide(times, np.where(near, 10, 1))))
+    return float(found.min())
+
+
+def _subdivide(times: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+    """Each interval of `times` (N,) in so many equal pieces (N - 1,)."""
+    first = np.repeat(times[:-1], pieces)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    return np.append(first + number * np.repeat(np.diff(times) / pieces, pieces), times[-1])
+
+
+def _first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
+    """Last time at which the extremals that meet the end conditions focus, for free final components.
+
+    These extremals are a Lagrangian subspace of (dq, dlambda): at the horizon dq_i = 0 where q_i is fixed and
+    dlambda_i = 0 where it is free. Carried backwards, its projection on dq loses rank at a focal point, and an extremal
+    with one before its horizon is no local minimum.
+    """
+    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    symplectic = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    basis = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
+    z = np.concatenate([extremal.states, extremal.costates], axis=1)
+    sign, before = 0.0, 0.0
+    for k in range(len(extremal.times) - 2, -1, -1):
+        step = extremal.times[k + 1] - extremal.times[k]
+        S = np.eye(2 * n)
+        propagate(arrays.flow, z[k].copy(), S, step, arrays.data, arrays.field, ROUGH_ACCURACY, step, False)
+        basis = -symplectic @ S.T @ symplectic @ basis  # the inverse of a symplectic matrix
+        basis = np.ascontiguousarray(basis)
+        determinant = _orthonormalise(basis)
+        if abs(determinant) > 1e-9:
+            if sign * determinant < 0:
+                return float(extremal.times[k] + step * determinant / (determinant - before))
+            sign = math.copysign(1.0, determinant)
+        before = determinant
+    return None
 
 
 def failure(

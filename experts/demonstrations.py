@@ -189,6 +189,7 @@ def rollout(
     folder = FilePath(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder}: exists and is not empty; choose another folder or remove it")
+    folder.parent.mkdir(parents=True, exist_ok=True)  # before the work: an impossible place is told at once
     found: list[Demonstration] = []
     solved = unsolved = failed = 0
     following = seed
@@ -237,28 +238,27 @@ def write_demonstrations(demonstrations: Sequence[Demonstration], folder: FilePa
                 },
             )
         )
-    # Written beside its place and moved there: an interrupted run leaves no half of a dataset behind.
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as scratch, _minari_root(scratch):
+    # Written beside its place and moved there whole: an interrupted run leaves no half of a dataset behind.
+    with TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as scratch:
+        root = FilePath(scratch) / "root"
         env = gym.make(ENVIRONMENT, family=family)
-        minari.create_dataset_from_buffers(
-            dataset_id(family),
-            episodes,
-            env=env,
-            eval_env=env,
-            algorithm_name="leapnav.experts.find_optimum",
-            author="leapnav",
-            author_email="",
-            code_permalink="",
-            description="Certified optima driven in the environment. Infos: state (x, y, heading), "
-            "costate, cost_to_go, running_cost; the episode's scenario is options['scenario'] as JSON.",
-            requirements=[f"leapnav=={leapnav.__version__}"],
-        )
+        with _minari_root(str(root)):
+            minari.create_dataset_from_buffers(
+                dataset_id(family),
+                episodes,
+                env=env,
+                eval_env=env,
+                algorithm_name="leapnav.experts.find_optimum",
+                author="leapnav",
+                author_email="",
+                code_permalink="",
+                description="Certified optima driven in the environment. Infos: state (x, y, heading), "
+                "costate, cost_to_go, running_cost; the episode's scenario is options['scenario'] as JSON.",
+                requirements=[f"leapnav=={leapnav.__version__}"],
+            )
         if folder.is_dir():
-            folder.rmdir()
-        os.mkdir(folder)
-        for item in FilePath(scratch).iterdir():
-            item.rename(folder / item.name)
+            folder.rmdir()  # empty, or `rollout` would have refused it
+        root.rename(folder)
 
 
 def dataset_id(family: str) -> str:

@@ -35,7 +35,8 @@ class Certificate:
         residual: largest violation of the boundary conditions, transversality included.
         defect: largest gap between a node and the flow from the node before, re-integrated at tight tolerance.
         hamiltonian_drift: largest minus smallest H along the extremal (H is constant on an extremal).
-        conjugate_point: first time (s) before the horizon at which dq(t)/dlambda(0) loses rank; None: a local minimum.
+        conjugate_point: a time (s) before the horizon at which dq(t)/dlambda(0) loses rank, or, where final components
+            are free, at which the extremals that meet the end conditions focus; None: a local minimum.
         clearance: smallest distance (m) to an obstacle or wall on the dense path; None without obstacles.
 
     """
@@ -79,7 +80,7 @@ class Extremal:
         times (N,), states (N, n), controls (N, m), costates (N, n): the solution at the integrator's own steps (s).
         accumulated (N,): cost from time 0.
         rates (N, 2n), curvatures (N, 2n): first and second time derivatives of (q, lambda), for dense evaluation.
-        history: one row per iteration.
+        history: one row per iteration (simple shooting: its last).
         certificate: see `Certificate`; None if the solver returned no path.
         nodes: how many nodes the solver used.
         work: integration steps taken by the solver.
@@ -115,24 +116,42 @@ class Extremal:
         Quintic Hermite interpolation of (q, lambda) between the integrator's steps, controls from the minimum
         principle; times outside [0, horizon] are held at the ends.
         """
-        times = np.clip(np.atleast_1d(np.asarray(t, dtype=float)), 0.0, self.problem.horizon)
+        values = self.interpolate(np.atleast_1d(np.asarray(t, dtype=float)))
         n = self.problem.system.n
-        k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
-        h = (self.times[k + 1] - self.times[k])[:, None]
-        s = (times - self.times[k])[:, None] / h
-        z = np.concatenate([self.states, self.costates], axis=1)
-        values = _quintic(
-            s, h, z[k], self.rates[k], self.curvatures[k], z[k + 1], self.rates[k + 1], self.curvatures[k + 1]
-        )
         arrays = self.problem.arrays
-        controls = np.empty((len(times), self.problem.system.m))
+        controls = np.empty((len(values), self.problem.system.m))
         for row, value in zip(controls, values, strict=True):
             arrays.control(value, arrays.data, row)
         result = values[:, :n], controls, values[:, n:]
         return result if np.ndim(t) else (result[0][0], result[1][0], result[2][0])
 
+    def interpolate(self, times: np.ndarray) -> np.ndarray:
+        """(q, lambda) at times (K,), shape (K, 2n).
+
+        Raises:
+            ValueError: a failed solve has no path.
+
+        """
+        if len(self.times) == 0:
+            raise ValueError(f"there is no path: {self.status.value}")
+        times = np.clip(times, 0.0, self.problem.horizon)
+        k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        h = (self.times[k + 1] - self.times[k])[:, None]
+        s = (times - self.times[k])[:, None] / h
+        z = np.concatenate([self.states, self.costates], axis=1)
+        return _quintic(
+            s, h, z[k], self.rates[k], self.curvatures[k], z[k + 1], self.rates[k + 1], self.curvatures[k + 1]
+        )
+
     def cost_to_go(self, t: Any) -> Any:
-        """Cost from time t to the horizon, scalar or (K,)."""
+        """Cost from time t to the horizon, scalar or (K,).
+
+        Raises:
+            ValueError: a failed solve has no path.
+
+        """
+        if len(self.times) == 0:
+            raise ValueError(f"there is no path: {self.status.value}")
         return self.cost - np.interp(t, self.times, self.accumulated)
 
     def to_dict(self) -> dict[str, Any]:

@@ -30,8 +30,9 @@ HEADINGS = len(ANGLES)
 # The cell (m) is small enough to manoeuvre over a short way; half of it is the resolution at which obstacles are seen.
 SMALLEST_CELL, LARGEST_CELL, CELLS_ON_THE_WAY = 0.05, 0.2, 20
 MOST_CELLS = 250  # per side; larger arenas get larger cells
-# How far (m) a lattice point may lie inside an obstacle: a gap that the robot just passes can lie between two points.
-TOLERATED_DEPTH = 0.1
+# How far inside an obstacle, in robot radii, a lattice point may lie: a gap that the robot just passes can lie between
+# two points, but no wall is thinner than the robot.
+TOLERATED_DEPTH = 0.4
 MOVES = 12  # per node, see `_move`
 ENERGY_CORRECTIONS, ENERGY_TOLERANCE = 2, 0.3  # the latter of log E: the order of candidates hardly depends on it
 Pose = tuple[float, float, float | None]
@@ -77,17 +78,17 @@ def _sample_field(field, x0, y0, spacing, columns, rows):
 
 @njit(
     types.Tuple((vector, int32[::1]))(
-        matrix, matrix, int64[::1], vector, int64[::1], float64, float64, float64, float64, float64
+        matrix, matrix, int64[::1], vector, int64[::1], float64, float64, float64, float64, float64, float64
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_weight, reach, slack):
+def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_weight, reach, slack, depth):
     """Cost to every node (nx * ny * HEADINGS) and its predecessor, from the seeds out.
 
     `speed` = sqrt(2 (E + Phi)) and `free` = clearance on the half-cell grid. Stops beyond `reach` times the cost of the
-    first target, and `slack` more.
+    first target, and `slack` more. `depth` (m) is how far inside an obstacle a point may lie.
     """
     nx, ny = (speed.shape[0] + 1) // 2, (speed.shape[1] + 1) // 2
     cost = np.full(nx * ny * HEADINGS, np.inf)
@@ -132,7 +133,7 @@ def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_
             if done[following]:
                 continue
             middle_x, middle_y = 2 * i + dx, 2 * j + dy
-            if free[2 * a, 2 * b] < -TOLERATED_DEPTH or free[middle_x, middle_y] < -TOLERATED_DEPTH:
+            if free[2 * a, 2 * b] < -depth or free[middle_x, middle_y] < -depth:
                 continue
             mean = (speed[2 * i, 2 * j] + 4.0 * speed[middle_x, middle_y] + speed[2 * a, 2 * b]) / 6.0
             total = key + lengths[k, number] * mean
@@ -257,6 +258,7 @@ class Lattice:
             cost.turn_weight,
             self.REACH,
             self.slack,
+            TOLERATED_DEPTH * self.scenario.robot.radius,
         )
         totals = costs[ends] + end_costs
         best = int(np.argmin(totals))

@@ -64,6 +64,8 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
     if candidates < 1:
         raise ValueError(f"candidates: expected at least 1, got {candidates!r}")
     problem = OptimalControlProblem.from_scenario(scenario)
+    if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.max_speed * scenario.horizon:
+        return failure(problem, Status.HORIZON_TOO_SHORT)
     search = _Search(scenario)
     shortest_time = np.inf
     for refinement in (1, 2):  # a narrow gap or a short way may need a finer lattice

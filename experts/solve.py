@@ -47,7 +47,7 @@ def solve(
         problem: an optimal control problem, or a scenario (whose guess is then the best path of the lattice search).
         method: "leapfrog", "multiple_shooting" or "single_shooting".
         guess: a path; without costates they are estimated from its motion. None: see `problem`, or a straight line.
-        tol: largest residual of the boundary and continuity conditions.
+        tol: largest residual of the boundary and continuity conditions; the certificate asks for 1e-8 in any case.
         max_iterations: of Newton's method.
         segments: shooting segments, and nodes of Leapfrog; None chooses them from the guess.
 
@@ -68,10 +68,11 @@ def solve(
         raise ValueError(f"segments: expected at least 1, got {segments!r}")
     task = as_problem(problem)
     if isinstance(guess, Extremal):
+        if len(guess.times) == 0:
+            raise ValueError(f"guess: the extremal has no path: {guess.status.value}")
         path = Path(guess.times * (task.horizon / guess.times[-1]), guess.states, guess.costates)
     elif guess is not None:
-        path = guess
-        _check_path(path, task)
+        path = _checked(guess, task)
     elif isinstance(problem, Scenario):
         candidate = next(Lattice(problem).candidates(), None)
         if candidate is None:
@@ -241,12 +242,18 @@ def polish(
     return STATUS[code], rows, work
 
 
-def _check_path(path: Path, problem: OptimalControlProblem) -> None:
+def _checked(guess: Path, problem: OptimalControlProblem) -> Path:
     n = problem.system.n
-    if path.times.ndim != 1 or len(path.times) < 2 or not np.all(np.diff(path.times) > 0):
+    costates = None if guess.costates is None else np.asarray(guess.costates, dtype=float)
+    path = Path(np.asarray(guess.times, dtype=float), np.asarray(guess.states, dtype=float), costates)
+    times = path.times
+    if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
         raise ValueError("guess: its times must be an increasing array of at least two")
+    if abs(times[0]) > 1e-6 * problem.horizon or abs(times[-1] - problem.horizon) > 1e-6 * problem.horizon:
+        raise ValueError(f"guess: its times must run from 0 to {problem.horizon:g}, not {times[0]:g} to {times[-1]:g}")
     for name, array in (("states", path.states), ("costates", path.costates)):
-        if array is not None and array.shape != (len(path.times), n):
-            raise ValueError(f"guess: its {name} must have shape {(len(path.times), n)}, got {array.shape}")
+        if array is not None and array.shape != (len(times), n):
+            raise ValueError(f"guess: its {name} must have shape {(len(times), n)}, got {array.shape}")
         if array is not None and not np.isfinite(array).all():
             raise ValueError(f"guess: its {name} are not finite")
+    return path

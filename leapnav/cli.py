@@ -12,7 +12,8 @@ import tyro
 
 from leapnav.training.config import CloningConfig
 
-FAILED, BAD_INPUT = 1, 2  # exit codes
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
+PICTURES = (".png", ".pdf", ".svg")
 DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
 
 
@@ -39,8 +40,7 @@ class Solve:
         from leapnav.experts.plotting import plot_solution
 
         scenario = Scenario.from_json(self.scenario)
-        for path in (self.plot, self.json):
-            _check_parent(path)
+        _check_outputs(self.json, self.plot)
         extremal = find_optimum(scenario) if self.method == "optimum" else solve(scenario, method=self.method)
         print(f"{scenario.name}: {extremal.status.name}: {extremal.status.value}")
         certificate = extremal.certificate
@@ -157,8 +157,10 @@ class Evaluate:
 
         if not self.policies:
             raise ValueError("policies: name at least one folder, or expert, or random")
-        for path in (self.plot, self.json):
-            _check_parent(path)
+        repeated = {name for name in self.policies if self.policies.count(name) > 1}
+        if repeated:
+            raise ValueError(f"policies: {sorted(repeated)[0]}: named more than once")
+        _check_outputs(self.json, self.plot)
         for name in self.policies:  # before minutes are spent on the references
             if name not in ("expert", "random") and not (Path(name) / "policy.json").is_file():
                 raise FileNotFoundError(
@@ -214,6 +216,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT
+    except KeyboardInterrupt:
+        print("leapnav: interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _message(error: Exception) -> str:
@@ -222,7 +227,12 @@ def _message(error: Exception) -> str:
     return str(error)
 
 
-def _check_parent(path: Path | None) -> None:
-    """Output into a folder that does not exist is told before the work, not after."""
-    if path is not None and not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: its folder does not exist")
+def _check_outputs(json: Path | None, plot: Path | None) -> None:
+    """A place that cannot be written to is told before the work, not after."""
+    for path in (json, plot):
+        if path is not None and not path.parent.is_dir():
+            raise FileNotFoundError(f"{path}: its folder does not exist")
+        if path is not None and path.is_dir():
+            raise IsADirectoryError(f"{path}: is a folder")
+    if plot is not None and plot.suffix not in PICTURES:
+        raise ValueError(f"{plot}: expected a name that ends in {', '.join(PICTURES)}")

@@ -51,7 +51,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
         (training, settings.training_scenarios, settings.training_seed, settings.recoveries),
         (test, settings.test_scenarios, settings.test_seed, 0),
     ):
-        if folder.exists():
+        if any(folder.glob("**/metadata.json")):
             console.print(f"Using {folder}")
         else:
             rollout(settings.family, count, folder, seed=seed, recoveries=recoveries, workers=settings.workers)

@@ -176,7 +176,7 @@ def test_a_touch_ends_the_episode_and_is_charged():
     env = NavigateEnv(scenario=task)
     rows = play(env, [np.array([1.0, 0.0])] * 100)
     assert rows[-1][2]
-    assert rows[-1][1] < -49
+    assert rows[-1][1] < -99  # collision and miss
     assert rows[-1][4][0] == pytest.approx(5.75, abs=0.1)
 
 
@@ -193,6 +193,22 @@ def test_a_robot_that_goes_on_after_a_touch_does_not_pass_through():
     assert total == -50.0  # once
     assert info["collision"]
     assert not info["is_success"]
+
+
+@pytest.mark.parametrize(("gap", "period"), [(0.001, 0.05), (0.003, 0.2), (0.005, 0.5)])
+def test_an_arc_close_round_a_disc_is_no_touch(gap, period):
+    # A circle of 1 m at 2 m/s; the chord of a period cuts the corner by more than the gap.
+    disc = {"circle": {"center": [5.0, 5.0], "radius": 1.0 - 0.25 - gap}}
+    task = scenario(start=[6.0, 5.0, math.pi / 2], goal=[2.0, 2.0, 0.0], obstacles=[disc], horizon=3.0)
+    env = NavigateEnv(scenario=task, control_period=period)
+    env.reset()
+    terminated = False
+    while not terminated:
+        _, _, terminated, _, info = env.step(np.array([1.0, 2.0 / 3.0]))
+        assert info["clearance"] == pytest.approx(gap, abs=1e-3)
+    assert not info["collision"]
+    angle = 2.0 * 3.0  # driven: 6 m at 1 m
+    assert env.pose[:2] == pytest.approx((5 + math.cos(angle), 5 + math.sin(angle)), abs=1e-6)
 
 
 def test_lidar_ranges_agree_with_a_fine_walk():
@@ -245,6 +261,8 @@ def test_the_scenario_option_takes_every_form_and_is_reported():
         (lambda: gym.make(ID, control_period=0.0), "control_period: .*0.0"),
         (lambda: gym.make(ID, miss_penalty=-1), "miss_penalty: .*-1"),
         (lambda: gym.make(ID, lidar_beams=-1), "lidar_beams: .*-1"),
+        (lambda: gym.make(ID, lidar_beams=32.7), "lidar_beams: .*32.7"),
+        (lambda: gym.make(ID, control_period=5e-324), "control_period: expected at least"),
         (lambda: gym.make(ID, scenario=scenario_fields(horizon=-1)), "horizon"),
         (lambda: gym.make(ID).reset(options={"seed": 1}), "options: .*'seed'"),
         (lambda: gym.make(ID).reset(options={"scenario": 3}), "scenario: expected .* int"),
@@ -265,6 +283,8 @@ def test_an_action_that_is_not_finite_is_refused_and_changes_nothing():
     env.reset()
     with pytest.raises(ValueError, match="action: expected two finite numbers"):
         env.step(np.array([np.nan, 0.0]))
+    with pytest.raises(ValueError, match="action: expected two finite numbers"):
+        env.step(np.array([0.5]))
     assert env.time == 0.0
     assert env.pose == (5.0, 5.0, 0.3)
 

@@ -10,11 +10,16 @@ from leapnav.envs import Scenario
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
-@pytest.mark.parametrize("block", re.findall(r"```python\n(.*?)```", README, re.DOTALL))
-def test_the_readme_s_examples_run_as_printed(block, tmp_path):
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    ("block", "output"), list(zip(BLOCKS, [r"True -\d\.\d+\n", r"(6\.0|5\.9999)\d+\n"], strict=True))
+)
+def test_the_readme_s_examples_run_as_printed(block, output, tmp_path):
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout
+    assert re.fullmatch(output, done.stdout)
 
 
 def test_the_readme_s_scenario_is_valid():

@@ -271,6 +271,11 @@ def test_no_path_has_its_own_status():
         assert not extremal.success
         assert "path" in extremal.status.value
         assert extremal.to_dict()["cost"] is None
+        for use in (lambda e=extremal: e.evaluate(0.0), lambda e=extremal: e.cost_to_go(0.0)):
+            with pytest.raises(ValueError, match="there is no path"):
+                use()
+        with pytest.raises(ValueError, match="guess: the extremal has no path"):
+            solve(Scenario.from_dict(fields), guess=extremal)
 
 
 def test_a_path_through_an_obstacle_is_a_collision():
@@ -328,13 +333,48 @@ def test_a_flow_that_blows_up_diverges():
         ({"max_iterations": 0}, "max_iterations: .*0"),
         ({"segments": 0}, "segments: .*0"),
         ({"guess": Path(np.array([0.0]), np.zeros((1, 3)))}, "guess: its times"),
-        ({"guess": Path(np.array([0.0, 1.0]), np.zeros((2, 2)))}, "guess: its states must have shape"),
-        ({"guess": Path(np.array([0.0, 1.0]), np.full((2, 3), np.nan))}, "guess: its states are not finite"),
+        (
+            {"guess": Path(np.array([0.0, 1.0]), np.zeros((2, 3)))},
+            "guess: its times must run from 0 to 5.4, not 0 to 1",
+        ),
+        ({"guess": Path(np.array([0.0, 5.4]), np.zeros((2, 2)))}, "guess: its states must have shape"),
+        ({"guess": Path(np.array([0.0, 5.4]), np.full((2, 3), np.nan))}, "guess: its states are not finite"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         solve(SCENARIOS["clutter-0"][0], **arguments)
+
+
+def test_an_obstacle_between_two_integrator_steps_is_seen():
+    # The flow does not feel this disc, so the integrator's steps are decimetres long.
+    fields = {
+        **SCENARIOS["clutter-0"][0].to_dict(),
+        "robot": {"model": "unicycle", "radius": 0.01, "max_speed": 2.0, "max_turn_rate": 3.0},
+        "obstacles": [{"circle": {"center": [5.03, 5.0], "radius": 0.02}}],
+        "cost": {"speed_weight": 1.0, "turn_weight": 0.5, "proximity_weight": 0.0, "proximity_scale": 0.1},
+        "start": [2, 5, 0.0],
+        "goal": [8, 5, 0.0],
+        "horizon": 6.0,
+    }
+    extremal = find_optimum(Scenario.from_dict(fields))
+    assert not extremal.success
+    assert extremal.status is Status.COLLISION
+    assert extremal.certificate.clearance == pytest.approx(-0.03, abs=1e-3)
+
+
+def test_a_focal_point_of_free_end_components_is_no_success():
+    # x' = u, Phi = -x^2/2, free end: x = 0 is an extremal, and a minimum only for horizons below pi/2.
+    x = sp.Symbol("x")
+    system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
+    for horizon in (1.5, 1.6, 2.0, 3.0):
+        problem = OptimalControlProblem(system, (0,), (None,), horizon, (1.0,), state_cost=-(x**2) / 2)
+        extremal = solve(problem, method="multiple_shooting")
+        if horizon < math.pi / 2:
+            assert extremal.success
+        else:
+            assert extremal.status is Status.CONJUGATE_POINT
+            assert extremal.certificate.conjugate_point == pytest.approx(horizon - math.pi / 2, abs=1e-3)
 
 
 def test_a_clearance_between_the_nodes_is_seen():

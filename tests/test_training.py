@@ -281,6 +281,8 @@ def test_one_episode_and_none():
         ({"epochs": 0}, "epochs: .*0"),
         ({"batch_size": -1}, "batch_size: .*-1"),
         ({"validation_share": 1.0}, "validation_share"),
+        ({"learning_rate": math.inf}, "learning_rate: .*inf"),
+        ({"seed": 10**20}, "seed: "),
     ],
 )
 def test_bad_settings_are_named(settings, message, demonstrations, env):

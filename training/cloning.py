@@ -49,8 +49,12 @@ def behaviour_clone(
     if not demonstrations:
         raise ValueError("demonstrations: expected at least one, got none")
     for name in ("epochs", "batch_size", "learning_rate"):
-        if not getattr(config, name) > 0:
+        if not (math.isfinite(getattr(config, name)) and getattr(config, name) > 0):
             raise ValueError(f"{name}: expected a positive number, got {getattr(config, name)!r}")
+    if not (math.isfinite(config.weight_decay) and config.weight_decay >= 0):
+        raise ValueError(f"weight_decay: expected a number >= 0, got {config.weight_decay!r}")
+    if not 0 <= config.seed < 2**63:
+        raise ValueError(f"seed: expected a number from 0 to 2^63 - 1, got {config.seed!r}")
     if not 0 <= config.validation_share < 1:
         raise ValueError(f"validation_share: expected a number in [0, 1), got {config.validation_share!r}")
     rng = th.Generator().manual_seed(config.seed)

@@ -132,7 +132,7 @@ def load_policy(folder: str | Path, env: gym.Env | None = None) -> ActorCriticPo
         description = json.loads((folder / "policy.json").read_text())
         low, high = (np.array(description[key], np.float32) for key in ("observation_low", "observation_high"))
         found = description["format"]
-    except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, TypeError) as error:  # ValueError: syntax, encoding, numbers
         raise ValueError(f"{folder / 'policy.json'}: not a policy's description: {error!r}") from None
     if found != FORMAT:
         raise ValueError(f"{folder / 'policy.json'}: format: expected {FORMAT}, got {found!r}")

@@ -15,7 +15,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from leapnav.experts.demonstrations import Demonstration
+import leapnav
+from leapnav.experts.demonstrations import ENVIRONMENT, Demonstration
 from leapnav.experts.plotting import OPTIMUM, draw_scenario
 from leapnav.training.evaluation import Episode, Interval, Score
 
@@ -57,6 +58,8 @@ def write_scores(
 ) -> None:
     """The table and every episode behind it as JSON (null where there is nothing to measure)."""
     content = {
+        "environment": ENVIRONMENT,
+        "leapnav": leapnav.__version__,
         "scores": [asdict(row) for row in scores],
         "episodes": {
             name: [
