@@ -84,11 +84,11 @@ def _sample_field(field, x0, y0, spacing, columns, rows):
     error_model="numpy",
     nogil=True,
 )
-def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_weight, reach, slack, depth):
+def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_weight, reach, slack, margin):
     """Cost to every node (nx * ny * HEADINGS) and its predecessor, from the seeds out.
 
     `speed` = sqrt(2 (E + Phi)) and `free` = clearance on the half-cell grid. Stops beyond `reach` times the cost of the
-    first target, and `slack` more. `depth` (m) is how far inside an obstacle a point may lie.
+    first target, and `slack` more. `margin` (m) is the smallest clearance of a point.
     """
     nx, ny = (speed.shape[0] + 1) // 2, (speed.shape[1] + 1) // 2
     cost = np.full(nx * ny * HEADINGS, np.inf)
@@ -133,7 +133,7 @@ def _dijkstra(speed, free, seeds, seed_costs, targets, cell, speed_weight, turn_
             if done[following]:
                 continue
             middle_x, middle_y = 2 * i + dx, 2 * j + dy
-            if free[2 * a, 2 * b] < -depth or free[middle_x, middle_y] < -depth:
+            if free[2 * a, 2 * b] < margin or free[middle_x, middle_y] < margin:
                 continue
             mean = (speed[2 * i, 2 * j] + 4.0 * speed[middle_x, middle_y] + speed[2 * a, 2 * b]) / 6.0
             total = key + lengths[k, number] * mean
@@ -159,15 +159,22 @@ def _mark(taken, i, j, k, cells, headings):
 
 
 class Lattice:
-    """The search of one scenario. `candidates` yields paths in order of promise."""
+    """The search of one scenario. `candidates` yields paths in order of promise.
+
+    Args:
+        refinement: how many times finer than usual the cells are.
+        margin: smallest clearance (m) of the lattice's points; None tolerates a little depth, see TOLERATED_DEPTH.
+
+    """
 
     # Nodes this near (cells, heading steps) to a path already taken belong to it.
     SAME_CELLS, SAME_HEADINGS = 2, 3
     # Candidates this much dearer than the first, in the lattice's own cost, are not worth a look.
     REACH = 1.6
 
-    def __init__(self, scenario: Scenario, refinement: int = 1) -> None:
+    def __init__(self, scenario: Scenario, refinement: int = 1, margin: float | None = None) -> None:
         self.scenario = scenario
+        self.margin = -TOLERATED_DEPTH * scenario.robot.radius if margin is None else margin
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
         cell = min(max(distance / CELLS_ON_THE_WAY, SMALLEST_CELL), LARGEST_CELL) / refinement
@@ -258,7 +265,7 @@ class Lattice:
             cost.turn_weight,
             self.REACH,
             self.slack,
-            TOLERATED_DEPTH * self.scenario.robot.radius,
+            self.margin,
         )
         totals = costs[ends] + end_costs
         best = int(np.argmin(totals))

@@ -20,7 +20,10 @@ NEWTON_ITERATIONS = 40
 # Three sweeps leave a path within a few per cent of its local optimum; what is dearer by more cannot become the best.
 SCREENING_MARGIN = 1.25
 SWEEPS, MORE_SWEEPS = 3, 8
-MOST_ROUNDS = 4
+MOST_ROUNDS = 3
+# Refinement and margin (m) of one lattice after the other, as long as nothing is certified: all candidates may lead
+# through a gap in which the optimum grazes, which a margin shuts, and a gap or a short way may need smaller cells.
+LATTICES = ((1, None), (1, 0.05), (2, None), (2, 0.05))
 # Two paths this near at all times (metres, and as much in radians) lead to the same extremal.
 SAME_PATH = 0.15
 
@@ -68,8 +71,8 @@ def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
         return failure(problem, Status.HORIZON_TOO_SHORT)
     search = _Search(scenario)
     shortest_time = np.inf
-    for refinement in (1, 2):  # a narrow gap or a short way may need a finer lattice
-        paths = Lattice(scenario, refinement).candidates()
+    for refinement, margin in LATTICES:
+        paths = Lattice(scenario, refinement, margin).candidates()
         for _ in range(MOST_ROUNDS):
             batch = [Path(c.times, c.poses) for c in islice(paths, candidates)]
             if not batch:

@@ -159,3 +159,9 @@ def test_a_goal_at_the_start_is_no_crash_and_no_wrong_success():
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="candidates: expected at least 1, got 0"):
         find_optimum(BEST_KNOWN[0][0], candidates=0)
+
+
+def test_a_gap_in_which_every_first_candidate_grazes_is_left_for_another_way():
+    extremal = find_optimum(sample_scenario("clutter", 40_040))
+    assert extremal.success, extremal
+    assert extremal.certificate.clearance > 0
