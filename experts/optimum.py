@@ -17,7 +17,8 @@ from leapnav.experts.solve import connect, default_segments, polish, start_nodes
 
 TOLERANCE = 1e-9
 NEWTON_ITERATIONS = 40
-# Three sweeps leave a path within a few per cent of its local optimum; what is dearer by more cannot become the best.
+# A swept path dearer than the best extremal by more than this is not polished. That is no bound (polishing can save
+# more, 27 % was seen), but on 300 clutter scenarios it lost nothing against polishing everything.
 SCREENING_MARGIN = 1.25
 SWEEPS, MORE_SWEEPS = 3, 8
 MOST_ROUNDS = 3
