@@ -21,8 +21,8 @@ from leapnav.envs import Scenario, sample_scenario
 from leapnav.envs.obstacles import clearances
 from leapnav.experts import Path, find_optimum, solve
 from leapnav.experts.lattice import Lattice
+from leapnav.experts.nodes import default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem
-from leapnav.experts.solve import default_segments, start_nodes
 
 INTERVALS = 50
 TOLERANCE = 1e-6  # of the peers; ours are certified to 1e-8

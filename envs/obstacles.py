@@ -88,39 +88,43 @@ def _polygon_distance(x, y, field, rows, edges):
 @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
 def proximity(x, y, field):
     """Proximity cost at a point: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
-    k, sigma, radius = field[0], field[1], field[2]
-    reach = CUTOFF * sigma
+    k, radius = field[0], field[2]
+    reach = CUTOFF * field[1]
+    steepness = 1.0 / field[1]  # divisions are the slow part of a term, after exp()
     value = gx = gy = hxx = hxy = hyy = 0.0
     for side in range(4):  # walls: one half-plane each, the inside positive
         along_x = side % 2 == 0
         sign = 1.0 if side < 2 else -1.0
         distance = sign * ((x if along_x else y) - field[ARENA + side]) - radius
         if distance < reach:
-            term = k * math.exp(-distance / sigma)
+            term = k * math.exp(-distance * steepness)
+            slope = sign * term * steepness
             value += term
             if along_x:
-                gx -= sign * term / sigma
-                hxx += term / sigma**2
+                gx -= slope
+                hxx += sign * slope * steepness
             else:
-                gy -= sign * term / sigma
-                hyy += term / sigma**2
+                gy -= slope
+                hyy += sign * slope * steepness
     at = SHAPES
     for _ in range(int(field[CIRCLES])):
         dx, dy = x - field[at], y - field[at + 1]
-        smooth = math.sqrt(dx * dx + dy * dy + 1e-6)  # differentiable at the centre
-        distance = smooth - field[at + 2] - radius
+        rim = field[at + 2] + radius
         at += 3
-        if distance < reach:
-            term = k * math.exp(-distance / sigma)
+        square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
+        if square < (rim + reach) ** 2:
+            smooth = math.sqrt(square)
+            term = k * math.exp((rim - smooth) * steepness)
             nx, ny = dx / smooth, dy / smooth
-            slope = term / sigma
+            slope = term * steepness
+            curl = slope / smooth
+            bend = slope * steepness + curl
             value += term
             gx -= slope * nx
             gy -= slope * ny
-            bend = slope / sigma + slope / smooth
-            hxx += bend * nx * nx - slope / smooth
+            hxx += bend * nx * nx - curl
             hxy += bend * nx * ny
-            hyy += bend * ny * ny - slope / smooth
+            hyy += bend * ny * ny - curl
     for _ in range(int(field[POLYGONS])):
         edges = int(field[at])
         rows = at + 1
@@ -136,22 +140,24 @@ def proximity(x, y, field):
                 row = rows + 5 * j
                 nx, ny = field[row], field[row + 1]
                 # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
-                share = math.exp((nx * x + ny * y - field[row + 2] - farthest) / sigma)
+                share = math.exp((nx * x + ny * y - field[row + 2] - farthest) * steepness)
                 total += share
                 mx += share * nx
                 my += share * ny
                 sxx += share * nx * nx
                 sxy += share * nx * ny
                 syy += share * ny * ny
-            term = k * math.exp(-distance / sigma) / total
-            mx, my = mx / total, my / total
-            slope, bend = term / sigma, term / sigma**2
+            part = 1.0 / total
+            term = k * math.exp(-distance * steepness) * part
+            mx, my = mx * part, my * part
+            slope = term * steepness
+            bend = slope * steepness
             value += term
             gx -= slope * mx
             gy -= slope * my
-            hxx += bend * (2 * mx * mx - sxx / total)
-            hxy += bend * (2 * mx * my - sxy / total)
-            hyy += bend * (2 * my * my - syy / total)
+            hxx += bend * (2 * mx * mx - sxx * part)
+            hxy += bend * (2 * mx * my - sxy * part)
+            hyy += bend * (2 * my * my - syy * part)
     return value, gx, gy, hxx, hxy, hyy
 
 

@@ -3,22 +3,41 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numba import float64, int64, njit, types
+from scipy.optimize import brentq
 
-from leapnav.envs.obstacles import clearances
+from leapnav.envs.obstacles import clearance
 from leapnav.experts.extremal import Certificate, Extremal, Iteration, Status
-from leapnav.experts.integrator import FLOW, constant, matrix, propagate, vector
+from leapnav.experts.integrator import (
+    CONTROL,
+    DENSE_TERMS,
+    EXTRA_STAGES,
+    FLOW,
+    LIMIT,
+    SMALLEST_STEP,
+    STAGES,
+    constant,
+    cube,
+    evaluate_interpolant,
+    interpolant,
+    matrix,
+    next_step,
+    propagate,
+    step,
+    vector,
+)
 from leapnav.experts.problem import OptimalControlProblem
 
 # Tighter than any solver's own integration, and about what double precision allows.
 ACCURACY = 1e-12
+FAILED_ACCURACY = 1e-9
 ROUGH_ACCURACY = 1e-6
 MOST_ROWS = 100_000  # steps of an extremal; one that needs more has diverged
-# The dense path has a point every SPACING metres; where it comes nearer to something than that, every tenth of that.
-SPACING = 5e-3
+NO_RANK = 1e-9  # a determinant below this has no sign that rounding leaves
 
 
 @njit(float64(matrix), cache=True, error_model="numpy", nogil=True)
@@ -60,72 +79,127 @@ def _orthonormalise(S):
 
 
 @njit(
-    types.Tuple((int64, float64, float64))(FLOW, vector, matrix, constant, constant, float64, matrix),
+    types.Tuple((int64, float64, int64, int64))(
+        FLOW, CONTROL, vector, matrix, constant, constant, float64, int64, matrix, cube, matrix
+    ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def _trace(flow, times, Z, data, field, accuracy, out):
+def _trace(flow, control, times, Z, data, field, accuracy, m, out, terms, sensitivity):
     """Integrates each segment from its node, recording every accepted step.
 
-    Rows of `out`: time, accumulated cost, running cost, z (2n), z' (2n), z'' (2n). Returns (rows or -1 if `out` is too
-    short or -2 if the flow diverged, largest gap at a node, first conjugate time or inf).
+    Rows of `out`: time, accumulated cost, running cost, u (m), z (2n), z' (2n); `terms` holds the interpolant of the
+    step that starts at the row. Returns (rows or -1 if `out` is too short or -2 if the flow diverged, largest gap at a
+    node, row of the step with the first conjugate point or -1, evaluations); `sensitivity` (2n, n) becomes the
+    orthonormalised dz/dlambda(0) at the start of that step.
     """
     size = Z.shape[1]
     n = size // 2
-    S = np.zeros((size, n))  # dz(t)/dlambda(0)
+    length = size * (1 + n)
+    y, new = np.zeros(length), np.empty(length)
+    K = np.empty((STAGES + 1 + EXTRA_STAGES, length))
+    L = np.empty(STAGES + 1)
+    S = y[size:].reshape((size, n))
+    before_step = np.zeros((size, n))
     for i in range(n):
         S[n + i, i] = 1.0
-    one = np.empty((size, 1))
-    d_one = np.empty((size, 1))
-    dz = np.empty(size)
-    z = np.empty(size)
-    rows, gap, conjugate, total, sign, before = 0, 0.0, np.inf, 0.0, 0.0, 0.0
+    rows, gap, conjugate, total, sign, evaluations = 0, 0.0, -1, 0.0, 0.0, 0
     last = len(times) - 2
-    step = 0.0
+    h = (times[1] - times[0]) / 4.0
     for k in range(last + 1):
-        z[:] = Z[k]
+        y[:size] = Z[k]
         elapsed, duration = 0.0, times[k + 1] - times[k]
-        if step <= 0.0:
-            step = duration / 64.0
+        K[0, size:] = 0.0
+        slope = K[0]
+        running = flow(
+            y[:size], data, field, y[size:].reshape((size, n)), slope[:size], slope[size:].reshape((size, n))
+        )
+        evaluations += 1
         while True:
             finished = elapsed >= duration
             if not finished or k == last:
                 if rows == len(out):
-                    return -1, gap, conjugate
-                one[:, 0] = 0.0
-                flow(z, data, field, one, dz, d_one)
-                one[:, 0] = dz  # A z' = z''
-                running = flow(z, data, field, one, dz, d_one)
+                    return -1, gap, conjugate, evaluations
                 out[rows, 0] = times[k] + elapsed
                 out[rows, 1] = total
                 out[rows, 2] = running
-                out[rows, 3 : 3 + size] = z
-                out[rows, 3 + size : 3 + 2 * size] = dz
-                out[rows, 3 + 2 * size :] = d_one[:, 0]
-                rows += 1
+                control(y[:size], data, out[rows, 3 : 3 + m])
+                out[rows, 3 + m : 3 + m + size] = y[:size]
+                out[rows, 3 + m + size :] = K[0, :size]
             if finished:
                 break
-            cost, taken, following, steps = propagate(flow, z, S, duration - elapsed, data, field, accuracy, step, True)
-            if steps < 0:
-                return -2, np.inf, conjugate
-            step = following
+            while True:
+                wanted = h
+                ends = elapsed + h >= duration * (1 - 1e-14)
+                if ends:
+                    h = duration - elapsed
+                cost, error = step(flow, y, new, K, L, size, n, h, accuracy, data, field, running)
+                evaluations += STAGES
+                taken, h = h, next_step(h, error)
+                if error <= 1.0:
+                    break
+                if h < SMALLEST_STEP * times[last + 1]:
+                    return -2, np.inf, conjugate, evaluations
+            if ends:  # cut short by the node, so the wanted step was not refuted
+                h = max(h, wanted)
+            interpolant(flow, y, new, K, size, taken, data, field, terms[rows])
+            evaluations += EXTRA_STAGES
+            rows += 1
             total += cost
-            elapsed = duration if taken >= duration - elapsed else elapsed + taken
+            elapsed = duration if ends else elapsed + taken
+            before_step[:] = y[size:].reshape((size, n))
+            y, new = new, y
+            running = L[STAGES]
+            for i in range(size):
+                if not abs(y[i]) < LIMIT:
+                    return -2, np.inf, conjugate, evaluations
             # Only the span of S matters. Gram-Schmidt keeps it numerically independent over any horizon, and its
             # positive scaling leaves the sign of det dq/dlambda(0) as it is.
-            determinant = _orthonormalise(S)
-            if abs(determinant) > 1e-9 and conjugate == np.inf:
+            determinant = _orthonormalise(y[size:].reshape((size, n)))
+            slope = K[0]
+            flow(y[:size], data, field, y[size:].reshape((size, n)), slope[:size], slope[size:].reshape((size, n)))
+            evaluations += 1
+            if abs(determinant) > NO_RANK and conjugate < 0:
                 if sign == 0.0:
                     sign = math.copysign(1.0, determinant)
                 elif sign * determinant < 0.0:
-                    crossing = times[k] + elapsed - taken * determinant / (determinant - before)
-                    if crossing < times[last + 1] * (1 - 1e-9):
-                        conjugate = crossing
-                before = determinant
+                    conjugate = rows - 1
+                    sensitivity[:] = before_step
         for i in range(size):
-            gap = max(gap, abs(z[i] - Z[k + 1, i]))
-    return rows, gap, conjugate
+            gap = max(gap, abs(y[i] - Z[k + 1, i]))
+    return rows + 1, gap, conjugate, evaluations
+
+
+@njit(float64(constant, vector, matrix, cube, int64, int64), cache=True, error_model="numpy", nogil=True)
+def _dense_clearance(field, times, starts, terms, ix, iy):
+    """Smallest clearance (m) along the interpolated path.
+
+    Clearance changes by no more than the way driven, so the walk skips what cannot hold a smaller value.
+    """
+    lowest, _ = clearance(starts[0, ix], starts[0, iy], field)
+    for k in range(len(times) - 1):
+        # The mean speed over the step and over its halves, with room: steps this accurate do not vary more in between.
+        way = 0.0
+        x, y = starts[k, ix], starts[k, iy]
+        for part in range(1, 9):
+            px = evaluate_interpolant(starts[k, ix], part / 8.0, terms[k], ix)
+            py = evaluate_interpolant(starts[k, iy], part / 8.0, terms[k], iy)
+            way = max(way, 8.0 * math.hypot(px - x, py - y))
+            x, y = px, py
+        way = 1.5 * way + 1e-12
+        s = 0.0
+        while s < 1.0:
+            here, _ = clearance(
+                evaluate_interpolant(starts[k, ix], s, terms[k], ix),
+                evaluate_interpolant(starts[k, iy], s, terms[k], iy),
+                field,
+            )
+            lowest = min(lowest, here)
+            # At the walk's shortest step (m) the path bends away by hundredths of a millimetre; finer near a touch.
+            s += max(here - lowest, min(max(0.1 * lowest, 1e-4), 5e-3)) / way
+    here, _ = clearance(starts[-1, ix], starts[-1, iy], field)
+    return min(lowest, here)
 
 
 def certify(
@@ -142,28 +216,40 @@ def certify(
         times: (K,) from 0 to the horizon.
         nodes: (K, 2n), q and lambda.
         converged: the solver's own verdict. Anything but SUCCESS stays; SUCCESS has to be confirmed here.
+        history: the solver's iterations.
+        work: the solver's evaluations of the flow.
 
     """
     arrays = problem.arrays
-    n = problem.system.n
-    # A path that did not converge is only looked at, so it need not be exact.
-    accuracy = ACCURACY if converged is Status.SUCCESS else ROUGH_ACCURACY
-    rows = 2048
+    n, m = problem.system.n, problem.system.m
+    # A path that did not converge is only looked at.
+    accuracy = ACCURACY if converged is Status.SUCCESS else FAILED_ACCURACY
+    rows = 512
+    sensitivity = np.empty((2 * n, n))
     while True:
-        out = np.empty((rows, 3 + 6 * n))
-        count, gap, conjugate = _trace(arrays.flow, times, nodes, arrays.data, arrays.field, accuracy, out)
+        out, terms = np.empty((rows, 3 + m + 4 * n)), np.empty((rows, DENSE_TERMS, 2 * n))
+        count, gap, step_of_conjugate, _ = _trace(
+            arrays.flow,
+            arrays.control,
+            times,
+            nodes,
+            arrays.data,
+            arrays.field,
+            accuracy,
+            m,
+            out,
+            terms,
+            sensitivity,
+        )
         if count != -1 or rows > MOST_ROWS:
             break
         rows *= 4
     if count < 0:
         return failure(problem, Status.DIVERGED if converged is Status.SUCCESS else converged, history, work)
-    out = out[:count]
-    states, costates = out[:, 3 : 3 + n].copy(), out[:, 3 + n : 3 + 2 * n].copy()
-    rates, curvatures = out[:, 3 + 2 * n : 3 + 4 * n].copy(), out[:, 3 + 4 * n :].copy()
-    controls = np.empty((count, problem.system.m))
-    for row, z in zip(controls, out[:, 3 : 3 + 2 * n].copy(), strict=True):
-        arrays.control(z, arrays.data, row)
-    hamiltonian = out[:, 2] + np.sum(costates * rates[:, :n], axis=1)
+    out, terms = out[:count].copy(), terms[: count - 1].copy()
+    z = np.ascontiguousarray(out[:, 3 + m : 3 + m + 2 * n])
+    states, costates = z[:, :n], z[:, n:]
+    hamiltonian = out[:, 2] + np.sum(costates * out[:, 3 + m + 2 * n : 3 + m + 3 * n], axis=1)
     end = np.where(arrays.free, costates[-1], states[-1] - arrays.goal)
     extremal = Extremal(
         problem=problem,
@@ -171,54 +257,51 @@ def certify(
         cost=float(out[-1, 1]),
         times=out[:, 0].copy(),
         states=states,
-        controls=controls,
+        controls=out[:, 3 : 3 + m].copy(),
         costates=costates,
         accumulated=out[:, 1].copy(),
-        rates=rates,
-        curvatures=curvatures,
+        hamiltonian=hamiltonian,
+        terms=terms,
         history=history,
         nodes=len(times),
         work=work,
     )
     if arrays.free.any():
         conjugate_point = _first_focal_time(extremal, arrays.free)
+    elif step_of_conjugate < 0:
+        conjugate_point = None
     else:
-        conjugate_point = None if conjugate == np.inf else float(conjugate)
+        conjugate_point = _conjugate_time(extremal, step_of_conjugate, sensitivity)
+    closest = None
+    if problem.field is not None and problem.system.position is not None:
+        ix, iy = (problem.system.state.index(symbol) for symbol in problem.system.position)
+        closest = float(_dense_clearance(problem.field, extremal.times, z, terms, ix, iy))
     certificate = Certificate(
         residual=float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max())),
         defect=float(gap),
         hamiltonian_drift=float(np.ptp(hamiltonian)),
         conjugate_point=conjugate_point,
-        clearance=None if problem.field is None else _dense_clearance(extremal, problem),
+        clearance=closest,
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     return replace(extremal, certificate=certificate, status=status)
 
 
-def _dense_clearance(extremal: Extremal, problem: OptimalControlProblem) -> float:
-    assert problem.field is not None and problem.system.position is not None
-    field = problem.field
-    at = [problem.system.state.index(symbol) for symbol in problem.system.position]
+def _conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float | None:
+    """When det dq(t)/dlambda(0) vanishes within step k, at whose start dz/dlambda(0) spans `sensitivity` (2n, n)."""
+    arrays = extremal.problem.arrays
 
-    def look(times: np.ndarray) -> np.ndarray:
-        return clearances(np.ascontiguousarray(extremal.interpolate(times)[:, at]), field)
+    def determinant(duration: float) -> float:
+        z = np.concatenate([extremal.states[k], extremal.costates[k]])
+        S = sensitivity.copy()
+        if duration > 0.0:
+            propagate(arrays.flow, z, S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
+        return _orthonormalise(S)
 
-    # Speeds at both ends of a step bound the way driven in it, up to a factor that steps this accurate stay below.
-    speeds = np.linalg.norm(extremal.rates[:, at], axis=1)
-    way = 1.5 * np.maximum(speeds[1:], speeds[:-1]) * np.diff(extremal.times)
-    times = _subdivide(extremal.times, np.ceil(way / SPACING).astype(int).clip(1))
-    found = look(times)
-    near = (found[1:] < SPACING) | (found[:-1] < SPACING)
-    if near.any():
-        found = np.append(found, look(_subdivide(times, np.where(near, 10, 1))))
-    return float(found.min())
-
-
-def _subdivide(times: np.ndarray, pieces: np.ndarray) -> np.ndarray:
-    """Each interval of `times` (N,) in so many equal pieces (N - 1,)."""
-    first = np.repeat(times[:-1], pieces)
-    number = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    return np.append(first + number * np.repeat(np.diff(times) / pieces, pieces), times[-1])
+    step = float(extremal.times[k + 1] - extremal.times[k])
+    time = float(extremal.times[k]) + _zero(determinant, step)
+    # One at the horizon itself does not contradict a minimum.
+    return time if time < extremal.problem.horizon * (1 - 1e-9) else None
 
 
 def _first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
@@ -231,21 +314,34 @@ def _first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
     arrays, n = extremal.problem.arrays, extremal.problem.system.n
     symplectic = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
     basis = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
-    z = np.concatenate([extremal.states, extremal.costates], axis=1)
-    sign, before = 0.0, 0.0
+    sign = 0.0
     for k in range(len(extremal.times) - 2, -1, -1):
-        step = extremal.times[k + 1] - extremal.times[k]
-        S = np.eye(2 * n)
-        propagate(arrays.flow, z[k].copy(), S, step, arrays.data, arrays.field, ROUGH_ACCURACY, step, False)
-        basis = -symplectic @ S.T @ symplectic @ basis  # the inverse of a symplectic matrix
-        basis = np.ascontiguousarray(basis)
+        end = float(extremal.times[k + 1])
+        carried = basis
+
+        def back(duration: float, end: float = end, carried: np.ndarray = carried) -> np.ndarray:
+            if duration <= 0.0:
+                return np.ascontiguousarray(carried)
+            z, S = extremal.interpolate(np.array([end - duration]))[0], np.eye(2 * n)
+            propagate(arrays.flow, z, S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
+            # The inverse of a symplectic matrix.
+            return np.ascontiguousarray(-symplectic @ S.T @ symplectic @ carried)
+
+        step = end - float(extremal.times[k])
+        basis = back(step)
         determinant = _orthonormalise(basis)
-        if abs(determinant) > 1e-9:
+        if abs(determinant) > NO_RANK:
             if sign * determinant < 0:
-                return float(extremal.times[k] + step * determinant / (determinant - before))
+                return end - _zero(lambda duration, back=back: _orthonormalise(back(duration)), step)
             sign = math.copysign(1.0, determinant)
-        before = determinant
     return None
+
+
+def _zero(function: Callable[[float], float], step: float) -> float:
+    """Where `function` changes its sign on [0, step]; the start, if it is too small there to have one."""
+    if function(0.0) * function(step) >= 0.0:
+        return 0.0
+    return float(brentq(function, 0.0, step, xtol=1e-12))
 
 
 def failure(
@@ -253,7 +349,7 @@ def failure(
 ) -> Extremal:
     """A result without a path."""
     n, m = problem.system.n, problem.system.m
-    empty, none = np.empty((0, n)), np.empty((0, 2 * n))
+    empty = np.empty((0, n))
     return Extremal(
         problem,
         status,
@@ -263,8 +359,8 @@ def failure(
         np.empty((0, m)),
         empty,
         np.empty(0),
-        none,
-        none,
+        np.empty(0),
+        np.empty((0, DENSE_TERMS, 2 * n)),
         history,
         None,
         0,

@@ -25,6 +25,29 @@ class Status(Enum):
     NOT_CERTIFIED = "the solver converged but re-integration did not confirm it. Try a smaller tol."
     COLLISION = "the extremal passes through an obstacle. Try find_optimum, or another guess."
     CONJUGATE_POINT = "the extremal is no local minimum (conjugate point before the horizon). Try another guess."
+    SUBPROBLEM = "a Leapfrog sub-problem did not converge, so the sweeps stand still. Try more segments or polish=True."
+
+
+# What the compiled Newton kernels return.
+CONVERGED, STALLED, DIVERGED, SINGULAR, MAX_ITERATIONS = 0, 1, 2, 3, 4
+KERNEL_STATUS = {
+    CONVERGED: Status.SUCCESS,
+    STALLED: Status.STALLED,
+    DIVERGED: Status.DIVERGED,
+    SINGULAR: Status.SINGULAR,
+    MAX_ITERATIONS: Status.MAX_ITERATIONS,
+}
+
+
+class SolveError(RuntimeError):
+    """A solve without success. The message says what to try next; `extremal` is the failed result."""
+
+    def __init__(self, extremal: Extremal, name: str = "") -> None:
+        super().__init__(f"{name}{': ' if name else ''}{extremal.status.name}: {extremal.status.value}")
+        self.extremal = extremal
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SolveError, (self.extremal,)
 
 
 @dataclass(frozen=True)
@@ -59,15 +82,38 @@ class Certificate:
         return Status.SUCCESS if self.conjugate_point is None else Status.CONJUGATE_POINT
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Iteration:
-    """One row of a solver's history. `phase` is "sweep" or "newton"; residual is NaN where it is not computed."""
+    """One row of a solver's history.
+
+    Attributes:
+        phase: "sweep" (Leapfrog), "reduce" (a Leapfrog sweep that removes nodes), "newton" or "collocation".
+        segments: into how many pieces the horizon is divided.
+        cost: J of the iterate.
+        residual: largest violation of the boundary and continuity conditions; for a sweep, of its path's states alone
+            (the costates may jump at the nodes until the end).
+        rejected: Leapfrog's rejected moves, the numbers of their nodes.
+        times, nodes: a sweep's feasible path, (segments + 1,) and (segments + 1, 2n): extremal arcs from node to node.
+
+    """
 
     phase: str
     segments: int
     cost: float
     residual: float
-    rejected: int
+    rejected: tuple[int, ...] = ()
+    times: np.ndarray | None = None
+    nodes: np.ndarray | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row as plain numbers, without the path."""
+        return {
+            "phase": self.phase,
+            "segments": self.segments,
+            "cost": _number(self.cost),
+            "residual": _number(self.residual),
+            "rejected": len(self.rejected),
+        }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,11 +125,12 @@ class Extremal:
         cost: J (the value of the returned path, even if it is not certified).
         times (N,), states (N, n), controls (N, m), costates (N, n): the solution at the integrator's own steps (s).
         accumulated (N,): cost from time 0.
-        rates (N, 2n), curvatures (N, 2n): first and second time derivatives of (q, lambda), for dense evaluation.
-        history: one row per iteration (simple shooting: its last).
+        hamiltonian (N,): H, constant along an extremal.
+        terms (N - 1, 7, 2n): coefficients of the integrator's interpolant, for dense evaluation.
+        history: one row per iteration.
         certificate: see `Certificate`; None if the solver returned no path.
         nodes: how many nodes the solver used.
-        work: integration steps taken by the solver.
+        work: evaluations of the extremal flow by the solver.
 
     """
 
@@ -95,8 +142,8 @@ class Extremal:
     controls: np.ndarray
     costates: np.ndarray
     accumulated: np.ndarray
-    rates: np.ndarray
-    curvatures: np.ndarray
+    hamiltonian: np.ndarray
+    terms: np.ndarray
     history: tuple[Iteration, ...] = ()
     certificate: Certificate | None = None
     nodes: int = 0
@@ -113,8 +160,8 @@ class Extremal:
     def evaluate(self, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(states, controls, costates) at times t, scalar or (K,); results have shape (n,), (m,), (n,) or (K, ...).
 
-        Quintic Hermite interpolation of (q, lambda) between the integrator's steps, controls from the minimum
-        principle; times outside [0, horizon] are held at the ends.
+        The integrator's own interpolant of order 7 for (q, lambda), controls from the minimum principle; times outside
+        [0, horizon] are held at the ends.
         """
         values = self.interpolate(np.atleast_1d(np.asarray(t, dtype=float)))
         n = self.problem.system.n
@@ -136,12 +183,11 @@ class Extremal:
             raise ValueError(f"there is no path: {self.status.value}")
         times = np.clip(times, 0.0, self.problem.horizon)
         k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
-        h = (self.times[k + 1] - self.times[k])[:, None]
-        s = (times - self.times[k])[:, None] / h
-        z = np.concatenate([self.states, self.costates], axis=1)
-        return _quintic(
-            s, h, z[k], self.rates[k], self.curvatures[k], z[k + 1], self.rates[k + 1], self.curvatures[k + 1]
-        )
+        s = ((times - self.times[k]) / (self.times[k + 1] - self.times[k]))[:, None]
+        value = np.zeros((len(times), self.terms.shape[2]))
+        for j in range(self.terms.shape[1] - 1, -1, -1):
+            value = (value + self.terms[k, j]) * (s if j % 2 == 0 else 1.0 - s)
+        return value + np.concatenate([self.states, self.costates], axis=1)[k]
 
     def cost_to_go(self, t: Any) -> Any:
         """Cost from time t to the horizon, scalar or (K,).
@@ -166,9 +212,7 @@ class Extremal:
             "states": self.states.tolist(),
             "controls": self.controls.tolist(),
             "costates": self.costates.tolist(),
-            "history": [
-                {**asdict(row), "residual": _number(row.residual), "cost": _number(row.cost)} for row in self.history
-            ],
+            "history": [row.to_dict() for row in self.history],
         }
 
     def to_json(self) -> str:
@@ -179,11 +223,3 @@ class Extremal:
 def _number(value: float) -> float | None:
     """JSON has neither NaN nor infinity."""
     return float(value) if np.isfinite(value) else None
-
-
-def _quintic(s: Any, h: Any, z0: Any, d0: Any, c0: Any, z1: Any, d1: Any, c1: Any) -> np.ndarray:
-    """Quintic Hermite polynomial through value, slope and curvature at both ends; s in [0, 1]."""
-    gap = z1 - z0
-    a, b, c = gap - h * d0 - h * h * c0 / 2, h * (d1 - d0) - h * h * c0, h * h * (c1 - c0)
-    cubic, quartic, quintic = 10 * a - 4 * b + c / 2, -15 * a + 7 * b - c, 6 * a - 3 * b + c / 2
-    return z0 + s * (h * d0 + s * (h * h * c0 / 2 + s * (cubic + s * (quartic + s * quintic))))

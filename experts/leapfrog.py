@@ -3,21 +3,340 @@
 J. L. Noakes, A global algorithm for geodesics, J. Austral. Math. Soc. A 65 (1998); C. Y. Kaya and J. L. Noakes,
 Leapfrog for optimal control, SIAM J. Numer. Anal. 46 (2008). Nodes z_0..z_p stand on a feasible path at times
 t_0..t_p. A sweep goes through i = 1..p-1, solves the sub-problem from node i-1 to node i+1 by simple shooting, and
-moves node i onto the sub-problem's extremal: at half its cost, or at the mean time. The path stays feasible, meets both
+moves node i onto the sub-problem's extremal: at the mean time, or at half its cost. The path stays feasible, meets both
 boundary conditions, and its cost never rises: a move that would raise it is rejected. Costates need no guess: they
-come from the chord between two nodes, and later from the last sweep.
+come from the chord between two nodes, and later from the last sweep. When a sweep gains little, nodes are removed whose
+sub-problem's extremal costs no more than the two arcs that it replaces, until p = 2 and the last sub-problem is the
+whole problem.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, field, replace
+
 import numpy as np
 from numba import boolean, float64, int64, njit, types
 
+from leapnav.experts.certificate import certify
+from leapnav.experts.extremal import CONVERGED, Extremal, Iteration, Status
+from leapnav.experts.initial_path import local_minima
 from leapnav.experts.integrator import FLOW, constant, matrix, propagate, vector
-from leapnav.experts.multiple_shooting import flags
-from leapnav.experts.single_shooting import CONVERGED, shoot
+from leapnav.experts.multiple_shooting import flags, polish
+from leapnav.experts.nodes import FEWEST_SEGMENTS, MOST_SEGMENTS, Settings, default_segments, start_nodes
+from leapnav.experts.problem import OptimalControlProblem, Path
+from leapnav.experts.single_shooting import shoot, single_shooting
 
 SUBPROBLEM_ITERATIONS = 12
+# Largest end error of an arc, and the integrator's accuracy: a jump of the states stays below 1e-9 even where errors
+# grow along the arc. Long arcs, which only a reduction of the nodes makes, need more.
+FEASIBLE, ACCURACY, LONG_ACCURACY = 1e-10, 1e-12, 1e-13
+# Newton's method is tried after so many sweeps in all, and mostly takes over after the first.
+SWEEPS_BEFORE_NEWTON = (1, 2, 4, 8, 16, 32, 64)
+# Without it: nodes are removed when a sweep gains less than this share of the cost.
+LITTLE = 1e-3
+MOST_SWEEPS = 500
+REDUCTIONS_FAILED = 2  # thereafter the sweeps go on until the costates do not jump at the nodes
+MOST_STUCK = 3  # sweeps with rejected moves, before arcs are halved
+STEERING_INTERVALS, STEERING_STARTS = 16, 6
+
+
+def leapfrog(problem: OptimalControlProblem, path: Path, settings: Settings) -> Extremal:
+    """Sweeps until Newton's method takes over (`polish`), or until the last sub-problem is the whole problem."""
+    times, nodes = start_nodes(problem, path, settings.segments or default_segments(path))
+    accuracy = ACCURACY if settings.polish else LONG_ACCURACY
+    track = FeasiblePath(problem, times, nodes, FEASIBLE, accuracy, settings.update == "half_cost", thorough=True)
+    if not track.feasible:
+        return certify(problem, track.times, track.nodes, Status.SUBPROBLEM, tuple(track.history), track.work)
+    return (_sweep_and_polish if settings.polish else _sweep_and_reduce)(track, settings)
+
+
+def _sweep_and_polish(track: FeasiblePath, settings: Settings) -> Extremal:
+    done = 0
+    for sweeps in SWEEPS_BEFORE_NEWTON:
+        while done < sweeps:
+            track.sweep(settings.order == "red_black")
+            done += 1
+        nodes = track.nodes.copy()
+        status, rows, work = polish(track.problem, track.times, nodes, settings.tol, settings.max_iterations)
+        track.work += work
+        # From a feasible path the way down leads to a cheaper extremal; a dearer one is another path's.
+        if status is Status.SUCCESS and rows[-1].cost <= track.cost * (1 + 1e-9) + 1e-9:
+            history = (*track.history, *rows)
+            extremal = certify(track.problem, track.times, nodes, status, history, track.work)
+            # From a saddle the sweeps lead further down.
+            if extremal.status is not Status.CONJUGATE_POINT or sweeps == SWEEPS_BEFORE_NEWTON[-1]:
+                return extremal
+    status = Status.STALLED if status is Status.SUCCESS else status
+    return certify(track.problem, track.times, nodes, status, tuple(track.history), track.work)
+
+
+def _sweep_and_reduce(track: FeasiblePath, settings: Settings) -> Extremal:
+    little, failures, stuck, status = LITTLE, 0, 0, Status.MAX_ITERATIONS
+    for _ in range(MOST_SWEEPS):
+        before = track.cost
+        if track.segments > 2:  # else the whole problem is the only sub-problem, and a reduction solves it
+            track.sweep(settings.order == "red_black")
+        if before - track.cost > little * abs(before):
+            continue
+        if failures == REDUCTIONS_FAILED:
+            if track.jumps()[1] <= settings.tol:
+                status = Status.SUCCESS
+                break
+            stuck = stuck + 1 if track.history[-1].rejected else 0
+            if stuck > MOST_STUCK:  # arcs so long that shooting loses the digits that are left to gain
+                if track.segments > MOST_SEGMENTS:
+                    status = Status.SUBPROBLEM
+                    break
+                track.split()
+                stuck = 0
+            continue
+        removed = track.reduce()
+        if track.segments == 1:
+            extremal = single_shooting(track.problem, Path(track.times, *track.halves()), settings)
+            if extremal.success:
+                return replace(extremal, history=tuple(track.history), work=track.work + extremal.work)
+            removed = 0
+        if removed == 0:
+            # Shooting over that long needs better costates, or amplifies its errors too much. Sweeps over shorter arcs
+            # improve the former and do not mind the latter.
+            failures += 1
+            little *= 0.1
+            while track.segments < FEWEST_SEGMENTS // 2:
+                track.split()
+    return certify(track.problem, track.times, track.nodes, status, tuple(track.history), track.work)
+
+
+@dataclass
+class FeasiblePath:
+    """Leapfrog's iterate: arcs from node to node, each an extremal of its own, and what they cost.
+
+    Attributes:
+        times (p + 1,), nodes (p + 1, 2n): changed in place.
+        tolerance: largest end error of an arc.
+        accuracy: of the integrator.
+        half_cost: nodes move to half their sub-problem's cost, not to the mean time.
+        thorough: connect nodes also where shooting alone does not, and measure the residual of every iterate.
+        costs (p,): of the arcs; infinite where nothing connects two nodes.
+        history: a row per sweep.
+
+    """
+
+    problem: OptimalControlProblem
+    times: np.ndarray
+    nodes: np.ndarray
+    tolerance: float
+    accuracy: float
+    half_cost: bool = False
+    thorough: bool = False
+    costs: np.ndarray = field(init=False)
+    history: list[Iteration] = field(default_factory=list)
+    work: int = 0
+
+    def __post_init__(self) -> None:
+        self._connect()
+        if self.thorough:
+            self._mend()
+        self._record("sweep", ())
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every two neighbouring nodes are connected."""
+        return bool(np.isfinite(self.costs).all())
+
+    def _connect(self) -> None:
+        self.costs = np.empty(self.segments)
+        arrays = self.problem.arrays
+        _, work = connect(
+            arrays.flow,
+            self.times,
+            self.nodes,
+            arrays.goal,
+            arrays.free,
+            arrays.data,
+            arrays.field,
+            self.tolerance,
+            self.accuracy,
+            self.costs,
+        )
+        self.work += work
+
+    def _mend(self) -> None:
+        """Connects what shooting did not: over fewer nodes, which leaves more time, or by Gauss-Newton on controls."""
+        while not self.feasible and self.segments > 1:
+            k = int(np.flatnonzero(np.isinf(self.costs))[0])
+            spans = [(a, b) for a, b in ((k, k + 2), (k - 1, k + 1), (k - 1, k + 2)) if a >= 0 and b <= self.segments]
+            # Shooting over each span first: it takes a hundredth of the time.
+            if not any(self._join(a, b, guess) for guess in (False, True) for a, b in [*spans, (k, k + 1)]):
+                if not spans:
+                    return
+                self._replace(*spans[0], self.nodes[list(spans[0])], math.inf)
+
+    def _join(self, a: int, b: int, guess: bool) -> bool:
+        """Connects node a to node b by one arc and drops what lies between; False if that fails."""
+        n = self.problem.system.n
+        last = b == self.segments
+        part = replace(
+            self.problem,
+            start=tuple(self.nodes[a, :n]),
+            goal=self.problem.goal if last else tuple(self.nodes[b, :n]),
+            horizon=float(self.times[b] - self.times[a]),
+        )
+        arrays = part.arrays
+        minima = local_minima(part, STEERING_INTERVALS, STEERING_STARTS) if guess else [(0.0, None)]
+        for _, path in sorted(minima, key=lambda entry: entry[0]):
+            nodes, cost = self.nodes[[a, b]], np.empty(1)
+            if path is not None and path.costates is not None:
+                nodes[0, n:] = path.costates[0]
+            failed, work = connect(
+                arrays.flow,
+                np.array([0.0, part.horizon]),
+                nodes,
+                arrays.goal,
+                arrays.free,
+                arrays.data,
+                arrays.field,
+                self.tolerance,
+                self.accuracy,
+                cost,
+            )
+            self.work += work
+            if not failed:
+                self._replace(a, b, nodes, cost[0])
+                return True
+        return False
+
+    def _replace(self, a: int, b: int, nodes: np.ndarray, cost: float) -> None:
+        """Puts one arc with these end nodes (2, 2n) in the place of those from node a to node b."""
+        self.times = np.delete(self.times, np.s_[a + 1 : b])
+        self.nodes = np.delete(self.nodes, np.s_[a + 1 : b], axis=0)
+        self.costs = np.delete(self.costs, np.s_[a + 1 : b])
+        self.nodes[a] = nodes[0]
+        if a + 1 == self.segments:
+            self.nodes[-1] = nodes[1]
+        self.costs[a] = cost
+
+    @property
+    def segments(self) -> int:
+        """How many arcs there are."""
+        return len(self.times) - 1
+
+    @property
+    def cost(self) -> float:
+        """J of the path."""
+        return float(self.costs.sum())
+
+    def sweep(self, red_black: bool = False) -> None:
+        """Moves every inner node once: in order, or first the odd and then the even ones."""
+        rejected = np.zeros(self.segments + 1, dtype=bool)
+        for first, stride in ((1, 2), (2, 2)) if red_black else ((1, 1),):
+            arrays = self.problem.arrays
+            self.work += sweep(
+                arrays.flow,
+                self.times,
+                self.nodes,
+                arrays.goal,
+                arrays.free,
+                arrays.data,
+                arrays.field,
+                self.tolerance,
+                self.accuracy,
+                self.half_cost,
+                self.costs,
+                first,
+                stride,
+                rejected,
+            )
+        self._record("sweep", tuple(np.flatnonzero(rejected).tolist()))
+
+    def reduce(self) -> int:
+        """Removes what can be removed of every other node without raising the cost; returns how many."""
+        keep, rejected = np.ones(self.segments + 1, dtype=bool), np.zeros(self.segments + 1, dtype=bool)
+        arrays = self.problem.arrays
+        self.work += merge(
+            arrays.flow,
+            self.times,
+            self.nodes,
+            arrays.goal,
+            arrays.free,
+            arrays.data,
+            arrays.field,
+            self.tolerance,
+            self.accuracy,
+            self.costs,
+            keep,
+            rejected,
+        )
+        self.times, self.nodes = self.times[keep].copy(), self.nodes[keep].copy()
+        # A removed node's arc is part of the one before it.
+        self.costs = self.costs[keep[:-1]].copy()
+        self._record("reduce", tuple(np.flatnonzero(rejected).tolist()))
+        return int((~keep).sum())
+
+    def halves(self) -> tuple[np.ndarray, np.ndarray]:
+        """States and costates of the nodes."""
+        n = self.problem.system.n
+        return self.nodes[:, :n], self.nodes[:, n:]
+
+    def jumps(self) -> tuple[float, float]:
+        """Largest jump at a node of the states (end conditions included) and of the costates.
+
+        Without jumps of the costates the path is an extremal.
+        """
+        arrays = self.problem.arrays
+        states, costates, work = measure(
+            arrays.flow, self.times, self.nodes, arrays.goal, arrays.free, arrays.data, arrays.field, self.accuracy
+        )
+        self.work += work
+        return states, costates
+
+    def split(self) -> None:
+        """Halves every arc, which changes neither path nor cost."""
+        arrays, size = self.problem.arrays, self.nodes.shape[1]
+        times, nodes = np.repeat(self.times, 2)[:-1], np.repeat(self.nodes, 2, axis=0)[:-1]
+        times[1::2] = (self.times[1:] + self.times[:-1]) / 2
+        costs = np.repeat(self.costs, 2)
+        for k in range(self.segments):
+            half = times[2 * k + 1] - times[2 * k]
+            z, none = self.nodes[k].copy(), np.empty((size, 0))
+            flow, data, field = arrays.flow, arrays.data, arrays.field
+            cost, _, _, work = propagate(flow, z, none, half, data, field, self.accuracy, 0.0, False)
+            nodes[2 * k + 1] = z
+            costs[2 * k : 2 * k + 2] = cost, self.costs[k] - cost
+            self.work += abs(work)
+        self.times, self.nodes, self.costs = times, nodes, costs
+
+    def _record(self, phase: str, rejected: tuple[int, ...]) -> None:
+        residual = math.nan
+        if self.thorough:
+            residual = self.jumps()[0] if self.feasible else math.inf
+        row = Iteration(phase, self.segments, self.cost, residual, rejected, self.times.copy(), self.nodes.copy())
+        self.history.append(row)
+
+
+@njit(
+    types.Tuple((float64, float64, int64))(FLOW, vector, matrix, vector, flags, constant, constant, float64),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def measure(flow, times, Z, goal, free, data, field, accuracy):
+    """Largest jumps of states and of costates from arc to arc, and the evaluations of the flow."""
+    n = len(goal)
+    p = len(times) - 1
+    S = np.empty((2 * n, 0))
+    states, costates, work = 0.0, 0.0, 0
+    for k in range(p):
+        z = Z[k].copy()
+        _, _, _, evaluations = propagate(flow, z, S, times[k + 1] - times[k], data, field, accuracy, 0.0, False)
+        work += abs(evaluations)
+        for i in range(n):
+            if k < p - 1:
+                states = max(states, abs(z[i] - Z[k + 1, i]))
+                costates = max(costates, abs(z[n + i] - Z[k + 1, n + i]))
+            else:
+                states = max(states, abs(z[n + i]) if free[i] else abs(z[i] - goal[i]))
+    return states, costates, work
 
 
 @njit(
@@ -29,82 +348,98 @@ SUBPROBLEM_ITERATIONS = 12
 def connect(flow, times, Z, goal, free, data, field, tolerance, accuracy, costs):
     """Makes a path of nodes feasible: solves each segment on its own, from the costates guessed in Z.
 
-    `costs` (p,) becomes the cost of each segment, infinite where shooting failed. Returns (failed segments, steps).
+    Where these lead nowhere, the costate at the end of the segment before is tried. `costs` (p,) becomes the cost of
+    each segment, infinite where both failed. Returns (failed segments, evaluations of the flow).
     """
     n = len(goal)
     p = len(times) - 1
     fixed = np.zeros(n, dtype=np.bool_)
-    end = np.empty(2 * n)
+    end = Z[0].copy()
+    log = np.empty((SUBPROBLEM_ITERATIONS + 1, 2))
     failed, work = 0, 0
     for k in range(p):
-        z = Z[k].copy()
-        # Only at the horizon may a component be free.
-        status, _, _, cost, steps = shoot(
-            flow,
-            z,
-            Z[k + 1, :n].copy(),
-            end,
-            free if k == p - 1 else fixed,
-            times[k + 1] - times[k],
-            data,
-            field,
-            tolerance,
-            accuracy,
-            SUBPROBLEM_ITERATIONS,
-        )
-        work += steps
         costs[k] = np.inf
-        if status == CONVERGED:
-            Z[k] = z
-            costs[k] = cost
-            if k == p - 1:
-                Z[p] = end
+        before = end[n:].copy()
+        for attempt in range(2):
+            z = Z[k].copy()
+            if attempt == 1:
+                z[n:] = before
+            # Only at the horizon may a component be free.
+            status, _, _, cost, evaluations = shoot(
+                flow,
+                z,
+                Z[k + 1, :n].copy(),
+                end,
+                free if k == p - 1 else fixed,
+                times[k + 1] - times[k],
+                data,
+                field,
+                tolerance,
+                accuracy,
+                SUBPROBLEM_ITERATIONS,
+                log,
+            )
+            work += evaluations
+            if status == CONVERGED:
+                Z[k] = z
+                costs[k] = cost
+                if k == p - 1:
+                    Z[p] = end
+                break
         else:
             failed += 1
+            end[:] = Z[k + 1]
     return failed, work
 
 
 @njit(
-    types.Tuple((int64, int64))(
-        FLOW, vector, matrix, vector, flags, constant, constant, float64, float64, boolean, vector, int64, int64
+    int64(
+        FLOW, vector, matrix, vector, flags, constant, constant, float64, float64, boolean, vector, int64, int64, flags
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cost, costs, first, stride):
+def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cost, costs, first, stride, rejected):
     """One sweep over the inner nodes first, first + stride, ... in place (stride 2: the red or black nodes).
 
     With `half_cost` a node moves to half the sub-problem's cost and its time changes, else it stays at the mean time of
-    its neighbours. Returns (rejected moves, integration steps).
+    its neighbours. `rejected` (p + 1,) is set where a move was. Returns the evaluations of the flow.
     """
     n = len(goal)
     p = len(times) - 1
     fixed = np.zeros(n, dtype=np.bool_)
     S = np.empty((2 * n, 0))
     end = np.empty(2 * n)
-    rejected, work = 0, 0
+    log = np.empty((SUBPROBLEM_ITERATIONS + 1, 2))
+    work = 0
     for i in range(first, p, stride):
-        z = Z[i - 1].copy()
         duration = times[i + 1] - times[i - 1]
-        status, _, _, cost, steps = shoot(
-            flow,
-            z,
-            Z[i + 1, :n].copy(),
-            end,
-            free if i == p - 1 else fixed,
-            duration,
-            data,
-            field,
-            tolerance,
-            accuracy,
-            SUBPROBLEM_ITERATIONS,
-        )
-        work += steps
         before = costs[i - 1] + costs[i]
-        # The slack is the integrator's error: a node that stands still must not be counted as rejected.
-        if status != CONVERGED or not cost <= before + 10.0 * accuracy * (1.0 + cost):
-            rejected += 1
+        slack = 10.0 * tolerance * (1.0 + abs(before))
+        for attempt in range(2):
+            z = Z[i - 1].copy()
+            if attempt == 1:  # along an extremal costates change slowly
+                z[n:] = Z[i, n:]
+            status, _, _, cost, evaluations = shoot(
+                flow,
+                z,
+                Z[i + 1, :n].copy(),
+                end,
+                free if i == p - 1 else fixed,
+                duration,
+                data,
+                field,
+                tolerance,
+                accuracy,
+                SUBPROBLEM_ITERATIONS,
+                log,
+            )
+            work += evaluations
+            if status == CONVERGED and (cost <= before + slack or before == np.inf):
+                break
+        else:
+            rejected[i] = True
             continue
         middle = z.copy()
         if half_cost:
@@ -112,11 +447,11 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
             part, taken = 0.0, 0.0
             here = middle.copy()
             while elapsed < duration:
-                part, taken, following, steps = propagate(
+                part, taken, following, evaluations = propagate(
                     flow, here, S, min(step, duration - elapsed), data, field, accuracy, step, True
                 )
-                work += 1
-                if steps < 0 or reached + part > target:
+                work += abs(evaluations)
+                if evaluations < 0 or reached + part > target:
                     break
                 middle[:] = here
                 reached += part
@@ -124,18 +459,70 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
                 step = min(following, duration / 16.0)
             # Within the last step the cost grows almost linearly.
             rest = taken * (target - reached) / part if part > 0 else 0.0
-            part, _, _, _ = propagate(flow, middle, S, rest, data, field, accuracy, 0.0, False)
+            part, _, _, evaluations = propagate(flow, middle, S, rest, data, field, accuracy, 0.0, False)
             elapsed += rest
             first_cost = reached + part
         else:
             elapsed = duration / 2.0
-            first_cost, _, _, steps = propagate(flow, middle, S, elapsed, data, field, accuracy, 0.0, False)
-            work += steps
+            first_cost, _, _, evaluations = propagate(flow, middle, S, elapsed, data, field, accuracy, 0.0, False)
+        work += abs(evaluations)
         Z[i - 1] = z
         Z[i] = middle
         if i == p - 1:
             Z[p] = end
         times[i] = times[i - 1] + elapsed
         costs[i - 1] = first_cost
-        costs[i] = cost - first_cost
-    return rejected, work
+        # What end errors of the arcs make uncertain is not booked as a rise.
+        costs[i] = min(cost, before) - first_cost
+    return work
+
+
+@njit(
+    int64(FLOW, vector, matrix, vector, flags, constant, constant, float64, float64, vector, flags, flags),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def merge(flow, times, Z, goal, free, data, field, tolerance, accuracy, costs, keep, rejected):
+    """Takes out every other inner node whose sub-problem's extremal costs no more than the arcs on its two sides.
+
+    `keep` (p + 1,) becomes False there, `costs` of the arc before it the cost of the one that replaces both. Returns
+    the evaluations of the flow.
+    """
+    n = len(goal)
+    p = len(times) - 1
+    fixed = np.zeros(n, dtype=np.bool_)
+    end = np.empty(2 * n)
+    log = np.empty((4 * SUBPROBLEM_ITERATIONS + 1, 2))
+    work = 0
+    i = 1
+    while i < p:
+        z = Z[i - 1].copy()
+        status, _, _, cost, evaluations = shoot(
+            flow,
+            z,
+            Z[i + 1, :n].copy(),
+            end,
+            free if i == p - 1 else fixed,
+            times[i + 1] - times[i - 1],
+            data,
+            field,
+            tolerance,
+            accuracy,
+            4 * SUBPROBLEM_ITERATIONS,
+            log,
+        )
+        work += evaluations
+        before = costs[i - 1] + costs[i]
+        if status == CONVERGED and cost <= before + 10.0 * tolerance * (1.0 + abs(before)):
+            Z[i - 1] = z
+            if i == p - 1:
+                Z[p] = end
+            # What end errors of the arcs make uncertain is not booked as a rise.
+            costs[i - 1] = min(cost, before)
+            keep[i] = False
+            i += 2
+        else:
+            rejected[i] = True
+            i += 1
+    return work

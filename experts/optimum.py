@@ -10,10 +10,12 @@ import numpy as np
 from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.certificate import certify, failure
-from leapnav.experts.extremal import Extremal, Iteration, Status
+from leapnav.experts.extremal import Extremal, Status
 from leapnav.experts.lattice import Lattice
+from leapnav.experts.leapfrog import FeasiblePath
+from leapnav.experts.multiple_shooting import polish
+from leapnav.experts.nodes import default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem, Path
-from leapnav.experts.solve import connect, default_segments, polish, start_nodes, sweep
 
 TOLERANCE = 1e-9
 NEWTON_ITERATIONS = 40
@@ -21,6 +23,8 @@ NEWTON_ITERATIONS = 40
 # more, 27 % was seen), but on 300 clutter scenarios it lost nothing against polishing everything.
 SCREENING_MARGIN = 1.25
 SWEEPS, MORE_SWEEPS = 3, 8
+# Sweeps need no accuracy beyond what the next sweep changes; Newton's method polishes the result.
+SWEEP_TOLERANCE = 1e-4
 MOST_ROUNDS = 3
 # Refinement and margin (m) of one lattice after the other, as long as nothing is certified: all candidates may lead
 # through a gap in which the optimum grazes, which a margin shuts, and a gap or a short way may need smaller cells.
@@ -31,21 +35,22 @@ SAME_PATH = 0.15
 
 @dataclass
 class _Attempt:
-    """A candidate on its way: the swept nodes and what they cost."""
+    """A candidate on its way: the swept path, and the extremal's nodes once Newton's method has found them."""
 
-    problem: OptimalControlProblem
-    times: np.ndarray
-    nodes: np.ndarray
-    costs: np.ndarray
-    history: list[Iteration]
-    work: int
+    track: FeasiblePath
+    solution: np.ndarray | None = None
 
     @property
     def cost(self) -> float:
-        return float(self.costs.sum())
+        return self.track.cost
+
+    @property
+    def nodes(self) -> np.ndarray:
+        return self.track.nodes if self.solution is None else self.solution
 
     def certify(self, converged: Status) -> Extremal:
-        return certify(self.problem, self.times, self.nodes, converged, tuple(self.history), self.work)
+        track = self.track
+        return certify(track.problem, track.times, self.nodes, converged, tuple(track.history), track.work)
 
 
 def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:
@@ -105,9 +110,8 @@ class _Search:
         stalled = [attempt for attempt in attempts if self._promising(attempt) and not self._polish(attempt)]
         for attempt in stalled:
             if self._promising(attempt):  # more sweeps: nearer to the extremal, or onto another one
-                rows, work = sweep(attempt.problem, attempt.times, attempt.nodes, attempt.costs, MORE_SWEEPS)
-                attempt.history += rows
-                attempt.work += work
+                for _ in range(MORE_SWEEPS):
+                    attempt.track.sweep()
                 if not self._polish(attempt):
                     self._stalled.append(attempt)
 
@@ -126,13 +130,13 @@ class _Search:
 
     def _polish(self, attempt: _Attempt) -> bool:
         """Newton on an attempt's nodes; False if it does not converge."""
-        nodes = attempt.nodes.copy()
-        status, rows, work = polish(attempt.problem, attempt.times, nodes, TOLERANCE, NEWTON_ITERATIONS)
-        attempt.history += rows
-        attempt.work += work
+        track, nodes = attempt.track, attempt.track.nodes.copy()
+        status, rows, work = polish(track.problem, track.times, nodes, TOLERANCE, NEWTON_ITERATIONS)
+        track.history += rows
+        track.work += work
         if status is not Status.SUCCESS:
             return False
-        attempt.nodes = nodes
+        attempt.solution = nodes
         self._solved.append(attempt)
         clear = clearances(nodes, self.scenario.field).min() > 0
         if clear and (self.best is None or rows[-1].cost < self.best.cost):
@@ -153,13 +157,13 @@ def _shortest_time(path: Path, scenario: Scenario) -> float:
 
 def _sweep(problem: OptimalControlProblem, path: Path) -> _Attempt:
     problem = problem.with_winding_of(path.states)
-    times, nodes = start_nodes(problem, path, default_segments(path))
-    costs = connect(problem, times, nodes)
-    rows, work = sweep(problem, times, nodes, costs, SWEEPS)
-    return _Attempt(problem, times, nodes, costs, rows, work)
+    track = FeasiblePath(problem, *start_nodes(problem, path, default_segments(path)), SWEEP_TOLERANCE, SWEEP_TOLERANCE)
+    for _ in range(SWEEPS):
+        track.sweep()
+    return _Attempt(track)
 
 
 def _same(attempt: _Attempt, other: _Attempt) -> bool:
-    times = other.times
-    mine = np.stack([np.interp(times, attempt.times, column) for column in attempt.nodes[:, :3].T], axis=1)
+    times = other.track.times
+    mine = np.stack([np.interp(times, attempt.track.times, column) for column in attempt.nodes[:, :3].T], axis=1)
     return float(np.abs(mine - other.nodes[:, :3]).max()) < SAME_PATH

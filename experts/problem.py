@@ -13,6 +13,7 @@ import numpy as np
 import sympy as sp
 
 from leapnav.envs.scenario import Scenario
+from leapnav.experts.integrator import sample_dynamics
 from leapnav.experts.system import ControlAffineSystem, compile_flow, unicycle
 
 
@@ -44,6 +45,7 @@ class OptimalControlProblem:
         state_cost: Phi, a SymPy expression in the system's state symbols.
         control_bounds: m pairs (lowest, highest), or None for unbounded controls.
         field: a packed obstacle field (`Scenario.field`) whose proximity cost is added to Phi at the system's position.
+        parameters: a number for each of the system's parameters, in its order.
 
     Raises:
         ValueError: a length or a value is impossible; the message names the argument and the value.
@@ -58,6 +60,7 @@ class OptimalControlProblem:
     state_cost: Any = 0
     control_bounds: Sequence[tuple[float, float]] | None = None
     field: np.ndarray | None = None
+    parameters: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         n, m = self.system.n, self.system.m
@@ -65,6 +68,7 @@ class OptimalControlProblem:
             ("start", self.start, n),
             ("goal", self.goal, n),
             ("control_weight", self.control_weight, m),
+            ("parameters", self.parameters, len(self.system.parameters)),
         ):
             if len(values) != length:
                 raise ValueError(f"{name}: expected {length} numbers, got {len(values)}: {values!r}")
@@ -80,7 +84,7 @@ class OptimalControlProblem:
             for low, high in self.control_bounds:
                 if not low < high:
                     raise ValueError(f"control_bounds: expected lowest < highest, got ({low!r}, {high!r})")
-        unknown = sp.sympify(self.state_cost).free_symbols - set(self.system.state)
+        unknown = sp.sympify(self.state_cost).free_symbols - {*self.system.state, *self.system.parameters}
         if unknown:
             raise ValueError(
                 f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}"
@@ -133,7 +137,7 @@ class OptimalControlProblem:
             start=np.array(self.start, dtype=float),
             goal=np.array([0.0 if g is None else g for g in self.goal], dtype=float),
             free=np.array([g is None for g in self.goal]),
-            data=_constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1]]),
+            data=_constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *self.parameters]),
             field=_constant([]) if self.field is None else self.field,
         )
 
@@ -143,26 +147,25 @@ class OptimalControlProblem:
         The control that follows the path in the least-squares sense gives the switching functions p = -R u, and
         lam = B (B'B)^-1 p is the smallest costate with these.
         """
-        arrays = self.arrays
-        n, m = self.system.n, self.system.m
         weight = np.asarray(self.control_weight, dtype=float)
-        probe = _constant([*np.ones(m), *np.full(m, -np.inf), *np.full(m, np.inf)])
         rates = np.gradient(path.states, path.times, axis=0)
-        costates = np.empty_like(path.states)
-        empty, z, dz, u = np.empty((2 * n, 0)), np.empty(2 * n), np.empty(2 * n), np.empty(m)
-        B = np.empty((n, m))
-        for k, q in enumerate(path.states):
-            z[:n], z[n:] = q, 0.0
-            arrays.flow(z, probe, arrays.field, empty, dz, empty)
-            drift = dz[:n].copy()
-            for i in range(n):  # u = -B'lam for unit weights, so unit costates read B off row by row
-                z[n:] = 0.0
-                z[n + i] = 1.0
-                arrays.control(z, probe, u)
-                B[i] = -u
-            control = np.linalg.lstsq(B, rates[k] - drift, rcond=None)[0]
-            costates[k] = np.linalg.lstsq(B.T, -weight * control, rcond=None)[0]
-        return costates
+        drift, fields = self.dynamics(path.states)
+        # Where the fields are dependent a trace of their size keeps B'B regular.
+        gram = fields.transpose(0, 2, 1) @ fields
+        m = self.system.m
+        gram += (1e-12 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(m)
+        inverse = np.linalg.inv(gram)
+        controls = inverse @ (fields.transpose(0, 2, 1) @ (rates - drift)[:, :, None])
+        return (fields @ (inverse @ (-weight[:, None] * controls)))[:, :, 0]
+
+    def dynamics(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A (N, n) and B (N, n, m) at states (N, n)."""
+        arrays, n, m = self.arrays, self.system.n, self.system.m
+        drift, fields = np.empty((len(states), n)), np.empty((len(states), n, m))
+        sample_dynamics(
+            arrays.flow, arrays.control, np.ascontiguousarray(states), arrays.data, arrays.field, drift, fields
+        )
+        return drift, fields
 
     def straight_line(self, points: int = 33) -> Path:
         """The straight line from start to goal; free components stay at their start."""

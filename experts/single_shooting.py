@@ -2,30 +2,87 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import boolean, float64, int64, njit, types
 
-from leapnav.experts.integrator import FLOW, constant, propagate, vector
+from leapnav.experts.certificate import certify
+from leapnav.experts.extremal import (
+    CONVERGED,
+    DIVERGED,
+    KERNEL_STATUS,
+    MAX_ITERATIONS,
+    SINGULAR,
+    STALLED,
+    Extremal,
+    Iteration,
+    Status,
+)
+from leapnav.experts.integrator import FLOW, constant, matrix, propagate, vector
 from leapnav.experts.linear import solve_dense
+from leapnav.experts.nodes import Settings, default_segments, start_nodes
+from leapnav.experts.problem import OptimalControlProblem, Path
 
-# Returned by the Newton kernels of this package; `extremal.Status` gives them words.
-CONVERGED, STALLED, DIVERGED, SINGULAR, MAX_ITERATIONS = 0, 1, 2, 3, 4
 SMALLEST_DAMPING = 1.0 / 64.0
+# Newton's method goes on to a residual this much below the one asked for, which may remain where it cannot.
+MARGIN = 0.1
+SMALLEST_TOLERANCE = 1e-13  # of the integrator, near rounding
+LOOSEST = 1e-4  # of the integrator, far from the solution
+
+
+def single_shooting(problem: OptimalControlProblem, path: Path, settings: Settings) -> Extremal:
+    """Newton's method on the initial costate."""
+    arrays = problem.arrays
+    _, nodes = start_nodes(problem, path, settings.segments or default_segments(path))
+    z, end = nodes[0].copy(), nodes[0].copy()
+    log = np.zeros((settings.max_iterations + 1, 2))
+    code, iterations, residual, _, work = shoot(
+        arrays.flow,
+        z,
+        arrays.goal,
+        end,
+        arrays.free,
+        problem.horizon,
+        arrays.data,
+        arrays.field,
+        MARGIN * settings.tol,
+        # Over the whole horizon the integration errors of all steps add up and grow.
+        max(settings.tol * 1e-5, SMALLEST_TOLERANCE),
+        settings.max_iterations,
+        log,
+    )
+    history = tuple(Iteration("newton", 1, row[1], row[0]) for row in log[: iterations + 1].tolist())
+    times = np.array([0.0, problem.horizon])
+    status = Status.SUCCESS if residual <= settings.tol else KERNEL_STATUS[code]
+    return certify(problem, times, np.stack([z, end]), status, history, work)
 
 
 @njit(
     types.Tuple((int64, int64, float64, float64, int64))(
-        FLOW, vector, vector, vector, types.Array(boolean, 1, "C"), float64, constant, constant, float64, float64, int64
+        FLOW,
+        vector,
+        vector,
+        vector,
+        types.Array(boolean, 1, "C"),
+        float64,
+        constant,
+        constant,
+        float64,
+        float64,
+        int64,
+        matrix,
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy, max_iterations):
+def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy, max_iterations, log):
     """Damped Newton on the costate in z = (q_0, lam_0), in place; z_end becomes the end of the extremal.
 
     `goal` holds q_f where `free` is False; where it is True the costate must vanish at the end (transversality).
-    Returns (status, iterations, residual, cost, integration steps). Converged means max |residual| <= tolerance.
+    `log` (max_iterations + 1, 2) receives residual and cost of each iterate. Returns (status, iterations, residual,
+    cost, evaluations of the flow). Converged means max |residual| <= tolerance.
     """
     n = len(goal)
     S = np.empty((2 * n, n))
@@ -36,14 +93,15 @@ def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy
     best_jacobian = np.empty((n, n))
     best_rhs = np.empty(n)
     best_norm, best_residual, cost, work = np.inf, np.inf, np.inf, 0
-    damping = 1.0
+    damping, hint = 1.0, 0.0
+    current, wanted = np.inf, max(accuracy, LOOSEST)
     for iteration in range(max_iterations + 1):
         while True:
             trial = start.copy()
             S[:] = 0.0
             for i in range(n):
                 S[n + i, i] = 1.0
-            trial_cost, _, _, steps = propagate(flow, trial, S, duration, data, field, accuracy, 0.0, False)
+            trial_cost, _, following, steps = propagate(flow, trial, S, duration, data, field, wanted, hint, False)
             work += abs(steps)
             norm, residual = 0.0, 0.0
             if steps < 0:
@@ -56,25 +114,34 @@ def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy
                     residual = max(residual, abs(rhs[i]))
                     for j in range(n):
                         jacobian[i, j] = S[row, j]
-            # Sufficient decrease of the residual norm; the first point has nothing to be compared with.
-            if norm <= (1.0 - damping / 2.0) ** 2 * best_norm and norm < np.inf:
+            # Sufficient decrease of the residual norm; the first point has nothing to be compared with. A better
+            # integrator sees errors that the one before did not.
+            slack = 100.0 * current * math.sqrt(n) if wanted < current < np.inf else 0.0
+            if math.sqrt(norm) <= (1.0 - damping / 2.0) * math.sqrt(best_norm) + slack and norm < np.inf:
                 break
             if iteration == 0:
+                log[0] = np.inf
                 return DIVERGED, iteration, np.inf, np.inf, work
             damping /= 2.0
             if damping < SMALLEST_DAMPING:
                 z[:] = best
-                return (CONVERGED if best_residual <= tolerance else STALLED), iteration, best_residual, cost, work
+                # The last row belongs to an iterate that was not reached.
+                return STALLED, iteration - 1, best_residual, cost, work
             for i in range(n):
                 start[n + i] = best[n + i] + damping * best_rhs[i]
         best[:] = start
         z_end[:] = trial
-        best_norm, best_residual, cost = norm, residual, trial_cost
+        best_norm, best_residual, cost, current = norm, residual, trial_cost, wanted
+        hint = following
+        log[iteration, 0] = residual
+        log[iteration, 1] = cost
         best_jacobian[:] = jacobian
         best_rhs[:] = rhs
-        if residual <= tolerance:
+        if residual <= tolerance and current <= accuracy:
             z[:] = best
             return CONVERGED, iteration, residual, cost, work
+        # Newton squares the residual, and an error of the integrator here is what remains of the residual thereafter.
+        wanted = min(current, max(accuracy, 0.01 * residual**3))
         if not solve_dense(best_jacobian, best_rhs):
             z[:] = best
             return SINGULAR, iteration, residual, cost, work

@@ -1,36 +1,37 @@
-"""`solve`: one problem, one path, one method."""
+"""`solve`: one problem, one method, one extremal."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from dataclasses import replace
+from itertools import islice
+from typing import Any, Literal
 
 import numpy as np
 
 from leapnav.envs.scenario import Scenario
-from leapnav.experts import leapfrog as leapfrog_kernels
-from leapnav.experts import multiple_shooting as multiple_shooting_kernels
-from leapnav.experts import single_shooting as single_shooting_kernels
-from leapnav.experts.certificate import certify, failure
-from leapnav.experts.extremal import Extremal, Iteration, Status
+from leapnav.experts.certificate import failure
+from leapnav.experts.collocation import collocation
+from leapnav.experts.extremal import Extremal, SolveError, Status
+from leapnav.experts.initial_path import initial_paths
 from leapnav.experts.lattice import Lattice
+from leapnav.experts.leapfrog import leapfrog
+from leapnav.experts.multiple_shooting import multiple_shooting
+from leapnav.experts.nodes import FEWEST_SEGMENTS, Settings
 from leapnav.experts.problem import OptimalControlProblem, Path, as_problem
+from leapnav.experts.single_shooting import single_shooting
 
-Method = Literal["single_shooting", "multiple_shooting", "leapfrog"]
-
-STATUS = {
-    single_shooting_kernels.CONVERGED: Status.SUCCESS,
-    single_shooting_kernels.STALLED: Status.STALLED,
-    single_shooting_kernels.DIVERGED: Status.DIVERGED,
-    single_shooting_kernels.SINGULAR: Status.SINGULAR,
-    single_shooting_kernels.MAX_ITERATIONS: Status.MAX_ITERATIONS,
+Method = Literal["single_shooting", "multiple_shooting", "leapfrog", "collocation"]
+METHODS: dict[str, Callable[[OptimalControlProblem, Path, Settings], Extremal]] = {
+    "single_shooting": single_shooting,
+    "multiple_shooting": multiple_shooting,
+    "leapfrog": leapfrog,
+    "collocation": collocation,
 }
-# The integrator is this much more accurate than the residual that Newton's method is asked for.
-ACCURACY = 1e-2
-SMALLEST_TOLERANCE = 1e-13  # of the integrator, near rounding
-# Sweeps need no accuracy beyond what the next sweep changes; Newton's method polishes the result.
-SWEEP_TOLERANCE = 1e-4
+# Of the paths found where no guess is given: so many are solved, unless dearer than the best by this share.
+TRIED, NEARLY = 4, 0.05
+POINTS_PER_SEGMENT = 8  # of an extremal that serves as a guess
 
 
 def solve(
@@ -40,24 +41,110 @@ def solve(
     tol: float = 1e-9,
     max_iterations: int = 60,
     segments: int | None = None,
+    *,
+    polish: bool = True,
+    update: Literal["mean_time", "half_cost"] = "mean_time",
+    order: Literal["sequential", "red_black"] = "sequential",
+    raise_on_failure: bool = False,
 ) -> Extremal:
-    """Solves the boundary value problem of the minimum principle from a guess: one extremal, not the global optimum.
+    """Solves the boundary value problem of the minimum principle: one certified extremal, not the global optimum.
 
     Args:
-        problem: an optimal control problem, or a scenario (whose guess is then the best path of the lattice search).
-        method: "leapfrog", "multiple_shooting" or "single_shooting".
-        guess: a path; without costates they are estimated from its motion. None: see `problem`, or a straight line.
+        problem: an optimal control problem, or a scenario.
+        method: "leapfrog", "multiple_shooting", "single_shooting" or "collocation".
+        guess: a path, whose costates are estimated from its motion if it has none, or an extremal (of a problem with
+            another horizon, goal or obstacle). None: for a scenario the best path of the lattice search; for a problem
+            the cheapest of several local minima on piecewise constant controls, neighbouring windings of goal angles
+            included.
         tol: largest residual of the boundary and continuity conditions; the certificate asks for 1e-8 in any case.
         max_iterations: of Newton's method.
-        segments: shooting segments, and nodes of Leapfrog; None chooses them from the guess.
+        segments: shooting segments, Leapfrog's nodes, collocation's first mesh; None chooses them from the guess, and
+            lets multiple shooting divide those that need it.
+        polish: end Leapfrog and collocation with multiple-shooting Newton steps, which is much faster; else Leapfrog
+            reduces its nodes until the last sub-problem is the whole problem, and collocation goes on to `tol`.
+        update: where Leapfrog moves a node on its sub-problem's extremal.
+        order: of the nodes in a Leapfrog sweep; "red_black" moves the odd ones, which do not depend on each other, and
+            then the even ones.
+        raise_on_failure: raise an exception instead of returning a failure.
 
     Returns:
         An `Extremal` whose status comes from its certificate.
 
     Raises:
         ValueError: an argument is impossible; the message names it.
+        SolveError: `raise_on_failure`, and there is no success; its `extremal` is the failed result.
 
     """
+    settings = _settings(method, tol, max_iterations, segments, polish, update, order)
+    task = as_problem(problem)
+    if guess is not None:
+        task, path, settings = _from_guess(task, guess, settings)
+        extremal = METHODS[method](task, path, settings)
+    elif isinstance(problem, Scenario):
+        candidate = next(Lattice(problem).candidates(), None)
+        if candidate is None:
+            extremal = failure(task, Status.NO_PATH)
+        else:
+            path = Path(candidate.times, candidate.poses)
+            extremal = METHODS[method](task.with_winding_of(path.states), path, settings)
+    else:
+        extremal = _without_guess(METHODS[method], task, settings)
+    if raise_on_failure and not extremal.success:
+        raise SolveError(extremal, problem.name if isinstance(problem, Scenario) else "")
+    return extremal
+
+
+def _without_guess(
+    solver: Callable[[OptimalControlProblem, Path, Settings], Extremal],
+    problem: OptimalControlProblem,
+    settings: Settings,
+) -> Extremal:
+    """The cheapest success from the most promising paths; the last resort is the straight line."""
+    best: Extremal | None = None
+    failed: list[Extremal] = []
+    for wound, path in islice(initial_paths(problem), TRIED):
+        extremal = solver(wound, path, settings)
+        if not extremal.success:
+            failed.append(extremal)
+        elif best is None or extremal.cost < best.cost:
+            best = extremal
+        elif extremal.cost > best.cost + NEARLY * abs(best.cost):
+            break
+    if best is not None:
+        return best
+    line = problem.straight_line()
+    failed.append(solver(problem.with_winding_of(line.states), line, settings))
+    if failed[-1].success:
+        return failed[-1]
+    # One that converged says more than one that did not.
+    converged = [extremal for extremal in failed if extremal.status in (Status.CONJUGATE_POINT, Status.COLLISION)]
+    return (converged or failed)[0]
+
+
+def _from_guess(
+    problem: OptimalControlProblem, guess: Path | Extremal, settings: Settings
+) -> tuple[OptimalControlProblem, Path, Settings]:
+    """Problem (with the guess's winding), path and settings for a guess."""
+    if isinstance(guess, Extremal):
+        if len(guess.times) == 0:
+            raise ValueError(f"guess: the extremal has no path: {guess.status.value}")
+        n, expected = guess.states.shape[1], problem.system.n
+        if n != expected:
+            raise ValueError(f"guess: the extremal has {n} states, the problem {expected}")
+        if settings.segments is None and guess.nodes > 2:
+            settings = replace(settings, segments=guess.nodes - 1)
+        points = POINTS_PER_SEGMENT * (settings.segments or FEWEST_SEGMENTS) + 1
+        values = guess.interpolate(np.linspace(0.0, guess.times[-1], points))
+        # Another horizon stretches the path.
+        path = Path(np.linspace(0.0, problem.horizon, points), values[:, :n], values[:, n:])
+    else:
+        path = _checked(guess, problem)
+    return problem.with_winding_of(path.states), path, settings
+
+
+def _settings(
+    method: str, tol: float, max_iterations: int, segments: int | None, polish: bool, update: Any, order: Any
+) -> Settings:
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     if not (math.isfinite(tol) and tol > 0):
@@ -66,180 +153,11 @@ def solve(
         raise ValueError(f"max_iterations: expected at least 1, got {max_iterations!r}")
     if segments is not None and segments < 1:
         raise ValueError(f"segments: expected at least 1, got {segments!r}")
-    task = as_problem(problem)
-    if isinstance(guess, Extremal):
-        if len(guess.times) == 0:
-            raise ValueError(f"guess: the extremal has no path: {guess.status.value}")
-        path = Path(guess.times * (task.horizon / guess.times[-1]), guess.states, guess.costates)
-    elif guess is not None:
-        path = _checked(guess, task)
-    elif isinstance(problem, Scenario):
-        candidate = next(Lattice(problem).candidates(), None)
-        if candidate is None:
-            return failure(task, Status.NO_PATH)
-        path = Path(candidate.times, candidate.poses)
-    else:
-        path = task.straight_line()
-    return METHODS[method](task.with_winding_of(path.states), path, tol, max_iterations, segments)
-
-
-def start_nodes(problem: OptimalControlProblem, path: Path, segments: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times (segments + 1,) and nodes (segments + 1, 2n) on a path, with both boundary conditions met exactly."""
-    times = np.linspace(0.0, problem.horizon, segments + 1)
-    even = path.resample(times)
-    costates = even.costates if even.costates is not None else problem.estimate_costates(even)
-    arrays = problem.arrays
-    nodes = np.concatenate([even.states, costates], axis=1)
-    n = problem.system.n
-    nodes[0, :n] = arrays.start
-    nodes[-1, :n] = np.where(arrays.free, nodes[-1, :n], arrays.goal)
-    return times, nodes
-
-
-def default_segments(path: Path) -> int:
-    """One segment per half second or per two points of a lattice path (0.4 to 0.7 m), whichever is more."""
-    return int(np.clip(max(len(path.times) / 2, path.times[-1] / 0.5), 8, 128))
-
-
-def single_shooting(
-    problem: OptimalControlProblem, path: Path, tol: float, max_iterations: int, segments: int | None
-) -> Extremal:
-    """Newton's method on the initial costate."""
-    arrays = problem.arrays
-    _, nodes = start_nodes(problem, path, segments or default_segments(path))
-    z, end = nodes[0].copy(), nodes[0].copy()
-    code, iterations, residual, cost, work = single_shooting_kernels.shoot(
-        arrays.flow,
-        z,
-        arrays.goal,
-        end,
-        arrays.free,
-        problem.horizon,
-        arrays.data,
-        arrays.field,
-        tol,
-        # Over the whole horizon the integration errors of all steps add up and grow.
-        max(tol * ACCURACY**2, SMALLEST_TOLERANCE),
-        max_iterations,
-    )
-    history = (Iteration("newton", 1, cost, residual, 0),) * min(iterations, 1)
-    times = np.array([0.0, problem.horizon])
-    return certify(problem, times, np.stack([z, end]), STATUS[code], history, work)
-
-
-def multiple_shooting(
-    problem: OptimalControlProblem, path: Path, tol: float, max_iterations: int, segments: int | None
-) -> Extremal:
-    """Newton's method on states and costates at all nodes."""
-    times, nodes = start_nodes(problem, path, segments or default_segments(path))
-    status, history, work = polish(problem, times, nodes, tol, max_iterations)
-    return certify(problem, times, nodes, status, history, work)
-
-
-def leapfrog(
-    problem: OptimalControlProblem, path: Path, tol: float, max_iterations: int, segments: int | None
-) -> Extremal:
-    """Leapfrog sweeps until Newton's method takes over, then multiple shooting on the same nodes."""
-    times, nodes = start_nodes(problem, path, segments or default_segments(path))
-    history: list[Iteration] = []
-    work = 0
-    costs = connect(problem, times, nodes)
-    for sweeps in (3, 6, 12, 24):
-        rows, steps = sweep(problem, times, nodes, costs, sweeps)
-        attempt = nodes.copy()
-        status, newton_rows, newton_steps = polish(problem, times, attempt, tol, max_iterations)
-        history += [*rows, *newton_rows]
-        work += steps + newton_steps
-        if status is Status.SUCCESS:
-            break
-    return certify(problem, times, attempt, status, tuple(history), work)
-
-
-METHODS: dict[str, Callable[[OptimalControlProblem, Path, float, int, int | None], Extremal]] = {
-    "single_shooting": single_shooting,
-    "multiple_shooting": multiple_shooting,
-    "leapfrog": leapfrog,
-}
-
-
-def connect(
-    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, tolerance: float = SWEEP_TOLERANCE
-) -> np.ndarray:
-    """Makes a path of nodes feasible in place; returns the cost of each segment, infinite where that failed."""
-    arrays = problem.arrays
-    costs = np.empty(len(times) - 1)
-    leapfrog_kernels.connect(
-        arrays.flow,
-        times,
-        nodes,
-        arrays.goal,
-        arrays.free,
-        arrays.data,
-        arrays.field,
-        tolerance,
-        tolerance,
-        costs,
-    )
-    return costs
-
-
-def sweep(
-    problem: OptimalControlProblem,
-    times: np.ndarray,
-    nodes: np.ndarray,
-    costs: np.ndarray,
-    sweeps: int,
-    half_cost: bool = False,
-    tolerance: float = SWEEP_TOLERANCE,
-) -> tuple[list[Iteration], int]:
-    """Leapfrog sweeps in place; returns a row for each, and the integration steps."""
-    arrays = problem.arrays
-    rows, work = [], 0
-    for _ in range(sweeps):
-        rejected, steps = leapfrog_kernels.sweep(
-            arrays.flow,
-            times,
-            nodes,
-            arrays.goal,
-            arrays.free,
-            arrays.data,
-            arrays.field,
-            tolerance,
-            tolerance,
-            half_cost,
-            costs,
-            1,
-            1,
-        )
-        rows.append(Iteration("sweep", len(costs), float(costs.sum()), math.nan, rejected))
-        work += steps
-    return rows, work
-
-
-def polish(
-    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, tol: float, max_iterations: int
-) -> tuple[Status, tuple[Iteration, ...], int]:
-    """Multiple-shooting Newton on the nodes, in place: (status, a row per iterate, integration steps)."""
-    arrays = problem.arrays
-    costs = np.empty(len(times) - 1)
-    log = np.zeros((max_iterations + 1, 3))
-    code, iterations, _, work = multiple_shooting_kernels.newton(
-        arrays.flow,
-        times,
-        nodes,
-        arrays.start,
-        arrays.goal,
-        arrays.free,
-        arrays.data,
-        arrays.field,
-        tol,
-        tol * ACCURACY,
-        max_iterations,
-        costs,
-        log,
-    )
-    rows = tuple(Iteration("newton", len(costs), row[1], row[0], 0) for row in log[: iterations + 1].tolist())
-    return STATUS[code], rows, work
+    if update not in ("mean_time", "half_cost"):
+        raise ValueError(f"update: expected 'mean_time' or 'half_cost', got {update!r}")
+    if order not in ("sequential", "red_black"):
+        raise ValueError(f"order: expected 'sequential' or 'red_black', got {order!r}")
+    return Settings(tol, max_iterations, segments, polish, update, order)
 
 
 def _checked(guess: Path, problem: OptimalControlProblem) -> Path:

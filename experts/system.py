@@ -26,7 +26,7 @@ import sympy as sp
 
 from leapnav.envs import obstacles
 
-GENERATOR_VERSION = "1"  # part of the file name: raise it whenever the generated text changes
+GENERATOR_VERSION = "2"  # part of the file name: raise it whenever the generated text changes
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class ControlAffineSystem:
         state: the n state symbols.
         drift: a(q), n expressions (numbers allowed).
         fields: b_j(q), one tuple of n expressions per control.
+        parameters: symbols in `drift`, `fields` and the state cost that are numbers of the problem, not of the system:
+            `OptimalControlProblem(parameters=...)` gives their values, and a new value compiles nothing.
         angles: state symbols that are angles; a goal for them is met modulo 2 pi.
         position: the two state symbols that are a point in the plane, for systems that move among obstacles.
 
@@ -55,6 +57,7 @@ class ControlAffineSystem:
     fields: tuple[tuple[sp.Expr, ...], ...]
     angles: tuple[sp.Symbol, ...] = field(default=())
     position: tuple[sp.Symbol, sp.Symbol] | None = None
+    parameters: tuple[sp.Symbol, ...] = field(default=())
 
     def __init__(
         self,
@@ -63,10 +66,15 @@ class ControlAffineSystem:
         fields: Sequence[Sequence[Any]],
         angles: Sequence[sp.Symbol] = (),
         position: Sequence[sp.Symbol] | None = None,
+        parameters: Sequence[sp.Symbol] = (),
     ) -> None:
         n = len(state)
         if n == 0 or len(set(state)) < n or not all(isinstance(s, sp.Symbol) for s in state):
             raise ValueError(f"state: expected distinct SymPy symbols, got {state!r}")
+        if len(set(parameters)) < len(parameters) or not all(isinstance(s, sp.Symbol) for s in parameters):
+            raise ValueError(f"parameters: expected distinct SymPy symbols, got {parameters!r}")
+        if set(parameters) & set(state):
+            raise ValueError(f"parameters: {sorted(map(str, set(parameters) & set(state)))[0]!r} is a state")
         if len(drift) != n:
             raise ValueError(f"drift: expected {n} expressions, one per state, got {len(drift)}")
         if len(fields) == 0:
@@ -80,15 +88,17 @@ class ControlAffineSystem:
             "fields": tuple(tuple(sp.sympify(e) for e in column) for column in fields),
             "angles": tuple(angles),
             "position": None if position is None else tuple(position),
+            "parameters": tuple(parameters),
         }
         for where, expressions in [
             ("drift", values["drift"]),
             *((f"fields[{j}]", c) for j, c in enumerate(values["fields"])),
         ]:
-            unknown = set().union(*(e.free_symbols for e in expressions)) - set(state)
+            unknown = set().union(*(e.free_symbols for e in expressions)) - {*state, *parameters}
             if unknown:
                 raise ValueError(
-                    f"{where}: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {tuple(state)}"
+                    f"{where}: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {tuple(state)}, "
+                    f"the parameters are {tuple(parameters)}"
                 )
         for where, chosen in (("angles", values["angles"]), ("position", values["position"] or ())):
             if not set(chosen) <= set(state):
@@ -119,6 +129,37 @@ def unicycle() -> ControlAffineSystem:
     )
 
 
+def differential_drive() -> ControlAffineSystem:
+    """The same robot with its wheels' speeds as controls: q = (x, y, theta), u = (left, right) in m/s.
+
+    The parameter is the distance between the wheels (m).
+    """
+    x, y, theta, track = sp.symbols("x y theta track")
+    return ControlAffineSystem(
+        state=(x, y, theta),
+        drift=(0, 0, 0),
+        fields=(
+            (sp.cos(theta) / 2, sp.sin(theta) / 2, -1 / track),
+            (sp.cos(theta) / 2, sp.sin(theta) / 2, 1 / track),
+        ),
+        angles=(theta,),
+        position=(x, y),
+        parameters=(track,),
+    )
+
+
+def unicycle_with_inertia() -> ControlAffineSystem:
+    """The robot with inertia: q = (x, y, theta, v, omega), u = (dv/dt, domega/dt)."""
+    x, y, theta, v, omega = sp.symbols("x y theta v omega")
+    return ControlAffineSystem(
+        state=(x, y, theta, v, omega),
+        drift=(v * sp.cos(theta), v * sp.sin(theta), omega, 0, 0),
+        fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
+        angles=(theta,),
+        position=(x, y),
+    )
+
+
 @lru_cache(maxsize=64)
 def compile_flow(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) -> ModuleType:
     """The compiled module of a system: `flow(z, data, field, S, dz, dS) -> running cost` and `control(z, data, u)`.
@@ -126,7 +167,9 @@ def compile_flow(system: ControlAffineSystem, state_cost: sp.Expr, in_field: boo
     `state_cost` is a SymPy expression in the state; with `in_field` the proximity cost of a packed obstacle field at
     the system's position is added to it.
     """
-    declaration = sp.srepr((system.state, system.drift, system.fields, system.position, state_cost, in_field))
+    declaration = sp.srepr(
+        (system.state, system.parameters, system.drift, system.fields, system.position, state_cost, in_field)
+    )
     # The kernel that the generated text calls is compiled into it, so its source belongs to the key.
     identity = "\n".join([GENERATOR_VERSION, declaration, inspect.getsource(obstacles)])
     name = f"flow_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
@@ -166,7 +209,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
     u = sp.symbols(f"u:{m}", real=True)
     slope = sp.symbols(f"slope:{m}", real=True)  # h_j'': 1 / r_j inside the control bounds, 0 beyond
     z = (*q, *lam)
-    rename = dict(zip(system.state, q, strict=True))
+    parameters = sp.symbols(f"parameter:{len(system.parameters)}", real=True) if system.parameters else ()
+    rename = dict(zip((*system.state, *system.parameters), (*q, *parameters), strict=True))
     drift = sum((sp.sympify(a).xreplace(rename) * p for a, p in zip(system.drift, lam, strict=True)), sp.Integer(0))
     switching = [
         sum((sp.sympify(b).xreplace(rename) * p for b, p in zip(column, lam, strict=True)), sp.Integer(0))
@@ -203,12 +247,13 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
             entry = hessian[a + n, b] if a < n else -hessian[a - n, b]
             if entry != 0:
                 jacobian[a, b] = entry
-    return _render(n, m, switching, value, rate, jacobian, at)
+    return _render(n, m, len(parameters), switching, value, rate, jacobian, at)
 
 
 def _render(
     n: int,
     m: int,
+    parameters: int,
     switching: Sequence[Any],
     value: Any,
     rate: list[sp.Expr],
@@ -244,6 +289,7 @@ def _render(
     unpack = [
         "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
         "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n)),
+        *(f"    parameter{i} = data[{3 * m + i}]" for i in range(parameters)),
     ]
     controls: list[str] = []
     for j in range(m):
