@@ -1,162 +1,188 @@
-"""From one path to a certified extremal: our methods beside scipy's solve_bvp and CasADi + IPOPT.
+"""From one path to a certified extremal: our methods beside scipy's solve_bvp and CasADi + IPOPT, and how time grows.
 
-All start from the same lattice path of the same scenarios, in the same process, and take turns. solve_bvp gets the
-path's states, costates consistent with the minimum principle, and the analytic Jacobian; IPOPT gets the path's states
-and solves the direct transcription (trapezoidal rule, 50 intervals). A solve counts as a success if the path that it
-returns meets the goal and is clear of every obstacle on its dense path.
+All start from the same lattice path of the same scenarios, in the same process, and take turns. A solve counts as a
+success if the solver says so and the path that it returns is clear of every obstacle on its dense path; ours only if
+it is certified. "Equal accuracy" of solve_bvp is the tolerance at which its solutions pass our certificate.
 """
 
 import argparse
+import gc
+import math
 import statistics
 import time
 from collections.abc import Callable
 
-import casadi
 import numpy as np
+from peers import Result, bvp, ipopt, line_guess, path_guess, transcription
 from rich.console import Console
 from rich.table import Table
-from scipy.integrate import solve_bvp
 
 from leapnav.envs import Scenario, sample_scenario
-from leapnav.envs.obstacles import clearances
-from leapnav.experts import Path, find_optimum, solve
+from leapnav.experts import OptimalControlProblem, Path, find_optimum, solve
 from leapnav.experts.lattice import Lattice
-from leapnav.experts.nodes import default_segments, start_nodes
-from leapnav.experts.problem import OptimalControlProblem
 
-INTERVALS = 50
-TOLERANCE = 1e-6  # of the peers; ours are certified to 1e-8
-Result = tuple[bool, float]
+Run = Callable[[Scenario, Path], Result]
+ROUNDS = 9  # of each measurement of how time grows; the median is printed
 
 
-def ours(method: str) -> Callable[[Scenario, Path], Result]:
+def ours(method: str) -> Run:
     def run(scenario: Scenario, path: Path) -> Result:
+        start = time.perf_counter()
         extremal = solve(scenario, method=method, guess=path)
-        return extremal.success, extremal.cost
+        return Result(extremal.success, extremal.cost, time.perf_counter() - start)
 
     return run
 
 
-def with_solve_bvp(scenario: Scenario, path: Path) -> Result:
-    problem = OptimalControlProblem.from_scenario(scenario).with_winding_of(path.states)
-    arrays = problem.arrays
-    times, nodes = start_nodes(problem, path, default_segments(path))
-    empty, dz, identity, jacobian = np.empty((6, 0)), np.empty(6), np.eye(6), np.empty((6, 6))
+def with_bvp(guess: Callable[..., tuple[np.ndarray, np.ndarray]], tol: float, zero: bool, compiled: bool) -> Run:
+    def run(scenario: Scenario, path: Path) -> Result:
+        states, costates = guess(scenario, path)
+        return bvp(scenario, states, 0.0 * costates if zero else costates, tol, compiled)
 
-    def rates(_, z):
-        out = np.empty_like(z)
-        for k, column in enumerate(np.ascontiguousarray(z.T)):
-            arrays.flow(column, arrays.data, arrays.field, empty, dz, empty)
-            out[:, k] = dz
-        return out
-
-    def jacobians(_, z):
-        out = np.empty((6, 6, z.shape[1]))
-        for k, column in enumerate(np.ascontiguousarray(z.T)):
-            arrays.flow(column, arrays.data, arrays.field, identity, dz, jacobian)
-            out[:, :, k] = jacobian
-        return out
-
-    def ends(start, end):
-        return np.concatenate([start[:3] - arrays.start, end[:3] - arrays.goal])
-
-    def end_jacobians(*_):
-        at_start, at_end = np.zeros((6, 6)), np.zeros((6, 6))
-        at_start[:3, :3] = at_end[3:, :3] = np.eye(3)
-        return at_start, at_end
-
-    found = solve_bvp(
-        rates, ends, times, nodes.T, fun_jac=jacobians, bc_jac=end_jacobians, tol=TOLERANCE, max_nodes=5000
-    )
-    dense = np.linspace(0, scenario.horizon, 2000)
-    states = np.ascontiguousarray(found.sol(dense)[:3].T)
-    values = [
-        arrays.flow(np.ascontiguousarray(z), arrays.data, arrays.field, empty, dz, empty) for z in found.sol(dense).T
-    ]
-    cost = float(np.trapezoid(values, dense))
-    return bool(found.success) and clearances(states, scenario.field).min() > 0, cost
+    return run
 
 
-def with_ipopt(scenario: Scenario, path: Path) -> Result:
-    times = np.linspace(0, scenario.horizon, INTERVALS + 1)
-    guess = path.resample(times).states
-    h, cost = scenario.horizon / INTERVALS, scenario.cost
-    opti = casadi.Opti()
-    q, u = opti.variable(3, INTERVALS + 1), opti.variable(2, INTERVALS + 1)
-    v, w = u[0, :], u[1, :]
-    rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
-    opti.subject_to(q[:, 1:] == q[:, :-1] + h / 2 * (rates[:, 1:] + rates[:, :-1]))
-    x_min, y_min, x_max, y_max = scenario.arena
-    near = 0
-    for d in (q[0, :] - x_min, x_max - q[0, :], q[1, :] - y_min, y_max - q[1, :]):
-        near += casadi.exp(-(d - scenario.robot.radius) / cost.proximity_scale)
-    for obstacle in scenario.obstacles:
-        (cx, cy), r = obstacle.circle.center, obstacle.circle.radius
-        d = casadi.sqrt((q[0, :] - cx) ** 2 + (q[1, :] - cy) ** 2 + 1e-6) - r - scenario.robot.radius
-        near += casadi.exp(-d / cost.proximity_scale)
-    running = (cost.speed_weight * v**2 + cost.turn_weight * w**2) / 2 + cost.proximity_weight * near
-    objective = h * (casadi.sum2(running) - (running[0] + running[-1]) / 2)
-    opti.minimize(objective)
-    opti.subject_to(q[:, 0] == np.array(scenario.start))
-    opti.subject_to(q[:, -1] == guess[-1])
-    opti.subject_to(opti.bounded(-scenario.robot.max_speed, v, scenario.robot.max_speed))
-    opti.subject_to(opti.bounded(-scenario.robot.max_turn_rate, w, scenario.robot.max_turn_rate))
-    opti.set_initial(q, guess.T)
-    opti.solver("ipopt", {"print_time": False, "expand": True}, {"print_level": 0, "sb": "yes", "tol": TOLERANCE})
+def peers() -> dict[str, Run]:
+    line = lambda scenario, _: line_guess(scenario)  # noqa: E731
+    return {
+        "IPOPT, 50 intervals": lambda s, p: ipopt(s, p, 50),
+        "IPOPT, 50 intervals, built beforehand": lambda s, p: ipopt(s, p, 50, prebuilt=True),
+        "IPOPT, 200 intervals": lambda s, p: ipopt(s, p, 200),
+        "IPOPT, 200 intervals, built beforehand": lambda s, p: ipopt(s, p, 200, prebuilt=True),
+        "solve_bvp, straight line, zero costates": with_bvp(line, 1e-6, True, False),
+        "solve_bvp, straight line, PMP costates": with_bvp(line, 1e-6, False, False),
+        "solve_bvp, path, zero costates": with_bvp(path_guess, 1e-6, True, False),
+        "solve_bvp, path, PMP costates": with_bvp(path_guess, 1e-6, False, False),
+        "the same, equal accuracy": with_bvp(path_guess, 1e-8, False, False),
+        "the same, our flow and Jacobian, 1e-6": with_bvp(path_guess, 1e-6, False, True),
+        "the same, our flow and Jacobian, equal accuracy": with_bvp(path_guess, 1e-8, False, True),
+    }
+
+
+def compare(count: int) -> None:
+    scenarios = [sample_scenario("clutter", seed=seed) for seed in range(500, 500 + count)]
+    own = {name: ours(name) for name in ("multiple_shooting", "leapfrog", "collocation", "single_shooting")}
+    methods = own | peers()
+    paths = []
+    for scenario in scenarios:
+        candidate = next(Lattice(scenario).candidates())
+        paths.append(Path(candidate.times, candidate.poses))
+        for intervals in (50, 200):  # what is built beforehand
+            transcription(len(scenario.obstacles), intervals)
+    for run in own.values():
+        run(scenarios[0], paths[0])  # loads the compiled code
+    results: dict[str, list[Result]] = {name: [] for name in methods}
+    for scenario, path in zip(scenarios, paths, strict=True):
+        for name, run in methods.items():
+            results[name].append(run(scenario, path))
+    best = statistics.median(r.seconds for r in results["multiple_shooting"])
+    leapfrog = statistics.median(r.seconds for r in results["leapfrog"])
+    table = Table(title=f"Path to extremal, {count} clutter scenarios (seeds from 500)")
+    table.add_column("method")
+    columns = ("success", "certified", "median ms", "x multiple shooting", "x leapfrog", "cost error, median")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for name, rows in results.items():
+        middle = statistics.median(r.seconds for r in rows)
+        # The same local minimum as multiple shooting's, or the error would say nothing.
+        pairs = zip(rows, results["multiple_shooting"], strict=True)
+        errors = [abs(r.cost / e.cost - 1) for r, e in pairs if r.success and e.success]
+        near = [error for error in errors if error < 0.02]
+        certified = sum(r.certified if name not in own else r.success for r in rows)
+        table.add_row(
+            name,
+            f"{sum(r.success for r in rows)} of {count}",
+            str(certified),
+            f"{1e3 * middle:.1f}",
+            f"{middle / best:.1f}",
+            f"{middle / leapfrog:.1f}",
+            f"{statistics.median(near):.0e}" if near else "-",
+        )
+    Console(width=150).print(table)
+    searches, optima = [], []
+    find_optimum(scenarios[0])
+    for scenario in scenarios:
+        searches.append(timed(lambda scenario=scenario: next(Lattice(scenario).candidates())))
+        optima.append(timed(lambda scenario=scenario: find_optimum(scenario)))
+    print(f"lattice search, median               {1e3 * statistics.median(searches):8.1f} ms")
+    print(f"find_optimum, everything, median     {1e3 * statistics.median(optima):8.1f} ms")
+
+
+def growth() -> None:
+    """Cost against work: obstacles, horizon, segments. Ratios are to the first row of each table."""
+    near = [(4.0, 4.5, 0.8), (6.0, 3.0, 0.5), (2.5, 6.0, 0.6), (7.0, 6.5, 0.5)]
+    rng = np.random.default_rng(0)
+    far: list[tuple[float, float, float]] = []
+    while len(far) < 512:
+        x, y = rng.uniform(1.0, 63.0, 2)
+        if max(x, y) > 14.0:
+            far.append((x, y, 0.4))
+    start, goal = (1.0, 1.0, 0.0), (8.0, 8.0, 1.5)
+    rows = []
+    path = None
+    for count in (8, 16, 32, 64, 128, 256, 512):
+        scenario = make(64.0, start, goal, 12.0, (near + far)[:count])
+        if path is None:
+            path = lattice_path(scenario)
+        rows.append((count, scenario, path, None))
+    report("obstacles, of which four are near the path", rows)
+
+    rows = []
+    for horizon in (10, 20, 40, 80):
+        size = 0.7 * horizon / math.sqrt(2) + 2.0  # at 0.7 m/s along the diagonal, with as many discs per metre of it
+        discs = []
+        for k in range(1, horizon // 4):
+            middle = 1.0 + 4 * k * (size - 2.0) / horizon
+            discs.append((middle + 0.3, middle - 0.3 * (-1) ** k, 0.4))
+        scenario = make(size, (1.0, 1.0, 0.8), (size - 1.0, size - 1.0, 0.8), float(horizon), discs)
+        rows.append((horizon, scenario, lattice_path(scenario), None))
+    report("horizon (s), with as many obstacles per second", rows)
+
+    # From a converged guess, so that the number of iterations does not vary with the segments.
+    extremal = solve(scenario, method="multiple_shooting", guess=rows[-1][2])
+    rows = [(segments, scenario, extremal, segments) for segments in (16, 32, 64, 128, 256)]
+    report("segments, on the last of these", rows)
+
+
+def make(size: float, start: tuple, goal: tuple, horizon: float, discs: list) -> Scenario:
+    obstacles = tuple({"circle": {"center": (x, y), "radius": r}} for x, y, r in discs)
+    return Scenario(arena=(0.0, 0.0, size, size), start=start, goal=goal, horizon=horizon, obstacles=obstacles)
+
+
+def lattice_path(scenario: Scenario) -> Path:
+    candidate = next(Lattice(scenario).candidates())
+    return Path(candidate.times, candidate.poses)
+
+
+def report(what: str, rows: list) -> None:
+    table = Table(title=f"Multiple shooting: time against {what}")
+    for column in (what.split(",")[0], "status", "median ms", "ratio", "evaluations of the flow"):
+        table.add_column(column, justify="right")
+    first = None
+    for value, scenario, guess, segments in rows:
+        problem = OptimalControlProblem.from_scenario(scenario)
+        kwargs = {"method": "multiple_shooting", "guess": guess, "segments": segments}
+        extremal = solve(problem, **kwargs)
+        gc.collect()
+        middle = statistics.median(timed(lambda p=problem, k=kwargs: solve(p, **k)) for _ in range(ROUNDS))
+        first = first or middle
+        row = (str(value), extremal.status.name, f"{1e3 * middle:.2f}", f"{middle / first:.2f}", str(extremal.work))
+        table.add_row(*row)
+    Console(width=150).print(table)
+
+
+def timed(run: Callable[[], object]) -> float:
     start = time.perf_counter()
-    try:
-        solution = opti.solve()
-    except RuntimeError:
-        with_ipopt.seconds = time.perf_counter() - start
-        return False, np.inf
-    # Building the problem in Python is CasADi's set-up, not IPOPT's work, and is left out.
-    with_ipopt.seconds = time.perf_counter() - start
-    states = Path(times, solution.value(q).T).resample(np.linspace(0, scenario.horizon, 2000)).states
-    return clearances(np.ascontiguousarray(states), scenario.field).min() > 0, float(solution.value(objective))
+    run()
+    return time.perf_counter() - start
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=40, help="clutter scenarios")
-    count = parser.parse_args().count
-    methods: dict[str, Callable[[Scenario, Path], Result]] = {
-        "leapfrog": ours("leapfrog"),
-        "multiple shooting": ours("multiple_shooting"),
-        "solve_bvp": with_solve_bvp,
-        f"IPOPT, {INTERVALS} intervals": with_ipopt,
-    }
-    scenarios = [sample_scenario("clutter", 20_000 + seed) for seed in range(count)]
-    seconds: dict[str, list[float]] = {name: [] for name in methods}
-    successes = dict.fromkeys(methods, 0)
-    search, optimum = [], []
-    find_optimum(scenarios[0])
-    for scenario in scenarios:
-        start = time.perf_counter()
-        candidate = next(Lattice(scenario).candidates())
-        search.append(time.perf_counter() - start)
-        start = time.perf_counter()
-        find_optimum(scenario)
-        optimum.append(time.perf_counter() - start)
-        path = Path(candidate.times, candidate.poses)
-        for name, run in methods.items():
-            start = time.perf_counter()
-            success, _ = run(scenario, path)
-            spent = time.perf_counter() - start
-            seconds[name].append(with_ipopt.seconds if run is with_ipopt else spent)
-            successes[name] += success
-    reference = statistics.median(seconds["leapfrog"])
-    table = Table(title=f"Path to extremal, {count} clutter scenarios")
-    for column in ("method", "success", "median ms", "times leapfrog's"):
-        table.add_column(column, justify="right" if column != "method" else "left")
-    for name, spent in seconds.items():
-        middle = statistics.median(spent)
-        table.add_row(name, f"{successes[name]} of {count}", f"{1e3 * middle:.1f}", f"{middle / reference:.2f}")
-    Console().print(table)
-    print(f"lattice search, median               {1e3 * statistics.median(search):8.1f} ms")
-    print(f"find_optimum, everything, median     {1e3 * statistics.median(optimum):8.1f} ms")
+    compare(parser.parse_args().count)
+    growth()
 
-
-with_ipopt.seconds = 0.0
 
 if __name__ == "__main__":
     main()

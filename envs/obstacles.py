@@ -3,12 +3,14 @@
 All kernels read one flat array, the packed field, so that it can pass through any compiled function:
 
     [0] proximity weight k   [1] proximity scale sigma   [2] robot radius   [3] circles   [4] polygons
-    [5:9] arena (x_min, y_min, x_max, y_max)
+    [5:9] arena (x_min, y_min, x_max, y_max)   [9] position of the grid
     then per circle:   x, y, r
     then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
+    then the obstacles' numbers in the scenario, since circles are packed before polygons
+    then the grid:     x, y, cell size, columns, lines, then where each cell's list begins (and the last one ends), then
+                       the lists: positions in the packed field of the obstacles that are felt somewhere in the cell
 
-Obstacles are numbered as in the scenario; since circles are packed before polygons the numbers are stored last,
-one per packed obstacle.
+The grid keeps the proximity cost of a point independent of obstacles far away; up to FEW obstacles it has one cell.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from numba import float64, int64, njit, types
 
 # A term whose distance exceeds 40 sigma is below 1e-17 k, the rounding error of the sum, and is skipped exactly.
 CUTOFF = 40.0
-CIRCLES, POLYGONS, ARENA, SHAPES = 3, 4, 5, 9  # positions in the packed field
+CIRCLES, POLYGONS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # positions in the packed field
+FEW, MOST_CELLS = 16, 32  # obstacles without a grid; columns or lines of one
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
 
@@ -45,10 +48,84 @@ def pack_field(
         else:
             polygons += _pack_polygon(np.asarray(shape.vertices, dtype=float))
             polygon_numbers.append(number)
-    header = [weight, scale, radius, len(circle_numbers), len(polygon_numbers), *arena]
-    field = np.array(header + circles + polygons + circle_numbers + polygon_numbers, dtype=np.float64)
+    header = [weight, scale, radius, float(len(circle_numbers)), float(len(polygon_numbers)), *arena]
+    return _finish(header, circles, polygons, [float(n) for n in circle_numbers + polygon_numbers])
+
+
+def blend_fields(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
+    """The packed field at `share` of the way from the first (0) to the second (1), obstacle by obstacle.
+
+    Raises:
+        ValueError: they do not hold the same kinds of obstacles.
+
+    """
+    parts = [_unpack(first), _unpack(second)]
+    (circles, polygons), (other_circles, other_polygons) = parts
+    if len(circles) != len(other_circles) or [len(p) for p in polygons] != [len(p) for p in other_polygons]:
+        raise ValueError("obstacles: two fields can be blended only if they hold the same kinds of obstacles")
+    header = (1.0 - share) * first[:GRID] + share * second[:GRID]
+    blended = [float(x) for x in ((1.0 - share) * circles + share * other_circles).ravel()]
+    rows: list[float] = []
+    for polygon, other in zip(polygons, other_polygons, strict=True):
+        rows += _pack_polygon((1.0 - share) * polygon[:, 3:] + share * other[:, 3:])
+    count = len(circles) + len(polygons)
+    numbers = first[int(first[GRID]) - count : int(first[GRID])].tolist()
+    return _finish(header.tolist(), blended, rows, numbers)
+
+
+def _finish(header: list[float], circles: list[float], polygons: list[float], numbers: list[float]) -> np.ndarray:
+    """The packed field, with its grid, of which `header` lacks the position."""
+    position = SHAPES + len(circles) + len(polygons) + len(numbers)
+    packed = np.array([*header, position, *circles, *polygons, *numbers], dtype=np.float64)
+    field = np.concatenate([packed, _pack_grid(packed)])
     field.flags.writeable = False
     return field
+
+
+def _unpack(packed: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Circles (count, 3) and the rows (m, 5) of each polygon."""
+    at = SHAPES + 3 * int(packed[CIRCLES])
+    circles = packed[SHAPES:at].reshape(-1, 3)
+    polygons = []
+    for _ in range(int(packed[POLYGONS])):
+        edges = int(packed[at])
+        polygons.append(packed[at + 1 : at + 1 + 5 * edges].reshape(edges, 5))
+        at += 1 + 5 * edges
+    return circles, polygons
+
+
+def _pack_grid(packed: np.ndarray) -> np.ndarray:
+    """The grid of a field; obstacles are felt up to CUTOFF scales from the robot's rim."""
+    reach = packed[2] + CUTOFF * packed[1]
+    circles, polygons = _unpack(packed)
+    positions = [SHAPES + 3 * i for i in range(len(circles))]
+    at = SHAPES + 3 * len(circles)
+    for polygon in polygons:
+        positions.append(at)
+        at += 1 + polygon.size
+    # Obstacles may reach out of the arena. A point beyond the grid belongs to the cell nearest to it, where everything
+    # that it feels is listed: the way to the nearest point of a convex set shortens the distances to all in the set.
+    corners = [packed[ARENA : ARENA + 4].reshape(2, 2)]
+    corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
+    corners += [polygon[:, 3:] for polygon in polygons]
+    low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+    if len(positions) <= FEW:
+        shape, size = np.array([1, 1]), float(np.max(high - low))
+    else:
+        size = float(np.max(high - low)) / MOST_CELLS
+        shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
+    first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
+    felt = np.empty((len(first), len(positions)), dtype=bool)
+    if len(circles):
+        nearest = np.clip(circles[:, :2], first[:, None], first[:, None] + size)
+        felt[:, : len(circles)] = np.linalg.norm(nearest - circles[:, :2], axis=2) - circles[:, 2] < reach
+    for k, polygon in enumerate(polygons):
+        # The smallest value of each half-plane's distance in the cell; their largest bounds the polygon's from below.
+        offsets = np.minimum(polygon[:, :2] * size, 0.0).sum(axis=1) - polygon[:, 2]
+        felt[:, len(circles) + k] = (first @ polygon[:, :2].T + offsets).max(axis=1) < reach
+    cells, numbers = np.nonzero(felt)
+    begins = np.searchsorted(cells, np.arange(len(first) + 1))
+    return np.concatenate([low, [size], shape, begins, np.array(positions, dtype=float)[numbers]])
 
 
 def _pack_polygon(vertices: np.ndarray) -> list[float]:
@@ -106,58 +183,67 @@ def proximity(x, y, field):
             else:
                 gy -= slope
                 hyy += sign * slope * steepness
-    at = SHAPES
-    for _ in range(int(field[CIRCLES])):
-        dx, dy = x - field[at], y - field[at + 1]
-        rim = field[at + 2] + radius
-        at += 3
-        square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
-        if square < (rim + reach) ** 2:
-            smooth = math.sqrt(square)
-            term = k * math.exp((rim - smooth) * steepness)
-            nx, ny = dx / smooth, dy / smooth
-            slope = term * steepness
-            curl = slope / smooth
-            bend = slope * steepness + curl
-            value += term
-            gx -= slope * nx
-            gy -= slope * ny
-            hxx += bend * nx * nx - curl
-            hxy += bend * nx * ny
-            hyy += bend * ny * ny - curl
-    for _ in range(int(field[POLYGONS])):
-        edges = int(field[at])
-        rows = at + 1
-        at = rows + 5 * edges
-        farthest = -np.inf
-        for j in range(edges):
-            row = rows + 5 * j
-            farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
-        distance = farthest - radius
-        if distance < reach:
-            total = mx = my = sxx = sxy = syy = 0.0
+    grid = int(field[GRID])
+    columns, lines = int(field[grid + 3]), int(field[grid + 4])
+    begins = grid + 5
+    if columns * lines > 1:
+        column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
+        line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
+        begins += column * lines + line
+    lists = grid + 6 + columns * lines
+    polygons = SHAPES + 3 * int(field[CIRCLES])
+    for entry in range(lists + int(field[begins]), lists + int(field[begins + 1])):
+        at = int(field[entry])
+        if at < polygons:
+            dx, dy = x - field[at], y - field[at + 1]
+            rim = field[at + 2] + radius
+            square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
+            if square < (rim + reach) ** 2:
+                smooth = math.sqrt(square)
+                inverse = 1.0 / smooth
+                term = k * math.exp((rim - smooth) * steepness)
+                nx, ny = dx * inverse, dy * inverse
+                slope = term * steepness
+                curl = slope * inverse
+                bend = slope * steepness + curl
+                value += term
+                gx -= slope * nx
+                gy -= slope * ny
+                hxx += bend * nx * nx - curl
+                hxy += bend * nx * ny
+                hyy += bend * ny * ny - curl
+        else:
+            edges = int(field[at])
+            rows = at + 1
+            farthest = -np.inf
             for j in range(edges):
                 row = rows + 5 * j
-                nx, ny = field[row], field[row + 1]
-                # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
-                share = math.exp((nx * x + ny * y - field[row + 2] - farthest) * steepness)
-                total += share
-                mx += share * nx
-                my += share * ny
-                sxx += share * nx * nx
-                sxy += share * nx * ny
-                syy += share * ny * ny
-            part = 1.0 / total
-            term = k * math.exp(-distance * steepness) * part
-            mx, my = mx * part, my * part
-            slope = term * steepness
-            bend = slope * steepness
-            value += term
-            gx -= slope * mx
-            gy -= slope * my
-            hxx += bend * (2 * mx * mx - sxx * part)
-            hxy += bend * (2 * mx * my - sxy * part)
-            hyy += bend * (2 * my * my - syy * part)
+                farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+            distance = farthest - radius
+            if distance < reach:
+                total = mx = my = sxx = sxy = syy = 0.0
+                for j in range(edges):
+                    row = rows + 5 * j
+                    nx, ny = field[row], field[row + 1]
+                    # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
+                    share = math.exp((nx * x + ny * y - field[row + 2] - farthest) * steepness)
+                    total += share
+                    mx += share * nx
+                    my += share * ny
+                    sxx += share * nx * nx
+                    sxy += share * nx * ny
+                    syy += share * ny * ny
+                part = 1.0 / total
+                term = k * math.exp(-distance * steepness) * part
+                mx, my = mx * part, my * part
+                slope = term * steepness
+                bend = slope * steepness
+                value += term
+                gx -= slope * mx
+                gy -= slope * my
+                hxx += bend * (2 * mx * mx - sxx * part)
+                hxy += bend * (2 * mx * my - sxy * part)
+                hyy += bend * (2 * my * my - syy * part)
     return value, gx, gy, hxx, hxy, hyy
 
 
@@ -169,7 +255,7 @@ def clearance(x, y, field):
     """
     radius = field[2]
     circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
-    numbers = len(field) - circles - polygons
+    numbers = int(field[GRID]) - circles - polygons
     best = min(
         min(x - field[ARENA], field[ARENA + 2] - x),
         min(y - field[ARENA + 1], field[ARENA + 3] - y),

@@ -1,12 +1,13 @@
 """Optimal control by the minimum principle: solvers, the search for the optimum, and the expert that drives it."""
 
-from leapnav.experts.certificate import certify
-from leapnav.experts.extremal import Certificate, Extremal, Iteration, Status
+from leapnav.experts.certificate import certify, verify
+from leapnav.experts.continuation import continuation
+from leapnav.experts.extremal import Certificate, Extremal, Iteration, SolveError, Status
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.problem import OptimalControlProblem, Path
 from leapnav.experts.solve import solve
-from leapnav.experts.system import ControlAffineSystem, unicycle
+from leapnav.experts.system import ControlAffineSystem, differential_drive, unicycle, unicycle_with_inertia
 
 __all__ = [
     "Certificate",
@@ -17,9 +18,14 @@ __all__ = [
     "NoOptimumError",
     "OptimalControlProblem",
     "Path",
+    "SolveError",
     "Status",
     "certify",
+    "continuation",
+    "differential_drive",
     "find_optimum",
     "solve",
     "unicycle",
+    "unicycle_with_inertia",
+    "verify",
 ]

@@ -19,7 +19,7 @@ from leapnav.experts.problem import OptimalControlProblem, Path
 
 # With a polish to follow, cubics need not be exact: their error falls with the fourth power of the mesh only.
 ROUGH_TOLERANCE = 1e-4
-MOST_NODES = 20_000
+MOST_NODES = 5_000
 MOST_POLISHED = 128  # segments
 # solve_bvp's own exit codes.
 ENDS = {0: Status.SUCCESS, 1: Status.MAX_ITERATIONS, 2: Status.SINGULAR, 3: Status.STALLED}

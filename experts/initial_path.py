@@ -18,6 +18,7 @@ import numpy as np
 from numba import boolean, float64, njit, types
 
 from leapnav.experts.integrator import CONTROL, FLOW, constant, cube, matrix, vector
+from leapnav.experts.linear import solve_positive
 from leapnav.experts.problem import OptimalControlProblem, Path
 
 INTERVALS = 64
@@ -276,21 +277,16 @@ def _quadratic_step(
     """Minimum of 1/2 d'Hd + g'd subject to G d = c, where what is not `moving` goes to its bound; with multipliers."""
     move = np.zeros(len(g))
     held = ~moving
-    free_move = None
-    if held.any():
-        # To the bound that is nearer.
-        move[held] = np.where(np.abs(lowest[held]) < np.abs(highest[held]), lowest[held], highest[held])
+    # To the bound that is nearer.
+    move[held] = np.where(np.abs(lowest[held]) < np.abs(highest[held]), lowest[held], highest[held])
     block = H[np.ix_(moving, moving)]
+    rhs = np.column_stack([-(g[moving] + np.einsum("ij,j->i", H[np.ix_(moving, held)], move[held])), G[:, moving].T])
     # The state cost need not be convex: enough is added to the diagonal to make the step one of descent.
     extra = 0.0
-    while True:
-        try:
-            factor = np.linalg.cholesky(block + extra * np.eye(len(block)))
-            break
-        except np.linalg.LinAlgError:
-            extra = max(4.0 * extra, 1e-3 * float(np.abs(np.diag(block)).max()))
-    rhs = np.column_stack([-(g[moving] + H[np.ix_(moving, held)] @ move[held]), G[:, moving].T])
-    solved = np.linalg.solve(factor.T, np.linalg.solve(factor, rhs))
+    solved = rhs.copy()
+    while not solve_positive(block + extra * np.eye(len(block)), solved):
+        extra = max(4.0 * extra, 1e-3 * float(np.abs(np.diag(block)).max(initial=1e-300)))
+        solved = rhs.copy()
     free_move, spread = solved[:, 0], solved[:, 1:]
     gram = G[:, moving] @ spread
     wanted = c - G[:, held] @ move[held]

@@ -193,27 +193,3 @@ def evaluate_interpolant(start, s, terms, i):
     for k in range(DENSE_TERMS - 1, -1, -1):
         value = (value + terms[k, i]) * (s if k % 2 == 0 else 1.0 - s)
     return start + value
-
-
-@njit(types.none(FLOW, CONTROL, matrix, constant, constant, matrix, cube), cache=True, error_model="numpy", nogil=True)
-def sample_dynamics(flow, control, states, data, field, drift, fields):
-    """Fills a (N, n) and B (N, n, m) of q' = a + B u at states (N, n)."""
-    count, n = states.shape
-    m = fields.shape[2]
-    # With unit weights and no bounds u = -B'lam, so unit costates read B off row by row.
-    probe = data.copy()
-    probe[:m] = 1.0
-    probe[m : 2 * m] = -np.inf
-    probe[2 * m : 3 * m] = np.inf
-    z, dz, u = np.zeros(2 * n), np.empty(2 * n), np.empty(m)
-    none, d_none = np.empty((2 * n, 0)), np.empty((2 * n, 0))
-    for k in range(count):
-        z[:n] = states[k]
-        flow(z, probe, field, none, dz, d_none)
-        drift[k] = dz[:n]
-        for i in range(n):
-            z[n + i] = 1.0
-            control(z, probe, u)
-            z[n + i] = 0.0
-            for j in range(m):
-                fields[k, i, j] = -u[j]

@@ -37,6 +37,7 @@ SWEEPS_BEFORE_NEWTON = (1, 2, 4, 8, 16, 32, 64)
 LITTLE = 1e-3
 MOST_SWEEPS = 500
 REDUCTIONS_FAILED = 2  # thereafter the sweeps go on until the costates do not jump at the nodes
+SAME_COST = 1e-6  # the cost of a last iterate of Newton's method is known to this
 MOST_STUCK = 3  # sweeps with rejected moves, before arcs are halved
 STEERING_INTERVALS, STEERING_STARTS = 16, 6
 
@@ -61,7 +62,7 @@ def _sweep_and_polish(track: FeasiblePath, settings: Settings) -> Extremal:
         status, rows, work = polish(track.problem, track.times, nodes, settings.tol, settings.max_iterations)
         track.work += work
         # From a feasible path the way down leads to a cheaper extremal; a dearer one is another path's.
-        if status is Status.SUCCESS and rows[-1].cost <= track.cost * (1 + 1e-9) + 1e-9:
+        if status is Status.SUCCESS and rows[-1].cost <= track.cost + SAME_COST * (1 + abs(track.cost)):
             history = (*track.history, *rows)
             extremal = certify(track.problem, track.times, nodes, status, history, track.work)
             # From a saddle the sweeps lead further down.

@@ -1,6 +1,12 @@
-"""Linear systems of the Newton methods, as compiled kernels: small dense, and banded with partial pivoting."""
+"""Linear systems as compiled kernels: small dense and banded ones with partial pivoting, and positive definite ones.
+
+Systems this small gain nothing from a BLAS, and its threads make them a hundred times slower where another process keeps
+the cores busy.
+"""
 
 from __future__ import annotations
+
+import math
 
 from numba import boolean, int64, njit
 
@@ -71,4 +77,38 @@ def solve_banded(rows, b, half):
         for j in range(k + 1, min(k + 2 * half, n - 1) + 1):
             b[k] -= rows[k, j - k + half] * b[j]
         b[k] /= rows[k, half]
+    return True
+
+
+@njit(boolean(matrix, matrix), cache=True, error_model="numpy", nogil=True)
+def solve_positive(A, B):
+    """Cholesky factorisation of A (n, n), of which the upper half is read, in place: B (n, k) becomes A^-1 B.
+
+    False if A is not positive definite.
+    """
+    n, width = B.shape
+    for k in range(n):
+        if not A[k, k] > 0.0:
+            return False
+        A[k, k] = math.sqrt(A[k, k])
+        inverse = 1.0 / A[k, k]
+        for j in range(k + 1, n):
+            A[k, j] *= inverse
+        for i in range(k + 1, n):
+            factor = A[k, i]
+            if factor != 0.0:
+                for j in range(i, n):
+                    A[i, j] -= factor * A[k, j]
+    for k in range(n):
+        for c in range(width):
+            B[k, c] /= A[k, k]
+        for i in range(k + 1, n):
+            for c in range(width):
+                B[i, c] -= A[k, i] * B[k, c]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            for c in range(width):
+                B[k, c] -= A[k, j] * B[j, c]
+        for c in range(width):
+            B[k, c] /= A[k, k]
     return True

@@ -28,9 +28,10 @@ from leapnav.experts.single_shooting import LOOSEST, MARGIN, SMALLEST_DAMPING
 flags = types.Array(boolean, 1, "C")
 # Newton's method goes on to a residual this much below the one asked for, so that H is constant to about as much; one
 # that it cannot lower any further may be as large. The integrator is more accurate than that.
-ACCURACY = 1e-2
+ACCURACY = 0.1
 # Sensitivities grow along a segment; where by more than this, Newton's method loses half its digits.
 LARGEST_GROWTH = 1e4
+SAFETY = 0.01  # a foreseen residual must be this much below the tolerance
 REFINEMENTS, MOST_SEGMENTS = 6, 20_000
 
 
@@ -188,9 +189,10 @@ def _residual(flow, times, Z, start, goal, free, data, field, accuracy, rows, rh
 def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, max_iterations, costs, log):
     """Damped Newton on the nodes Z (segments + 1, 2n), in place; `costs` (segments,) becomes the cost of each segment.
 
-    `log` (max_iterations + 1, 3) receives residual, cost and damping of each iterate. The integrator is as accurate as
-    the current residual deserves, and `accuracy` at the end. A residual of tolerance / MARGIN is accepted where no step
-    decreases it (the certificate has the last word). Returns (status, iterations, residual, evaluations).
+    `log` (max_iterations + 1, 3) receives residual, cost and damping of each iterate but a last one whose residual is
+    foreseen. The integrator is as accurate as the current residual deserves, and `accuracy` at the end. A residual of
+    tolerance / MARGIN is accepted where no step decreases it (the certificate has the last word). Returns (status,
+    iterations, residual, evaluations).
     """
     n = len(goal)
     segments = len(times) - 1
@@ -206,7 +208,7 @@ def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, 
     norm, residual, work = _residual(flow, times, Z, start, goal, free, data, field, current, rows, rhs, costs, hint)
     if norm == np.inf:
         return DIVERGED, 0, np.inf, work
-    damping = 1.0
+    damping, before = 1.0, 0.0
     for iteration in range(max_iterations + 1):
         log[iteration, 0] = residual
         log[iteration, 1] = costs.sum()
@@ -218,8 +220,15 @@ def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, 
         if not solve_banded(rows, rhs, half):
             return SINGULAR, iteration, residual, work
         step = rhs.copy()
-        # Newton squares the residual, and an error of the integrator here is what remains of the residual thereafter.
-        wanted = min(current, max(accuracy, 0.01 * residual**3))
+        # What convergence of order two makes of the residual; the certificate integrates the result in any case.
+        following = residual * (residual / before) ** 2 if damping == 1.0 and residual < before else np.inf
+        if following <= SAFETY * tolerance and current <= accuracy:
+            for k in range(segments + 1):
+                for i in range(2 * n):
+                    Z[k, i] += step[2 * n * k + i]
+            return CONVERGED, iteration, following, work
+        # An error of the integrator here is what remains of the residual in the end.
+        wanted = accuracy if residual < 1e-2 else min(current, max(accuracy, 0.01 * residual**3))
         damping = min(1.0, 2.0 * damping)
         while True:
             for k in range(segments + 1):
@@ -243,5 +252,6 @@ def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, 
         Z[:] = trial
         hint[:] = trial_hint
         costs[:] = trial_costs
+        before = residual
         norm, residual, current = trial_norm, trial_residual, wanted
     return MAX_ITERATIONS, max_iterations, residual, work

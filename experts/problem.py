@@ -6,15 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
 import sympy as sp
 
 from leapnav.envs.scenario import Scenario
-from leapnav.experts.integrator import sample_dynamics
-from leapnav.experts.system import ControlAffineSystem, compile_flow, unicycle
+from leapnav.experts.dynamics import sample_dynamics, smallest_costates
+from leapnav.experts.system import CompiledFunction, ControlAffineSystem, compile_flow, unicycle
 
 
 @dataclass(frozen=True)
@@ -119,21 +118,17 @@ class OptimalControlProblem:
         # Compiled functions belong to this process; the receiving one makes its own.
         return {name: value for name, value in self.__dict__.items() if name != "arrays"}
 
-    @property
-    def module(self) -> ModuleType:
-        """The compiled extremal flow."""
-        return compile_flow(self.system, sp.sympify(self.state_cost), self.field is not None)
-
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem as the arrays that the kernels take."""
         m = self.system.m
+        flow, control = compile_flow(self.system, sp.sympify(self.state_cost), self.field is not None)
         bounds = np.array(
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
         return ProblemArrays(
-            flow=self.module.flow,
-            control=self.module.control,
+            flow=flow,
+            control=control,
             start=np.array(self.start, dtype=float),
             goal=np.array([0.0 if g is None else g for g in self.goal], dtype=float),
             free=np.array([g is None for g in self.goal]),
@@ -144,19 +139,14 @@ class OptimalControlProblem:
     def estimate_costates(self, path: Path) -> np.ndarray:
         """Costates (N, n) consistent with the minimum principle along a path without any.
 
-        The control that follows the path in the least-squares sense gives the switching functions p = -R u, and
-        lam = B (B'B)^-1 p is the smallest costate with these.
+        The control that follows the path in the least-squares sense gives the switching functions p = -R u, and of the
+        costates with these the smallest is taken.
         """
-        weight = np.asarray(self.control_weight, dtype=float)
-        rates = np.gradient(path.states, path.times, axis=0)
         drift, fields = self.dynamics(path.states)
-        # Where the fields are dependent a trace of their size keeps B'B regular.
-        gram = fields.transpose(0, 2, 1) @ fields
-        m = self.system.m
-        gram += (1e-12 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(m)
-        inverse = np.linalg.inv(gram)
-        controls = inverse @ (fields.transpose(0, 2, 1) @ (rates - drift)[:, :, None])
-        return (fields @ (inverse @ (-weight[:, None] * controls)))[:, :, 0]
+        costates = np.empty_like(drift)
+        rates = np.gradient(path.states, path.times, axis=0)
+        smallest_costates(drift, fields, rates, np.array(self.control_weight, dtype=float), costates)
+        return costates
 
     def dynamics(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A (N, n) and B (N, n, m) at states (N, n)."""
@@ -179,8 +169,8 @@ class OptimalControlProblem:
 class ProblemArrays:
     """What the kernels read: compiled functions, boundary values (n,), free flags (n,), weights and bounds, field."""
 
-    flow: Any
-    control: Any
+    flow: CompiledFunction
+    control: CompiledFunction
     start: np.ndarray
     goal: np.ndarray
     free: np.ndarray

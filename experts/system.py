@@ -18,13 +18,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import platformdirs
 import sympy as sp
+from numba import types
 
 from leapnav.envs import obstacles
+from leapnav.experts.integrator import CONTROL, FLOW
 
 GENERATOR_VERSION = "2"  # part of the file name: raise it whenever the generated text changes
 
@@ -160,9 +161,32 @@ def unicycle_with_inertia() -> ControlAffineSystem:
     )
 
 
+class CompiledFunction:
+    """A compiled function as the argument of a kernel: its type and its address.
+
+    Numba also takes the dispatcher itself, but then resolves its type anew in every call, which takes a tenth of the
+    time of a short solve.
+    """
+
+    def __init__(self, dispatcher: Any, kind: types.FunctionType) -> None:
+        compiled = dispatcher.get_compile_result(kind.signature)
+        self._numba_type_ = kind
+        self._address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name)
+        self._dispatcher = dispatcher  # keeps the code alive
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Calls the function from Python."""
+        return self._dispatcher(*arguments)
+
+
 @lru_cache(maxsize=64)
-def compile_flow(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) -> ModuleType:
-    """The compiled module of a system: `flow(z, data, field, S, dz, dS) -> running cost` and `control(z, data, u)`.
+def compile_flow(
+    system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool
+) -> tuple[CompiledFunction, CompiledFunction]:
+    """A system's compiled `flow(z, data, field, S, dz, dS) -> running cost` and `control(z, data, u)`.
 
     `state_cost` is a SymPy expression in the state; with `in_field` the proximity cost of a packed obstacle field at
     the system's position is added to it.
@@ -181,7 +205,7 @@ def compile_flow(system: ControlAffineSystem, state_cost: sp.Expr, in_field: boo
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
-    return module
+    return CompiledFunction(module.flow, FLOW), CompiledFunction(module.control, CONTROL)
 
 
 def _cache_directory() -> Path:

@@ -3,10 +3,13 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import sympy as sp
+from scipy.integrate import solve_ivp
 
 from leapnav.envs import Scenario
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem
+from leapnav.experts import Path as Guess
 
 DATA = Path(__file__).parent / "data"
 
@@ -56,3 +59,18 @@ def scenario_fields(**changes: object) -> dict:
         "cost": {"speed_weight": 1.0, "turn_weight": 0.5, "proximity_weight": 1.0, "proximity_scale": 0.1},
     }
     return {**fields, **changes}
+
+
+def shooting_guess(problem, costate):
+    """The path that the flow draws from an initial costate."""
+    n = problem.system.n
+
+    def flow(_, z):
+        dz, empty = np.empty(2 * n), np.empty((2 * n, 0))
+        problem.arrays.flow(z, problem.arrays.data, problem.arrays.field, empty, dz, empty)
+        return dz
+
+    times = np.linspace(0.0, problem.horizon, 65)
+    start = np.concatenate([np.asarray(problem.start, dtype=float), costate])
+    z = solve_ivp(flow, (0.0, problem.horizon), start, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12).y.T
+    return Guess(times, z[:, :n], z[:, n:])

@@ -2,8 +2,9 @@ import math
 
 import numpy as np
 import pytest
-from helpers import best_known
+from helpers import best_known, scenario_fields
 
+from leapnav.envs import Scenario
 from leapnav.envs.obstacles import arc_clearance, clearance, clearances, proximity
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
@@ -133,3 +134,43 @@ def test_an_arc_does_not_jump_a_thin_obstacle():
         obstacles=({"polygon": {"vertices": ((5.0, 0.0), (5.01, 0.0), (5.01, 10.0), (5.0, 10.0))}},),
     )
     assert arc_clearance(1.0, 5.0, 0.0, 8.0, 0.0, scenario.field) < 0
+
+
+def many_obstacles(count, size, seed=0):
+    """Discs and boxes scattered over a square arena, clear of its first two metres (start) and its last (goal)."""
+    rng = np.random.default_rng(seed)
+    obstacles = []
+    while len(obstacles) < count:
+        x, y = rng.uniform(1.0, size - 1.0, 2)
+        if min(math.hypot(x, y), math.hypot(size - x, size - y)) < 4.0:
+            continue
+        if len(obstacles) % 2:
+            obstacles.append({"circle": {"center": [x, y], "radius": rng.uniform(0.1, 0.6)}})
+        else:
+            a, b = rng.uniform(0.2, 1.0, 2)
+            vertices = [[x - a, y - b], [x + a, y - b], [x + a, y + b], [x - a, y + b]]
+            obstacles.append({"polygon": {"vertices": vertices}})
+    fields = scenario_fields(arena=[0, 0, size, size], obstacles=obstacles, goal=[size - 1.0, size - 1.0, 0.0])
+    return Scenario.from_dict(fields)
+
+
+@pytest.mark.parametrize(("count", "size"), [(40, 12.0), (100, 40.0), (300, 60.0)])
+def test_a_grid_of_obstacles_changes_nothing(count, size):
+    scenario = many_obstacles(count, size)
+    rng = np.random.default_rng(1)
+    # Also outside the arena, where an integrator may look.
+    for x, y in rng.uniform(-6.0, size + 6.0, (300, 2)):
+        expected = np.zeros(6)
+        for part in range(0, count, 10):
+            alone = scenario.model_copy(update={"obstacles": scenario.obstacles[part : part + 10]})
+            expected += proximity(x, y, alone.field)
+        walls = np.array(proximity(x, y, scenario.model_copy(update={"obstacles": ()}).field))
+        expected -= (len(range(0, count, 10)) - 1) * walls
+        scale = 1.0 + np.abs(expected).max() + np.abs(walls).max()
+        assert np.abs(np.array(proximity(x, y, scenario.field)) - expected).max() <= 1e-12 * scale
+
+
+def test_points_far_away_or_not_numbers_are_survived():
+    scenario = many_obstacles(60, 20.0)
+    for x, y in ((1e300, 0.0), (-1e300, 1e300), (math.inf, 0.0), (math.nan, 1.0)):
+        proximity(x, y, scenario.field)

@@ -1,0 +1,244 @@
+"""The same problem for the tools that people use now: scipy's solve_bvp, and CasADi with IPOPT.
+
+Both get what their documentation recommends, and nothing that a user would have to invent: solve_bvp a vectorised
+right-hand side in NumPy (or, as a second entry, our compiled flow with its analytic Jacobian); IPOPT the trapezoidal
+transcription with exact derivatives, as its Opti stack builds them for each new scenario, or (as a second entry) built
+once with the scenario's numbers as parameters, before the clock starts.
+"""
+
+import functools
+import time
+from dataclasses import dataclass
+
+import casadi
+import numpy as np
+from scipy.integrate import solve_bvp
+
+from leapnav.envs import Scenario
+from leapnav.envs.obstacles import clearances
+from leapnav.experts import Path, Status, certify
+from leapnav.experts.nodes import default_segments, start_nodes
+from leapnav.experts.problem import OptimalControlProblem
+
+MOST_NODES = 5000
+IPOPT_TOLERANCE = 1e-6
+POINTS = 4000  # at which a returned path is looked at
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a solver returned.
+
+    Did it say success and is its path clear, the cost, how long it took (s), and does the path pass our certificate.
+    """
+
+    success: bool
+    cost: float
+    seconds: float
+    certified: bool = False
+
+
+def bvp(scenario: Scenario, states: np.ndarray, costates: np.ndarray, tol: float, compiled: bool = False) -> Result:
+    """solve_bvp from a guess on an even mesh."""
+    problem = OptimalControlProblem.from_scenario(scenario).with_winding_of(states)
+    goal, start_state = np.array(problem.goal), np.array(problem.start)
+    rates, jacobian = _compiled(problem) if compiled else (_in_numpy(scenario), None)
+
+    def ends(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        return np.concatenate([first[:3] - start_state, last[:3] - goal])
+
+    def end_jacobians(*_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at_start, at_end = np.zeros((6, 6)), np.zeros((6, 6))
+        at_start[:3, :3] = at_end[3:, :3] = np.eye(3)
+        return at_start, at_end
+
+    mesh = np.linspace(0.0, scenario.horizon, len(states))
+    guess = np.concatenate([states, costates], axis=1).T
+    start = time.perf_counter()
+    with np.errstate(all="ignore"):
+        found = solve_bvp(
+            rates,
+            ends,
+            mesh,
+            guess,
+            fun_jac=jacobian,
+            bc_jac=end_jacobians if compiled else None,
+            tol=tol,
+            max_nodes=MOST_NODES,
+        )
+    seconds = time.perf_counter() - start
+    dense = np.linspace(0.0, scenario.horizon, POINTS)
+    z = np.nan_to_num(found.sol(dense))
+    clear = clearances(np.ascontiguousarray(z[:2].T), scenario.field).min() > 0
+    cost = float(np.trapezoid(_running_cost(problem, np.ascontiguousarray(z.T)), dense))
+    certified = found.success and certify(problem, found.x, np.ascontiguousarray(found.y.T), Status.SUCCESS).success
+    return Result(bool(found.success) and bool(clear), cost, seconds, certified)
+
+
+def path_guess(scenario: Scenario, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """States of the path and costates estimated along it, as our own methods get them."""
+    problem = OptimalControlProblem.from_scenario(scenario).with_winding_of(path.states)
+    _, nodes = start_nodes(problem, path, default_segments(path))
+    return nodes[:, :3], nodes[:, 3:]
+
+
+def line_guess(scenario: Scenario, points: int = 33) -> tuple[np.ndarray, np.ndarray]:
+    """The straight line, and costates -r v (cos, sin, 0) of driving along it at constant speed."""
+    problem = OptimalControlProblem.from_scenario(scenario)
+    states = problem.with_winding_of(np.array([scenario.start])).straight_line(points).states
+    way = np.subtract(scenario.goal[:2], scenario.start[:2])
+    costates = np.zeros_like(states)
+    costates[:, :2] = -scenario.cost.speed_weight * way / scenario.horizon
+    return states, costates
+
+
+def _in_numpy(scenario: Scenario):
+    """The extremal flow of a scenario of discs as its user would write it: vectorised over the mesh."""
+    cost, robot = scenario.cost, scenario.robot
+    centers = np.array([o.circle.center for o in scenario.obstacles])[:, :, None]
+    rims = np.array([o.circle.radius for o in scenario.obstacles])[:, None] + robot.radius
+    x_min, y_min, x_max, y_max = scenario.arena
+    sigma, k = cost.proximity_scale, cost.proximity_weight
+
+    def rates(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+        x, y, theta, lx, ly, lt = z
+        cos, sin = np.cos(theta), np.sin(theta)
+        v = np.clip(-(lx * cos + ly * sin) / cost.speed_weight, -robot.max_speed, robot.max_speed)
+        w = np.clip(-lt / cost.turn_weight, -robot.max_turn_rate, robot.max_turn_rate)
+        dx, dy = x - centers[:, 0], y - centers[:, 1]
+        distance = np.sqrt(dx**2 + dy**2 + 1e-6)
+        term = k * np.exp(-(distance - rims) / sigma)
+        phi_x = -(term * dx / distance).sum(axis=0) / sigma
+        phi_y = -(term * dy / distance).sum(axis=0) / sigma
+        for sign, d in ((1, x - x_min), (-1, x_max - x)):
+            phi_x -= sign * k * np.exp(-(d - robot.radius) / sigma) / sigma
+        for sign, d in ((1, y - y_min), (-1, y_max - y)):
+            phi_y -= sign * k * np.exp(-(d - robot.radius) / sigma) / sigma
+        return np.stack([v * cos, v * sin, w, -phi_x, -phi_y, v * (lx * sin - ly * cos)])
+
+    return rates
+
+
+def _compiled(problem: OptimalControlProblem):
+    """Our flow and its Jacobian, column by column."""
+    arrays = problem.arrays
+    none, dz, identity, block = np.empty((6, 0)), np.empty(6), np.eye(6), np.empty((6, 6))
+
+    def rates(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+        out = np.empty_like(z)
+        for k, column in enumerate(np.ascontiguousarray(z.T)):
+            arrays.flow(column, arrays.data, arrays.field, none, dz, none)
+            out[:, k] = dz
+        return out
+
+    def jacobian(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+        out = np.empty((6, 6, z.shape[1]))
+        for k, column in enumerate(np.ascontiguousarray(z.T)):
+            arrays.flow(column, arrays.data, arrays.field, identity, dz, block)
+            out[:, :, k] = block
+        return out
+
+    return rates, jacobian
+
+
+def _running_cost(problem: OptimalControlProblem, z: np.ndarray) -> np.ndarray:
+    arrays, none, dz = problem.arrays, np.empty((6, 0)), np.empty(6)
+    return np.array([arrays.flow(row, arrays.data, arrays.field, none, dz, none) for row in z])
+
+
+@functools.cache
+def transcription(obstacles: int, intervals: int) -> tuple[casadi.Function, int]:
+    """IPOPT for scenarios of so many discs with their numbers as parameters, and its number of constraints."""
+    q, u = casadi.SX.sym("q", 3, intervals + 1), casadi.SX.sym("u", 2, intervals + 1)
+    numbers = casadi.SX.sym("numbers", 16 + 3 * obstacles)
+    horizon, sigma, weight, radius, speed_weight, turn_weight = casadi.vertsplit(numbers[:6])
+    arena, start, goal = numbers[6:10], numbers[10:13], numbers[13:16]
+    discs = casadi.reshape(numbers[16:], 3, obstacles)
+    v, w = u[0, :], u[1, :]
+    h = horizon / intervals
+    rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
+    near = 0
+    for d in (q[0, :] - arena[0], arena[2] - q[0, :], q[1, :] - arena[1], arena[3] - q[1, :]):
+        near += casadi.exp(-(d - radius) / sigma)
+    for i in range(obstacles):
+        d = casadi.sqrt((q[0, :] - discs[0, i]) ** 2 + (q[1, :] - discs[1, i]) ** 2 + 1e-6) - discs[2, i] - radius
+        near += casadi.exp(-d / sigma)
+    running = (speed_weight * v**2 + turn_weight * w**2) / 2 + weight * near
+    steps = q[:, 1:] - q[:, :-1] - h / 2 * (rates[:, 1:] + rates[:, :-1])
+    constraints = casadi.vertcat(casadi.vec(steps), q[:, 0] - start, q[:, -1] - goal)
+    program = {
+        "x": casadi.vertcat(casadi.vec(q), casadi.vec(u)),
+        "p": numbers,
+        "f": h * (casadi.sum2(running) - (running[0] + running[-1]) / 2),
+        "g": constraints,
+    }
+    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": IPOPT_TOLERANCE}}
+    return casadi.nlpsol("solver", "ipopt", program, options), constraints.shape[0]
+
+
+def ipopt(scenario: Scenario, path: Path, intervals: int, prebuilt: bool = False) -> Result:
+    """IPOPT on the trapezoidal transcription, from the path's states and the speeds along it."""
+    times = np.linspace(0.0, scenario.horizon, intervals + 1)
+    states = path.resample(times).states
+    along = np.gradient(states, times, axis=0)
+    speed = along[:, 0] * np.cos(states[:, 2]) + along[:, 1] * np.sin(states[:, 2])
+    speeds = np.stack([speed, along[:, 2]], axis=1)
+    values, cost, success, seconds = (_prebuilt if prebuilt else _opti)(scenario, times, states, speeds)
+    dense = Path(times, values).resample(np.linspace(0.0, scenario.horizon, POINTS)).states
+    clear = clearances(np.ascontiguousarray(dense), scenario.field).min() > 0
+    return Result(success and bool(clear), cost, seconds)
+
+
+Solved = tuple[np.ndarray, float, bool, float]
+
+
+def _prebuilt(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solved:
+    solver, count = transcription(len(scenario.obstacles), len(times) - 1)
+    robot, cost = scenario.robot, scenario.cost
+    discs = [value for o in scenario.obstacles for value in (*o.circle.center, o.circle.radius)]
+    weights = [cost.proximity_scale, cost.proximity_weight, robot.radius, cost.speed_weight, cost.turn_weight]
+    numbers = [scenario.horizon, *weights, *scenario.arena, *scenario.start, *states[-1], *discs]
+    limits = np.concatenate([np.full(states.size, np.inf), np.tile([robot.max_speed, robot.max_turn_rate], len(times))])
+    guess = np.concatenate([states.ravel(), speeds.ravel()])
+    start = time.perf_counter()
+    found = solver(x0=guess, p=numbers, lbx=-limits, ubx=limits, lbg=np.zeros(count), ubg=np.zeros(count))
+    seconds = time.perf_counter() - start
+    values = np.array(found["x"]).ravel()[: states.size].reshape(-1, 3)
+    return values, float(found["f"]), bool(solver.stats()["success"]), seconds
+
+
+def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solved:
+    intervals, cost, robot = len(times) - 1, scenario.cost, scenario.robot
+    h = scenario.horizon / intervals
+    opti = casadi.Opti()
+    q, u = opti.variable(3, intervals + 1), opti.variable(2, intervals + 1)
+    v, w = u[0, :], u[1, :]
+    rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
+    opti.subject_to(q[:, 1:] == q[:, :-1] + h / 2 * (rates[:, 1:] + rates[:, :-1]))
+    x_min, y_min, x_max, y_max = scenario.arena
+    near = 0
+    for d in (q[0, :] - x_min, x_max - q[0, :], q[1, :] - y_min, y_max - q[1, :]):
+        near += casadi.exp(-(d - robot.radius) / cost.proximity_scale)
+    for obstacle in scenario.obstacles:
+        (cx, cy), r = obstacle.circle.center, obstacle.circle.radius
+        d = casadi.sqrt((q[0, :] - cx) ** 2 + (q[1, :] - cy) ** 2 + 1e-6) - r - robot.radius
+        near += casadi.exp(-d / cost.proximity_scale)
+    running = (cost.speed_weight * v**2 + cost.turn_weight * w**2) / 2 + cost.proximity_weight * near
+    objective = h * (casadi.sum2(running) - (running[0] + running[-1]) / 2)
+    opti.minimize(objective)
+    opti.subject_to(q[:, 0] == np.array(scenario.start))
+    opti.subject_to(q[:, -1] == states[-1])
+    opti.subject_to(opti.bounded(-robot.max_speed, v, robot.max_speed))
+    opti.subject_to(opti.bounded(-robot.max_turn_rate, w, robot.max_turn_rate))
+    opti.set_initial(q, states.T)
+    opti.set_initial(u, speeds.T)
+    options = {"print_level": 0, "sb": "yes", "tol": IPOPT_TOLERANCE}
+    opti.solver("ipopt", {"print_time": False, "expand": True}, options)
+    # Writing the problem down in Python is not counted, making its derivatives and solving it is.
+    start = time.perf_counter()
+    try:
+        solution = opti.solve()
+    except RuntimeError:
+        return states, np.inf, False, time.perf_counter() - start
+    seconds = time.perf_counter() - start
+    return solution.value(q).T, float(solution.value(objective)), True, seconds

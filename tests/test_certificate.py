@@ -1,0 +1,145 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy as sp
+from helpers import best_known, published_problems, shooting_guess
+
+from leapnav.envs import Scenario
+from leapnav.envs.obstacles import clearances
+from leapnav.experts import (
+    ControlAffineSystem,
+    OptimalControlProblem,
+    Status,
+    certify,
+    find_optimum,
+    solve,
+    verify,
+)
+
+SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
+PROBLEMS = published_problems()
+
+
+def grushin_geodesic(a, b):
+    """End point of the Grushin geodesic from the origin with x1 = (a/b) sin(b t), at t = 1."""
+    return a / b * math.sin(b), -(a * a) / b * (0.5 - math.sin(2 * b) / (4 * b))
+
+
+def test_an_extremal_past_its_conjugate_point_is_no_success():
+    # det d(x1, x2)/d(a, b) = a^2 tau (sin tau - tau cos tau) / b^4 with tau = b t: it vanishes where tan tau = tau.
+    problem, _, _ = PROBLEMS["grushin"]
+    first = 4.493409457909064
+    for b, conjugate in ((4.4, None), (5.0, first / 5.0), (6.0, first / 6.0)):
+        beyond = replace(problem, goal=grushin_geodesic(2.5, b))
+        extremal = solve(beyond, method="single_shooting", guess=shooting_guess(beyond, (-2 * 2.5, 2 * b)))
+        assert extremal.cost == pytest.approx(2.5**2, rel=1e-7)
+        found = extremal.certificate.conjugate_point
+        if conjugate is None:
+            assert extremal.success
+            assert found is None
+        else:
+            assert extremal.status is Status.CONJUGATE_POINT
+            assert found == pytest.approx(conjugate, abs=1e-3)
+
+
+def test_the_other_published_grushin_extremal_is_a_local_minimum_and_dearer():
+    # J = 6.333416555 was published as the optimum. Its b is just beyond pi, where it stops being the global minimum,
+    # but before 4.49, where it would stop being a local one.
+    problem, cost, _ = PROBLEMS["grushin"]
+    b = 3.1543
+    for _ in range(50):  # fixed point of sin b = -0.01 b / a, with a from the second component
+        a = math.sqrt(b / (0.5 - math.sin(2 * b) / (4 * b)))
+        b = math.pi + math.asin(0.01 * b / a)
+    extremal = solve(problem, method="single_shooting", guess=shooting_guess(problem, (-2 * a, 2 * b)))
+    assert extremal.success
+    assert extremal.cost == pytest.approx(6.333416555, rel=1e-7)
+    assert extremal.cost > cost
+
+
+def test_a_focal_point_of_free_end_components_is_no_success():
+    # x' = u, Phi = -x^2/2, free end: x = 0 is an extremal, and a minimum only for horizons below pi/2.
+    x = sp.Symbol("x")
+    system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
+    for horizon in (1.5, 1.6, 2.0, 3.0):
+        problem = OptimalControlProblem(system, (0,), (None,), horizon, (1.0,), state_cost=-(x**2) / 2)
+        extremal = solve(problem, method="multiple_shooting")
+        if horizon < math.pi / 2:
+            assert extremal.success
+        else:
+            assert extremal.status is Status.CONJUGATE_POINT
+            assert extremal.certificate.conjugate_point == pytest.approx(horizon - math.pi / 2, abs=1e-3)
+
+
+def test_an_obstacle_between_two_integrator_steps_is_seen():
+    # The flow does not feel this disc, so the integrator's steps are decimetres long.
+    fields = {
+        **SCENARIOS["clutter-0"][0].to_dict(),
+        "robot": {"model": "unicycle", "radius": 0.01, "max_speed": 2.0, "max_turn_rate": 3.0},
+        "obstacles": [{"circle": {"center": [5.03, 5.0], "radius": 0.02}}],
+        "cost": {"speed_weight": 1.0, "turn_weight": 0.5, "proximity_weight": 0.0, "proximity_scale": 0.1},
+        "start": [2, 5, 0.0],
+        "goal": [8, 5, 0.0],
+        "horizon": 6.0,
+    }
+    extremal = find_optimum(Scenario.from_dict(fields))
+    assert not extremal.success
+    assert extremal.status is Status.COLLISION
+    assert extremal.certificate.clearance == pytest.approx(-0.03, abs=1e-3)
+
+
+def test_a_clearance_between_the_nodes_is_seen():
+    """The certificate looks at the dense path: its clearance is that of a thousand points, not of the nodes."""
+    extremal = find_optimum(SCENARIOS["slalom-4"][0])
+    states = extremal.evaluate(np.linspace(0, extremal.problem.horizon, 20_000))[0]
+    dense = clearances(np.ascontiguousarray(states), extremal.problem.field).min()
+    assert extremal.certificate.clearance == pytest.approx(dense, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["clutter-5", "clutter-9", "polygons-9", "rooms-11"])
+def test_the_costate_is_the_gradient_of_the_optimal_cost(name):
+    scenario, _ = SCENARIOS[name]
+    reference = find_optimum(scenario)
+    h = 2e-5  # third derivatives are large near an obstacle
+
+    def cost(**changes):
+        fields = scenario.to_dict()
+        moved = Scenario.from_dict({**fields, **{k: v(fields[k]) for k, v in changes.items()}})
+        extremal = solve(moved, method="multiple_shooting", guess=reference, tol=1e-11)
+        assert extremal.success
+        return extremal.cost
+
+    def shift(i, by):
+        return lambda values: [v + by * (k == i) for k, v in enumerate(values)]
+
+    for i in range(3):
+        at_start = (cost(start=shift(i, h)) - cost(start=shift(i, -h))) / (2 * h)
+        assert at_start == pytest.approx(reference.costates[0, i], rel=1e-5, abs=1e-6)
+        at_goal = (cost(goal=shift(i, h)) - cost(goal=shift(i, -h))) / (2 * h)
+        assert at_goal == pytest.approx(-reference.costates[-1, i], rel=1e-5, abs=1e-6)
+    by_time = (cost(horizon=lambda t: t + h) - cost(horizon=lambda t: t - h)) / (2 * h)
+    assert by_time == pytest.approx(reference.hamiltonian[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["clutter-5", "polygons-9", "rooms-11", "slalom-4"])
+def test_the_certificate_agrees_with_scipy_s_integrator(name):
+    extremal = find_optimum(SCENARIOS[name][0])
+    assert extremal.success
+    assert verify(extremal) <= 1e-9
+    assert extremal.certificate.hamiltonian_drift <= 1e-8
+    spoilt = replace(extremal, costates=extremal.costates + 1e-6 * (extremal.times > 1.0)[:, None])
+    assert verify(spoilt) > 1e-7
+
+
+def test_a_wrong_solution_is_not_certified():
+    extremal = find_optimum(SCENARIOS["clutter-5"][0])
+    times = np.linspace(0.0, extremal.problem.horizon, 17)
+    nodes = extremal.interpolate(times)
+    assert certify(extremal.problem, times, nodes, Status.SUCCESS).success
+    for row, column in ((5, 4), (0, 0), (16, 2)):  # a costate within, the start, the goal
+        wrong = nodes.copy()
+        wrong[row, column] += 1e-6
+        found = certify(extremal.problem, times, wrong, Status.SUCCESS)
+        assert found.status is Status.NOT_CERTIFIED
+        assert max(found.certificate.residual, found.certificate.defect) > 1e-7

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+from helpers import best_known, published_problems
+from scipy.integrate import solve_ivp
+
+from leapnav.experts import (
+    OptimalControlProblem,
+    find_optimum,
+)
+from leapnav.experts.integrator import propagate
+from leapnav.experts.linear import solve_banded, solve_dense, solve_positive
+
+SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
+PROBLEMS = published_problems()
+
+
+def test_the_integrator_s_error_falls_with_order_eight_down_to_rounding():
+    problem, _, _ = PROBLEMS["van-der-pol-free-end"]
+    arrays = problem.arrays
+
+    def end(steps):
+        z, S = np.array([1.0, 0.0, 1.7, 0.0]), np.eye(4)
+        for _ in range(steps):
+            # A tolerance this loose accepts the given step as it is.
+            propagate(arrays.flow, z, S, problem.horizon / steps, arrays.data, arrays.field, 1e9, 0.0, False)
+        return z, S
+
+    exact, exact_sensitivity = end(400)
+    steps = np.array([4, 6, 8, 12, 16])
+    for which, reference in ((0, exact), (1, exact_sensitivity)):
+        errors = np.array([np.abs(end(count)[which] - reference).max() for count in steps])
+        orders = np.log(errors[:-1] / errors[1:]) / np.log(steps[1:] / steps[:-1])
+        assert np.all(orders > 7.5), (errors, orders)
+    assert np.abs(end(100)[0] - exact).max() < 1e-13
+
+
+def test_the_integrator_s_error_follows_its_tolerance():
+    scenario, _ = SCENARIOS["clutter-9"]
+    problem = OptimalControlProblem.from_scenario(scenario)
+    optimum = find_optimum(scenario)
+    start = np.concatenate([optimum.states[0], optimum.costates[0]])
+    exact = np.concatenate(optimum.evaluate(3.0)[::2])
+    errors = []
+    for tolerance in (1e-5, 1e-7, 1e-9):
+        z, S = start.copy(), np.empty((6, 0))
+        propagate(problem.arrays.flow, z, S, 3.0, problem.arrays.data, problem.arrays.field, tolerance, 0.0, False)
+        errors.append(np.abs(z - exact).max())
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] < 1e-6
+
+
+def test_dense_evaluation_agrees_with_independent_integration():
+    scenario, _ = SCENARIOS["clutter-9"]
+    extremal = find_optimum(scenario)
+    arrays = extremal.problem.arrays
+    dz, empty = np.empty(6), np.empty((6, 0))
+
+    def flow(_, z):
+        arrays.flow(z, arrays.data, arrays.field, empty, dz, empty)
+        return dz.copy()
+
+    # From the middle outwards, which is where forward integration is still well-conditioned.
+    for start in (0.0, scenario.horizon / 2):
+        q, _, lam = extremal.evaluate(start)
+        times = start + np.linspace(0.0, 1.5, 40)
+        found = solve_ivp(flow, (times[0], times[-1]), [*q, *lam], "DOP853", t_eval=times, rtol=1e-11, atol=1e-12).y.T
+        states, controls, costates = extremal.evaluate(times)
+        assert np.hstack([states, costates]) == pytest.approx(found, abs=1e-7)
+        assert controls[:, 1] == pytest.approx(-costates[:, 2] / 0.5, abs=1e-9)
+    assert extremal.cost_to_go(0.0) == extremal.cost
+    assert extremal.cost_to_go(scenario.horizon) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_linear_solvers_agree_with_numpy():
+    rng = np.random.default_rng(0)
+    for n, half in ((3, 1), (20, 2), (60, 8)):
+        A, b = rng.normal(size=(n, n)), rng.normal(size=n)
+        A[np.abs(np.subtract.outer(np.arange(n), np.arange(n))) > half] = 0.0
+        expected = np.linalg.solve(A, b)
+        rows = np.zeros((n, 3 * half + 1))
+        for i in range(n):
+            for j in range(max(0, i - half), min(n, i + half + 1)):
+                rows[i, j - i + half] = A[i, j]
+        banded, dense = b.copy(), b.copy()
+        assert solve_banded(rows, banded, half)
+        assert solve_dense(A.copy(), dense)
+        assert banded == pytest.approx(expected, rel=1e-8, abs=1e-10)
+        assert dense == pytest.approx(expected, rel=1e-8, abs=1e-10)
+        positive, columns = A @ A.T, rng.normal(size=(n, 3))
+        expected = np.linalg.solve(positive, columns)
+        assert solve_positive(positive.copy(), columns)
+        assert columns == pytest.approx(expected, rel=1e-6, abs=1e-8)
+    assert not solve_positive(-np.eye(2), np.ones((2, 1)))
+    assert not solve_dense(np.zeros((2, 2)), np.ones(2))
+    assert not solve_banded(np.zeros((4, 4)), np.ones(4), 1)

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+from helpers import best_known, published_problems
+
+from leapnav.experts import (
+    Path,
+    find_optimum,
+    solve,
+)
+from leapnav.experts.integrator import propagate
+
+SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
+PROBLEMS = published_problems()
+
+
+def gaps(problem, times, nodes):
+    """Jumps of the states from arc to arc, and what the boundary conditions miss."""
+    n, arrays = problem.system.n, problem.arrays
+    found = [np.abs(nodes[0, :n] - arrays.start).max()]
+    found.append(np.abs(np.where(arrays.free, nodes[-1, n:], nodes[-1, :n] - arrays.goal)).max())
+    for k in range(len(times) - 1):
+        z, none = nodes[k].copy(), np.empty((2 * n, 0))
+        propagate(arrays.flow, z, none, times[k + 1] - times[k], arrays.data, arrays.field, 1e-13, 0.0, False)
+        found.append(np.abs(z[:n] - nodes[k + 1, :n]).max())
+    return max(found)
+
+
+@pytest.mark.parametrize("polish", [True, False])
+@pytest.mark.parametrize("order", ["sequential", "red_black"])
+@pytest.mark.parametrize("update", ["mean_time", "half_cost"])
+@pytest.mark.parametrize("name", ["clutter-0", "clutter-3", "clutter-9", "polygons-9"])
+def test_every_path_of_leapfrog_is_feasible_and_its_cost_never_rises(name, update, order, polish):
+    scenario, _ = SCENARIOS[name]
+    extremal = solve(scenario, method="leapfrog", update=update, order=order, polish=polish)
+    assert extremal.success
+    sweeps = [row for row in extremal.history if row.phase in ("sweep", "reduce")]
+    assert len(sweeps) >= 2
+    assert np.all(np.diff([row.cost for row in sweeps]) <= 1e-12)
+    assert extremal.cost <= sweeps[-1].cost + 1e-8
+    for row in sweeps:
+        assert len(row.times) == row.segments + 1
+        assert np.all(np.diff(row.times) > 0)
+        # Over arcs of several seconds, which only the reduction makes, errors of rounding grow by a factor of 1e4.
+        assert gaps(extremal.problem, row.times, row.nodes) <= (1e-9 if polish else 1e-8)
+        assert row.residual == pytest.approx(gaps(extremal.problem, row.times, row.nodes), abs=1e-9)
+    if update == "half_cost":
+        assert not np.allclose(sweeps[1].times, sweeps[0].times)
+    if not polish:
+        assert min(row.segments for row in sweeps) <= 4
+
+
+@pytest.mark.parametrize("name", ["clutter-0", "clutter-9", "rooms-11", "slalom-4"])
+def test_leapfrog_and_multiple_shooting_find_the_same_extremal_of_a_scenario(name):
+    scenario, _ = SCENARIOS[name]
+    reference = find_optimum(scenario)
+    assert reference.success
+    again = solve(scenario, method="multiple_shooting", guess=reference)
+    assert again.cost == pytest.approx(reference.cost, rel=1e-9)
+    leapfrog = solve(scenario, method="leapfrog", guess=Path(reference.times, reference.states))
+    assert leapfrog.success
+    assert leapfrog.cost == pytest.approx(reference.cost, rel=1e-9)
