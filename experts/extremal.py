@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass
 from enum import Enum
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from leapnav.experts.problem import OptimalControlProblem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Status(Enum):
@@ -199,6 +203,24 @@ class Extremal:
         if len(self.times) == 0:
             raise ValueError(f"there is no path: {self.status.value}")
         return self.cost - np.interp(t, self.times, self.accumulated)
+
+    def plot(self, path: str | os.PathLike[str] | None = None, title: str | None = None) -> Figure:
+        """States, controls, costates and Hamiltonian over time, the path in the plane, and Leapfrog's sweeps.
+
+        See `leapnav.experts.plotting.plot_extremal`, which also draws a scenario.
+
+        Args:
+            path: where to write the picture; None writes none.
+            title: None: cost and status.
+
+        Raises:
+            ValueError: a failed solve has no path, or the file's ending is no picture format.
+
+        """
+        # Whoever only solves need not load Matplotlib.
+        from leapnav.experts.plotting import plot_extremal
+
+        return plot_extremal(self, path, title=title)
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain dictionaries, lists and numbers, as `leapnav solve --json` writes it."""

@@ -1,7 +1,7 @@
 """Linear systems as compiled kernels: small dense and banded ones with partial pivoting, and positive definite ones.
 
-Systems this small gain nothing from a BLAS, and its threads make them a hundred times slower where another process keeps
-the cores busy.
+Systems this small gain nothing from a BLAS, and its threads make them a hundred times slower where another process
+keeps the cores busy.
 """
 
 from __future__ import annotations

@@ -1,20 +1,40 @@
-"""Pictures of scenarios and paths, on Matplotlib axes."""
+"""Pictures of scenarios, paths and extremals, on Matplotlib axes."""
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Callable, Sequence
+from itertools import cycle, pairwise
 from typing import Any
 
 import numpy as np
+import sympy as sp
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
-from leapnav.experts.extremal import Extremal
+from leapnav.experts.extremal import Extremal, Iteration
+from leapnav.experts.integrator import propagate
+from leapnav.experts.problem import OptimalControlProblem
 
 OBSTACLE, EDGE, WALL, START, GOAL, OPTIMUM = "#c3c8d1", "#7a8190", "#3c4048", "#2662ab", "#22804f", "#1a1a1a"
+# Told apart by their lightness too, so also by the colour-blind.
+CURVES = (START, "#e08a00", GOAL, "#cc79a7", "#56b4e9", OPTIMUM)
 ROBOTS_DRAWN = 9  # along a path, evenly spaced in time
+POINTS = 400  # of a dense path
+FIELD_POINTS = 200  # per side, of an obstacle field
+BOUND_SHOWN = 3.0  # times the largest control
+SMALLEST_DRIFT = 1e-9  # below it the Hamiltonian's deviations are drawn small, as what they are
+SWEEPS = ("sweep", "reduce")  # Leapfrog's phases, whose rows carry a feasible path
+SWEEPS_DRAWN, FIRST_SWEEPS = 12, 4  # the first ones change most
+SWEEP_ACCURACY = 1e-10  # errors grow along the long arcs of the last sweeps, which still should look connected
+SMALLEST_DISTANCE = 1e-10  # of costs, relative: the end error that Leapfrog allows an arc
+SPREAD = 100.0  # costs further apart, in smallest distances, are drawn as distances on a logarithmic axis
 
 
 def draw_scenario(axes: Axes, scenario: Scenario) -> None:
@@ -46,7 +66,33 @@ def draw_robot(axes: Axes, pose: Any, radius: float, color: str, **style: Any) -
 
 
 def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLike[str]) -> None:
-    """Writes a picture of an extremal: the path over the obstacles, and controls and costates over time.
+    """Writes the picture of a scenario's extremal, see `plot_extremal`.
+
+    Raises:
+        ValueError: the extremal has no path, or the file's ending is no picture format.
+
+    """
+    plot_extremal(extremal, path, scenario)
+
+
+def plot_extremal(
+    extremal: Extremal,
+    path: str | os.PathLike[str] | None = None,
+    scenario: Scenario | None = None,
+    title: str | None = None,
+) -> Figure:
+    """An extremal of any problem: states, controls, costates and Hamiltonian over time.
+
+    A system with a position also has its path in the plane. A Leapfrog solve shows how it came about: the feasible
+    paths of its sweeps, from light to dark, in the plane (of the first two states, for a system without a position),
+    and the cost against the sweep, in the same colours.
+
+    Args:
+        extremal: of any problem; it need not be certified.
+        path: where to write the picture; None writes none.
+        scenario: the problem's scenario, whose arena and obstacles are drawn. Without it the plane shows where the
+            problem's obstacle field lets no robot's centre be.
+        title: None: cost and status, after the scenario's name.
 
     Raises:
         ValueError: the extremal has no path, or the file's ending is no picture format.
@@ -54,24 +100,239 @@ def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLik
     """
     if len(extremal.times) == 0:
         raise ValueError(f"there is no path to draw: {extremal.status.value}")
-    figure = Figure(figsize=(10.5, 5.6), layout="constrained")
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
-    plane = figure.add_subplot(grid[:, 0])
-    draw_scenario(plane, scenario)
-    plane.plot(extremal.states[:, 0], extremal.states[:, 1], color=OPTIMUM, linewidth=1.8)
-    for pose in extremal.evaluate(np.linspace(0.0, scenario.horizon, ROBOTS_DRAWN + 2)[1:-1])[0]:
-        draw_robot(plane, pose, scenario.robot.radius, OPTIMUM, alpha=0.3)
-    plane.set_title(f"{scenario.name}: J = {extremal.cost:.4f}, {extremal.status.name}")
-    speed, turn, costates = (figure.add_subplot(grid[row, 1]) for row in range(3))
-    speed.plot(extremal.times, extremal.controls[:, 0], color=START)
-    speed.set_ylabel("speed (m/s)")
-    turn.plot(extremal.times, extremal.controls[:, 1], color=START)
-    turn.set_ylabel("turn rate (rad/s)")
-    for values, label in zip(extremal.costates.T, ("x", "y", "θ"), strict=True):
-        costates.plot(extremal.times, values, label=rf"$\lambda_{{{label}}}$" if label != "θ" else r"$\lambda_\theta$")
-    costates.set(ylabel="costates", xlabel="time (s)")
-    costates.legend(loc="best", fontsize=8, ncols=3)
-    for axes in (speed, turn, costates):
+    in_plane = extremal.problem.system.position is not None
+    sweeps = [row for row in extremal.history if row.phase in SWEEPS and np.isfinite(row.cost)]
+    if in_plane or sweeps:
+        figure = Figure(figsize=(11.5, 7.4 if sweeps else 6.4), layout="constrained")
+        grid = figure.add_gridspec(4, 2, width_ratios=(1.2, 1))
+        plane = figure.add_subplot(grid[:3, 0] if sweeps else grid[:, 0])
+        if in_plane:
+            _draw_plane(plane, extremal, scenario, sweeps)
+        else:
+            _draw_state_space(plane, extremal, sweeps)
+        if sweeps:
+            _draw_costs(figure.add_subplot(grid[3, 0]), extremal, sweeps)
+        panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
+    else:
+        figure = Figure(figsize=(10.5, 5.2), layout="constrained")
+        panels = list(figure.subplots(2, 2).ravel())
+    _draw_over_time(panels, extremal, "time (s)" if scenario is not None else "time")
+    if title is None:
+        name = "" if scenario is None else f"{scenario.name}: "
+        title = f"{name}J = {extremal.cost:.7g}, {extremal.status.name}"
+    figure.suptitle(title)
+    if path is not None:
+        figure.savefig(path, dpi=150)
+    return figure
+
+
+def _dense_times(extremal: Extremal) -> np.ndarray:
+    """Evenly spaced times and the integrator's own, which lie close where the path turns sharply; shape (K,)."""
+    return np.union1d(extremal.times, np.linspace(0.0, extremal.problem.horizon, POINTS))
+
+
+def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> None:
+    """States, controls, costates and Hamiltonian on four axes."""
+    problem, horizon = extremal.problem, extremal.problem.horizon
+    names = [sp.latex(symbol) for symbol in problem.system.state]
+    times = _dense_times(extremal)
+    states, controls, costates = extremal.evaluate(times)
+    for axes, values, name, labels in (
+        (panels[0], states, "states", names),
+        (panels[1], controls, "controls", [f"u_{{{j + 1}}}" for j in range(problem.system.m)]),
+        (panels[2], costates, "costates", [rf"\lambda_{{{name}}}" for name in names]),
+    ):
+        for color, column, symbol in zip(cycle(CURVES), values.T, labels, strict=False):
+            axes.plot(times, column, color=color, linewidth=1.5, label=f"${symbol}$")
+        axes.set_ylabel(name)
+    if problem.control_bounds is not None:
+        _draw_bounds(panels[1], controls, problem.control_bounds)
+    _draw_hamiltonian(panels[3], extremal)
+    last = panels[-1].get_subplotspec()
+    for axes in panels:
+        axes.set_xlim(0.0, horizon)
         axes.grid(alpha=0.3)
-        axes.set_xlim(0.0, scenario.horizon)
-    figure.savefig(path, dpi=150)
+        # Beside the axes, where no curve can run through it.
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.05), frameon=False, fontsize=9, handlelength=1.2)
+        spec = axes.get_subplotspec()
+        if spec is not None and last is not None and spec.rowspan.stop == last.rowspan.stop:
+            axes.set_xlabel(label)
+        else:
+            axes.tick_params(labelbottom=False)
+
+
+def _draw_bounds(axes: Axes, controls: np.ndarray, bounds: Sequence[tuple[float, float]]) -> None:
+    """Control bounds as faint lines; those far from the controls lie beyond the axes, else the curves were flat."""
+    low, high = axes.get_ylim()
+    near = BOUND_SHOWN * float(np.abs(controls).max())
+    for color, pair in zip(cycle(CURVES), bounds, strict=False):
+        for bound in pair:
+            if np.isfinite(bound):
+                axes.axhline(bound, color=color, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.5, zorder=1)
+            if abs(bound) <= near:
+                low, high = min(low, 1.06 * bound), max(high, 1.06 * bound)
+    axes.set_ylim(low, high)
+
+
+def _draw_hamiltonian(axes: Axes, extremal: Extremal) -> None:
+    """H less its mean at the integrator's own steps: between them the interpolant's error would show, not H's."""
+    mean = float(extremal.hamiltonian.mean())
+    deviation = extremal.hamiltonian - mean
+    axes.plot(
+        extremal.times,
+        deviation,
+        color=START,
+        linewidth=1.0,
+        marker=".",
+        markersize=3,
+        label=r"$H - \bar{H}$" + "\n" + rf"$\bar{{H}} = {mean:.5g}$",
+    )
+    reach = 1.25 * max(SMALLEST_DRIFT, float(np.abs(deviation).max()))
+    axes.set(ylabel="Hamiltonian", ylim=(-reach, reach))
+
+
+def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweeps: Sequence[Iteration]) -> None:
+    """The path of a system with a position, over the obstacles, with headings if it has a state theta."""
+    system = extremal.problem.system
+    assert system.position is not None
+    ix, iy = (system.state.index(symbol) for symbol in system.position)
+    names = [str(symbol) for symbol in system.state]
+    heading = names.index("theta") if "theta" in names else None
+    states = extremal.evaluate(_dense_times(extremal))[0]
+    _draw_sweeps(axes, extremal.problem, sweeps, lambda _, states: (states[:, ix], states[:, iy]))
+    axes.plot(states[:, ix], states[:, iy], color=OPTIMUM, linewidth=1.8, zorder=3)
+    drawn = extremal.evaluate(np.linspace(0.0, extremal.problem.horizon, ROBOTS_DRAWN + 2))[0]
+    poses = [(q[ix], q[iy], None if heading is None else q[heading]) for q in drawn]
+    if scenario is not None:
+        draw_scenario(axes, scenario)
+        for pose in poses[1:-1]:
+            draw_robot(axes, pose, scenario.robot.radius, OPTIMUM, alpha=0.3, zorder=3)
+        return
+    low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
+    center, reach = (low + high) / 2, 0.6 * float((high - low).max()) or 1.0
+    if extremal.problem.field is not None:
+        _draw_field(axes, extremal.problem.field, center, reach)
+    if heading is not None:
+        x, y, angle = np.array(poses, dtype=float).T
+        style = {"angles": "xy", "scale": 18, "width": 0.005, "color": OPTIMUM, "alpha": 0.6}
+        axes.quiver(x, y, np.cos(angle), np.sin(angle), **style)
+    for pose, color in ((poses[0], START), (poses[-1], GOAL)):
+        axes.plot(pose[0], pose[1], "o", color=color, markersize=7, zorder=4)
+    axes.set(
+        xlim=(center[0] - reach, center[0] + reach),
+        ylim=(center[1] - reach, center[1] + reach),
+        aspect="equal",
+        xlabel=f"${sp.latex(system.position[0])}$",
+        ylabel=f"${sp.latex(system.position[1])}$",
+    )
+    axes.grid(alpha=0.3)
+
+
+def _draw_field(axes: Axes, field: np.ndarray, center: np.ndarray, reach: float) -> None:
+    """Where an obstacle field lets no robot's centre be, in a square of half-side `reach` (m)."""
+    x, y = (np.linspace(c - reach, c + reach, FIELD_POINTS) for c in center)
+    distance = np.array([[clearance(a, b, field)[0] for a in x] for b in y])
+    if distance.min() < 0:
+        axes.contourf(x, y, distance, levels=[distance.min(), 0.0], colors=[OBSTACLE], zorder=0)
+
+
+def _draw_state_space(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration]) -> None:
+    """The first two states against each other, or the only one over time."""
+    times = _dense_times(extremal)
+    states = extremal.evaluate(times)[0]
+    names = [f"${sp.latex(symbol)}$" for symbol in extremal.problem.system.state]
+
+    def place(times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (times, states[:, 0]) if states.shape[1] == 1 else (states[:, 0], states[:, 1])
+
+    _draw_sweeps(axes, extremal.problem, sweeps, place)
+    x, y = place(times, states)
+    axes.plot(x, y, color=OPTIMUM, linewidth=1.8, zorder=3)
+    for k, color in ((0, START), (-1, GOAL)):
+        axes.plot(x[k], y[k], "o", color=color, markersize=7, zorder=4)
+    axes.set(xlabel=names[0] if len(names) > 1 else "time", ylabel=names[1] if len(names) > 1 else names[0])
+    axes.grid(alpha=0.3)
+
+
+def _draw_sweeps(
+    axes: Axes,
+    problem: OptimalControlProblem,
+    sweeps: Sequence[Iteration],
+    place: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+) -> None:
+    """Feasible paths and nodes of some sweeps, where `place` puts times (K,) and states (K, n)."""
+    for k, color in _chosen(sweeps).items():
+        times, nodes = sweeps[k].times, sweeps[k].nodes
+        assert times is not None and nodes is not None
+        axes.plot(*place(*_feasible_path(problem, times, nodes)), color=color, linewidth=1.0, label=f"sweep {k}")
+        axes.plot(*place(times, nodes[:, : problem.system.n]), ".", color=color, markersize=3.5)
+
+
+def _chosen(sweeps: Sequence[Iteration]) -> dict[int, Any]:
+    """Which sweeps to draw, the first ones and an even selection of the rest, and their colours from light to dark."""
+    last = len(sweeps) - 1
+    first = min(FIRST_SWEEPS, len(sweeps))
+    rest = np.linspace(first, last, SWEEPS_DRAWN - first).round().astype(int) if last >= first else []
+    numbers = sorted({*range(first), *map(int, rest)})
+    return dict(zip(numbers, colormaps["viridis_r"](np.linspace(0.12, 0.92, len(numbers))), strict=True))
+
+
+def _feasible_path(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Times (K,) and states (K, n) on the extremal arcs from node to node; times (p + 1,), nodes (p + 1, 2n)."""
+    arrays, n = problem.arrays, problem.system.n
+    none = np.empty((2 * n, 0))
+    steps = math.ceil(POINTS / (len(times) - 1))
+    dense = np.concatenate([np.linspace(a, b, steps + 1) for a, b in pairwise(times)])
+    states = np.empty((len(dense), n))
+    for k in range(len(times) - 1):
+        z, at = nodes[k].copy(), k * (steps + 1)
+        states[at] = z[:n]
+        for j in range(at + 1, at + steps + 1):
+            step = dense[j] - dense[j - 1]
+            propagate(arrays.flow, z, none, step, arrays.data, arrays.field, SWEEP_ACCURACY, 0.0, False)
+            states[j] = z[:n]
+    return dense, states
+
+
+def _draw_costs(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration]) -> None:
+    """Cost of each iterate, the sweeps in the colours of their paths, over the number of segments if that changes."""
+    rows = [row for row in extremal.history if np.isfinite(row.cost)]
+    costs, phases = np.array([row.cost for row in rows]), np.array([row.phase for row in rows])
+    swept = np.flatnonzero(np.isin(phases, SWEEPS))
+    # A sweep's path is feasible, so only the end errors of its arcs take it below the extremal; a Newton step's is not.
+    distance = np.abs(costs - extremal.cost)
+    distance[swept] = costs[swept] - extremal.cost
+    smallest = SMALLEST_DISTANCE * (1 + abs(extremal.cost))
+    # A failure may have ended above its sweeps.
+    logarithmic = distance.max() > SPREAD * smallest and distance.min() > -SPREAD * smallest
+    values = np.maximum(distance, smallest) if logarithmic else costs
+    label = "sweep, in its path's colour"
+    axes.plot(swept, values[swept], color=EDGE, linewidth=0.8, marker=".", markersize=3, zorder=1, label=label)
+    for k, color in _chosen(sweeps).items():
+        axes.plot(swept[k], values[swept[k]], "o", color=color, markersize=5)
+    for phase, marker, label in (("reduce", "s", "nodes removed"), ("newton", "x", "Newton step")):
+        numbers = np.flatnonzero(phases == phase)
+        if len(numbers):
+            style = {"markersize": 8 if marker == "s" else 5, "markerfacecolor": "none", "markeredgecolor": OPTIMUM}
+            axes.plot(numbers, values[numbers], marker, label=label, **style)
+    if logarithmic:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(numticks=5))
+        axes.yaxis.set_minor_locator(NullLocator())
+    axes.set(
+        xlabel="sweep" if len(swept) == len(rows) else "iteration", ylabel="$|J_k - J|$" if logarithmic else "$J_k$"
+    )
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    segments = [row.segments for row in rows]
+    if len(set(segments)) > 1:
+        side = axes.twinx()
+        side.step(range(len(rows)), segments, where="mid", color=OBSTACLE, linewidth=2.0)
+        side.set(ylabel="segments", ylim=(0, 1.1 * max(segments)))
+        side.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+        side.yaxis.label.set_color(EDGE)
+        side.tick_params(colors=EDGE)
+        # The steps are a backdrop.
+        axes.set_zorder(side.get_zorder() + 1)
+        axes.patch.set_visible(False)
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=3, frameon=False, fontsize=8)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
 from leapnav.training.config import CloningConfig
+
+if TYPE_CHECKING:
+    from leapnav.envs.scenario import Scenario
+    from leapnav.experts import Extremal
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 PICTURES = (".png", ".pdf", ".svg")
@@ -19,28 +25,32 @@ DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find opti
 
 @dataclass(frozen=True)
 class Solve:
-    """Find the optimum of a scenario, or one extremal with a method of your choice.
+    """Find the optimum of a scenario, or one extremal with a method of your choice, or compare the methods.
 
     Exit code 0: certified; 1: no certified solution; 2: bad input.
     """
 
     scenario: tyro.conf.Positional[Path]
     """Scenario file (JSON)."""
-    method: Literal["optimum", "leapfrog", "multiple_shooting", "single_shooting"] = "optimum"
-    """"optimum" searches globally; the others solve from the best path of the lattice search."""
+    method: Literal["optimum", "leapfrog", "multiple_shooting", "single_shooting", "collocation", "all"] = "optimum"
+    """"optimum" searches globally; the others solve from the best path of the lattice search; "all" compares them."""
     plot: Path | None = None
-    """Write a picture of the solution (.png, .pdf or .svg)."""
+    """Write a picture of the solution (.png, .pdf or .svg); with "all", of the cheapest one that is certified."""
     json: Path | None = None
-    """Write the solution: cost, certificate, states, controls, costates, history."""
+    """Write the solution: cost, certificate, states, controls, costates, history; with "all", one for each method."""
 
     def run(self) -> int:
         """Solves and reports."""
         from leapnav.envs.scenario import Scenario
-        from leapnav.experts import find_optimum, solve
-        from leapnav.experts.plotting import plot_solution
 
         scenario = Scenario.from_json(self.scenario)
         _check_outputs(self.json, self.plot)
+        return self._compare(scenario) if self.method == "all" else self._solve(scenario)
+
+    def _solve(self, scenario: Scenario) -> int:
+        from leapnav.experts import find_optimum, solve
+
+        assert self.method != "all"
         extremal = find_optimum(scenario) if self.method == "optimum" else solve(scenario, method=self.method)
         print(f"{scenario.name}: {extremal.status.name}: {extremal.status.value}")
         certificate = extremal.certificate
@@ -52,13 +62,30 @@ class Solve:
             print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")
             print(f"  conjugate point    {'none' if conjugate is None else f'{conjugate:.3f} s'}")
             print(f"  clearance          {certificate.clearance:.3f} m")
+            scope = " (of the best candidate alone)" if self.method == "optimum" else ""
+            print(f"  iterations         {len(extremal.history)}{scope}")
+            print(f"  evaluations        {extremal.work}{scope}")
+        self._write(scenario, extremal, extremal.to_json())
+        return 0 if extremal.success else FAILED
+
+    def _compare(self, scenario: Scenario) -> int:
+        import json
+
+        extremals = _solve_by_all_methods(scenario)
+        best = min(extremals.values(), key=lambda extremal: (not extremal.success, extremal.cost))
+        content = json.dumps({method: extremal.to_dict() for method, extremal in extremals.items()}, allow_nan=False)
+        self._write(scenario, best if best.success else None, content)
+        return 0 if best.success else FAILED
+
+    def _write(self, scenario: Scenario, extremal: Extremal | None, content: str) -> None:
+        from leapnav.experts.plotting import plot_solution
+
         if self.json is not None:
-            self.json.write_text(extremal.to_json() + "\n")
+            self.json.write_text(content + "\n")
             print(f"wrote {self.json}")
-        if self.plot is not None and len(extremal.times):
+        if self.plot is not None and extremal is not None and len(extremal.times):
             plot_solution(scenario, extremal, self.plot)
             print(f"wrote {self.plot}")
-        return 0 if extremal.success else FAILED
 
 
 @dataclass(frozen=True)
@@ -225,6 +252,58 @@ def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return str(error)
+
+
+def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
+    """Every method's extremal from the same path; prints them side by side."""
+    from leapnav.experts import OptimalControlProblem, Status, solve
+    from leapnav.experts import Path as GuessedPath
+    from leapnav.experts.certificate import failure
+    from leapnav.experts.lattice import Lattice
+    from leapnav.experts.solve import Method
+
+    candidate = next(Lattice(scenario).candidates(), None)
+    if candidate is None:
+        print(f"{scenario.name}: {Status.NO_PATH.name}: {Status.NO_PATH.value}")
+        return dict.fromkeys(get_args(Method), failure(OptimalControlProblem.from_scenario(scenario), Status.NO_PATH))
+    path = GuessedPath(candidate.times, candidate.poses)
+    extremals, seconds = {}, {}
+    for method in get_args(Method):
+        # The first solve loads or compiles what the second one, which is timed, then finds in memory.
+        solve(scenario, method=method, guess=path)
+        start = perf_counter()
+        extremals[method] = solve(scenario, method=method, guess=path)
+        seconds[method] = perf_counter() - start
+    print(f"{scenario.name}: every method from the best path of the lattice search")
+    _print_comparison(extremals, seconds)
+    for method, extremal in extremals.items():
+        if not extremal.success:
+            print(f"{method}: {extremal.status.value}")
+    return extremals
+
+
+def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, float]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    table.add_column("status", overflow="fold")
+    for column in ("cost", "residual", "itera-\ntions", "evalu-\nations", "time\nms"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for method, extremal in extremals.items():
+        certificate = extremal.certificate
+        table.add_row(
+            method,
+            extremal.status.name,
+            "-" if certificate is None else f"{extremal.cost:.9g}",
+            "-" if certificate is None else f"{max(certificate.residual, certificate.defect):.1e}",
+            str(len(extremal.history)),
+            str(extremal.work),
+            f"{1000 * seconds[method]:.1f}",
+        )
+    Console().print(table)
 
 
 def _check_outputs(json: Path | None, plot: Path | None) -> None:

@@ -28,12 +28,18 @@ def failing(arguments, capsys):
     return code, captured.err
 
 
-@pytest.mark.parametrize("method", ["optimum", "leapfrog", "multiple_shooting"])
+METHODS = {"single_shooting", "multiple_shooting", "leapfrog", "collocation"}
+
+
+@pytest.mark.parametrize("method", ["optimum", "leapfrog", "multiple_shooting", "collocation"])
 def test_solve_prints_draws_and_writes(method, scenario_file, tmp_path, capsys):
     path, cost = scenario_file
     plot, out = tmp_path / "path.png", tmp_path / "out.json"
     assert main(["solve", str(path), "--method", method, "--plot", str(plot), "--json", str(out)]) == 0
-    assert "SUCCESS" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "SUCCESS" in printed
+    assert "iterations" in printed
+    assert "evaluations" in printed
     solution = json.loads(out.read_text())
     assert solution["success"] is True
     assert solution["cost"] == pytest.approx(cost, rel=1e-4)
@@ -41,13 +47,66 @@ def test_solve_prints_draws_and_writes(method, scenario_file, tmp_path, capsys):
     assert plot.read_bytes()[:4] == b"\x89PNG"
 
 
-def test_solve_without_a_solution_is_exit_code_1(tmp_path, capsys):
+def compared(text):
+    """The rows of the table of methods by method: status, cost, residual, iterations, evaluations, time."""
+    rows = [line.split() for line in text.splitlines()]
+    return {row[0]: row[1:] for row in rows if len(row) == 7 and row[0] in METHODS}
+
+
+def test_all_methods_are_compared_side_by_side(scenario_file, tmp_path, capsys):
+    path, cost = scenario_file
+    plot, out = tmp_path / "path.png", tmp_path / "out.json"
+    assert main(["solve", str(path), "--method", "all", "--plot", str(plot), "--json", str(out)]) == 0
+    table = compared(capsys.readouterr().out)
+    assert table.keys() == METHODS
+    for status, value, residual, iterations, evaluations, milliseconds in table.values():
+        assert status == "SUCCESS"
+        assert float(value) == pytest.approx(cost, rel=1e-6)
+        assert float(residual) <= 1e-8
+        assert int(iterations) > 0
+        assert int(evaluations) > 100
+        assert 0.1 < float(milliseconds) < 10_000
+    solutions = json.loads(out.read_text())
+    assert solutions.keys() == METHODS
+    assert len({round(solution["cost"], 6) for solution in solutions.values()}) == 1
+    assert all(len(solutions[method]["history"]) == int(table[method][3]) for method in METHODS)
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_method_that_fails_advises_and_the_cheapest_success_is_drawn(tmp_path, capsys, monkeypatch):
+    scenario, cost = next((scenario, cost) for scenario, cost in best_known() if scenario.name == "clutter-9")
+    path, out, drawn = tmp_path / "scenario.json", tmp_path / "out.json", []
+    scenario.to_json(path)
+    monkeypatch.setattr("leapnav.experts.plotting.plot_solution", lambda _, extremal, __: drawn.append(extremal))
+    arguments = ["solve", str(path), "--method", "all", "--plot", str(tmp_path / "path.png"), "--json", str(out)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    table = compared(printed)
+    assert table.keys() == METHODS
+    solutions = json.loads(out.read_text())
+    failed = {method for method in METHODS if not solutions[method]["success"]}
+    assert "single_shooting" in failed
+    for method in METHODS:
+        assert table[method][0] == solutions[method]["status"]
+        assert (f"{method}: {solutions[method]['advice']}" in printed) == (method in failed)
+    (extremal,) = drawn
+    assert extremal.success
+    assert extremal.cost == min(solutions[method]["cost"] for method in METHODS - failed)
+    assert extremal.cost == pytest.approx(cost, rel=1e-4)
+
+
+@pytest.mark.parametrize("method", ["optimum", "all"])
+def test_solve_without_a_solution_is_exit_code_1(method, tmp_path, capsys):
     walls = [{"polygon": {"vertices": [[5, y], [5.5, y], [5.5, y + 5], [5, y + 5]]}} for y in (0, 5)]
     path, out = tmp_path / "shut.json", tmp_path / "out.json"
     path.write_text(json.dumps(scenario_fields(obstacles=walls, start=[2, 5, 0], goal=[8, 5, 0])))
-    assert main(["solve", str(path), "--json", str(out), "--plot", str(tmp_path / "p.png")]) == 1
-    assert "NO_PATH" in capsys.readouterr().out
-    assert json.loads(out.read_text())["cost"] is None
+    arguments = ["solve", str(path), "--method", method, "--json", str(out), "--plot", str(tmp_path / "p.png")]
+    assert main(arguments) == 1
+    assert "NO_PATH: no path from start to goal" in capsys.readouterr().out
+    solutions = json.loads(out.read_text())
+    for solution in [solutions[name] for name in METHODS] if method == "all" else [solutions]:
+        assert solution["status"] == "NO_PATH"
+        assert solution["cost"] is None
     assert not (tmp_path / "p.png").exists()
 
 
