@@ -27,15 +27,38 @@ from leapnav.experts.problem import OptimalControlProblem, Path
 SMALLEST_DAMPING = 1.0 / 64.0
 # Newton's method goes on to a residual this much below the one asked for, which may remain where it cannot.
 MARGIN = 0.1
+FIRST_PARTS, MOST_PARTS = 8, 128  # of the horizon, by which the march advances
+MARCHING_TOLERANCE = 1e-7
 SMALLEST_TOLERANCE = 1e-13  # of the integrator, near rounding
 LOOSEST = 1e-4  # of the integrator, far from the solution
 
 
 def single_shooting(problem: OptimalControlProblem, path: Path, settings: Settings) -> Extremal:
-    """Newton's method on the initial costate."""
+    """Newton's method on the initial costate.
+
+    Where the guess is too far off for the whole horizon, it is improved over a growing part of it first, with points of
+    the path for goals.
+    """
+    nodes = start_nodes(problem, path, settings.segments or default_segments(path))[1]
+    z, end, status, history, work = _shoot(problem, nodes[0], settings)
+    if status is not Status.SUCCESS:
+        costate, evaluations = _march(problem, path, nodes[0], settings)
+        work += evaluations
+        if costate is not None:
+            second, second_end, status, rows, evaluations = _shoot(problem, costate, settings)
+            history += rows
+            work += evaluations
+            if status is Status.SUCCESS:
+                z, end = second, second_end
+    return certify(problem, np.array([0.0, problem.horizon]), np.stack([z, end]), status, history, work)
+
+
+def _shoot(
+    problem: OptimalControlProblem, guess: np.ndarray, settings: Settings
+) -> tuple[np.ndarray, np.ndarray, Status, tuple[Iteration, ...], int]:
+    """Start and end of the extremal from a guess (2n,) of the start, with status, history and evaluations."""
     arrays = problem.arrays
-    _, nodes = start_nodes(problem, path, settings.segments or default_segments(path))
-    z, end = nodes[0].copy(), nodes[0].copy()
+    z, end = guess.copy(), guess.copy()
     log = np.zeros((settings.max_iterations + 1, 2))
     code, iterations, residual, _, work = shoot(
         arrays.flow,
@@ -53,9 +76,33 @@ def single_shooting(problem: OptimalControlProblem, path: Path, settings: Settin
         log,
     )
     history = tuple(Iteration("newton", 1, row[1], row[0]) for row in log[: iterations + 1].tolist())
-    times = np.array([0.0, problem.horizon])
-    status = Status.SUCCESS if residual <= settings.tol else KERNEL_STATUS[code]
-    return certify(problem, times, np.stack([z, end]), status, history, work)
+    return z, end, Status.SUCCESS if residual <= settings.tol else KERNEL_STATUS[code], history, work
+
+
+def _march(
+    problem: OptimalControlProblem, path: Path, guess: np.ndarray, settings: Settings
+) -> tuple[np.ndarray | None, int]:
+    """The start (2n,) of an extremal that follows the path nearly to the horizon, None if there is none."""
+    arrays, n, horizon = problem.arrays, problem.system.n, problem.horizon
+    log = np.empty((settings.max_iterations + 1, 2))
+    fixed = np.zeros(n, dtype=bool)
+    reached, step, work = 0.0, horizon / FIRST_PARTS, 0
+    z, end = guess.copy(), guess.copy()
+    while reached < horizon * (1 - 1 / FIRST_PARTS):
+        to = min(reached + step, horizon * (1 - 0.5 / FIRST_PARTS))
+        trial = z.copy()
+        goal = path.resample(np.array([to])).states[0]
+        arguments = (goal, end, fixed, to, arrays.data, arrays.field, MARCHING_TOLERANCE, MARCHING_TOLERANCE * 1e-3)
+        code, _, _, _, evaluations = shoot(arrays.flow, trial, *arguments, settings.max_iterations, log)
+        work += abs(evaluations)
+        if code == CONVERGED:
+            z, reached = trial, to
+            step = min(2.0 * step, horizon / FIRST_PARTS)
+        else:
+            step /= 2.0
+            if step < horizon / MOST_PARTS:
+                return None, work
+    return z, work
 
 
 @njit(
