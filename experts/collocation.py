@@ -13,7 +13,7 @@ from scipy.integrate import solve_bvp
 from leapnav.experts.certificate import certify
 from leapnav.experts.extremal import Extremal, Iteration, Status
 from leapnav.experts.integrator import FLOW, constant, cube, matrix
-from leapnav.experts.multiple_shooting import polish
+from leapnav.experts.multiple_shooting import confirm, polish
 from leapnav.experts.nodes import Settings, default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem, Path
 
@@ -77,7 +77,7 @@ def collocation(problem: OptimalControlProblem, path: Path, settings: Settings) 
     chosen = np.unique(np.append(np.arange(0, len(found.x), every), len(found.x) - 1))
     times, nodes = found.x[chosen], nodes[chosen]
     status, rows, evaluations = polish(problem, times, nodes, settings.tol, settings.max_iterations)
-    return certify(problem, times, nodes, status, (*history, *rows), work + evaluations)
+    return confirm(problem, times, nodes, status, (*history, *rows), work + evaluations, settings)
 
 
 def _cost(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> float:

@@ -22,7 +22,7 @@ from leapnav.experts.certificate import certify
 from leapnav.experts.extremal import CONVERGED, Extremal, Iteration, Status
 from leapnav.experts.initial_path import local_minima
 from leapnav.experts.integrator import FLOW, constant, matrix, propagate, vector
-from leapnav.experts.multiple_shooting import flags, polish
+from leapnav.experts.multiple_shooting import confirm, flags, polish
 from leapnav.experts.nodes import FEWEST_SEGMENTS, MOST_SEGMENTS, Settings, default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem, Path
 from leapnav.experts.single_shooting import shoot, single_shooting
@@ -38,6 +38,7 @@ LITTLE = 1e-3
 MOST_SWEEPS = 500
 REDUCTIONS_FAILED = 2  # thereafter the sweeps go on until the costates do not jump at the nodes
 SAME_COST = 1e-6  # the cost of a last iterate of Newton's method is known to this
+CLOSED = 5e-10  # larger jumps of the states between arcs call for a better integrator
 MOST_STUCK = 3  # sweeps with rejected moves, before arcs are halved
 STEERING_INTERVALS, STEERING_STARTS = 16, 6
 
@@ -64,12 +65,13 @@ def _sweep_and_polish(track: FeasiblePath, settings: Settings) -> Extremal:
         # From a feasible path the way down leads to a cheaper extremal; a dearer one is another path's.
         if status is Status.SUCCESS and rows[-1].cost <= track.cost + SAME_COST * (1 + abs(track.cost)):
             history = (*track.history, *rows)
-            extremal = certify(track.problem, track.times, nodes, status, history, track.work)
+            extremal = confirm(track.problem, track.times, nodes, status, history, track.work, settings)
             # From a saddle the sweeps lead further down.
             if extremal.status is not Status.CONJUGATE_POINT or sweeps == SWEEPS_BEFORE_NEWTON[-1]:
                 return extremal
-    status = Status.STALLED if status is Status.SUCCESS else status
-    return certify(track.problem, track.times, nodes, status, tuple(track.history), track.work)
+    # Newton's method does not take over: the sweeps alone have to do.
+    track.accuracy = LONG_ACCURACY
+    return _sweep_and_reduce(track, settings)
 
 
 def _sweep_and_reduce(track: FeasiblePath, settings: Settings) -> Extremal:
@@ -311,6 +313,11 @@ class FeasiblePath:
         residual = math.nan
         if self.thorough:
             residual = self.jumps()[0] if self.feasible else math.inf
+            if CLOSED < residual < math.inf and self.accuracy > LONG_ACCURACY:
+                # Errors grow along some arc by more than usual.
+                self.accuracy = LONG_ACCURACY
+                self._connect()
+                residual = self.jumps()[0] if self.feasible else math.inf
         row = Iteration(phase, self.segments, self.cost, residual, rejected, self.times.copy(), self.nodes.copy())
         self.history.append(row)
 

@@ -23,7 +23,7 @@ from leapnav.experts.integrator import FLOW, constant, matrix, propagate, vector
 from leapnav.experts.linear import solve_banded
 from leapnav.experts.nodes import Settings, default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem, Path
-from leapnav.experts.single_shooting import LOOSEST, MARGIN, SMALLEST_DAMPING
+from leapnav.experts.single_shooting import LOOSEST, MARGIN, SAFETY, SMALLEST_DAMPING, STEEPEST
 
 flags = types.Array(boolean, 1, "C")
 # Newton's method goes on to a residual this much below the one asked for, so that H is constant to about as much; one
@@ -31,7 +31,6 @@ flags = types.Array(boolean, 1, "C")
 ACCURACY = 0.1
 # Sensitivities grow along a segment; where by more than this, Newton's method loses half its digits.
 LARGEST_GROWTH = 1e4
-SAFETY = 0.01  # a foreseen residual must be this much below the tolerance
 REFINEMENTS, MOST_SEGMENTS = 6, 20_000
 
 
@@ -54,13 +53,38 @@ def multiple_shooting(problem: OptimalControlProblem, path: Path, settings: Sett
         status, rows, evaluations = polish(problem, times, nodes, settings.tol, settings.max_iterations)
         history += rows
         work += evaluations
-    return certify(problem, times, nodes, status, history, work)
+    return confirm(problem, times, nodes, status, history, work, settings)
+
+
+def confirm(
+    problem: OptimalControlProblem,
+    times: np.ndarray,
+    nodes: np.ndarray,
+    status: Status,
+    history: tuple[Iteration, ...],
+    work: int,
+    settings: Settings,
+) -> Extremal:
+    """Certifies polished nodes; where re-integration does not confirm a residual that was only foreseen, goes on."""
+    extremal = certify(problem, times, nodes, status, history, work)
+    if extremal.status is not Status.NOT_CERTIFIED:
+        return extremal
+    status, rows, more = polish(problem, times, nodes, settings.tol, settings.max_iterations, foresee=False)
+    return certify(problem, times, nodes, status, history + rows, work + more)
 
 
 def polish(
-    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, tol: float, max_iterations: int
+    problem: OptimalControlProblem,
+    times: np.ndarray,
+    nodes: np.ndarray,
+    tol: float,
+    max_iterations: int,
+    foresee: bool = True,
 ) -> tuple[Status, tuple[Iteration, ...], int]:
-    """Multiple-shooting Newton on the nodes, in place: (status, a row per iterate, evaluations of the flow)."""
+    """Multiple-shooting Newton on the nodes, in place: (status, a row per iterate, evaluations of the flow).
+
+    With `foresee` the last iterate is not evaluated where quadratic convergence tells its residual.
+    """
     arrays = problem.arrays
     costs = np.empty(len(times) - 1)
     log = np.zeros((max_iterations + 1, 3))
@@ -76,6 +100,7 @@ def polish(
         MARGIN * tol,
         MARGIN * tol * ACCURACY,
         max_iterations,
+        foresee,
         costs,
         log,
     )
@@ -180,13 +205,26 @@ def _residual(flow, times, Z, start, goal, free, data, field, accuracy, rows, rh
 
 @njit(
     types.Tuple((int64, int64, float64, int64))(
-        FLOW, vector, matrix, vector, vector, flags, constant, constant, float64, float64, int64, vector, matrix
+        FLOW,
+        vector,
+        matrix,
+        vector,
+        vector,
+        flags,
+        constant,
+        constant,
+        float64,
+        float64,
+        int64,
+        boolean,
+        vector,
+        matrix,
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, max_iterations, costs, log):
+def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, max_iterations, foresee, costs, log):
     """Damped Newton on the nodes Z (segments + 1, 2n), in place; `costs` (segments,) becomes the cost of each segment.
 
     `log` (max_iterations + 1, 3) receives residual, cost and damping of each iterate but a last one whose residual is
@@ -221,8 +259,8 @@ def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, 
             return SINGULAR, iteration, residual, work
         step = rhs.copy()
         # What convergence of order two makes of the residual; the certificate integrates the result in any case.
-        following = residual * (residual / before) ** 2 if damping == 1.0 and residual < before else np.inf
-        if following <= SAFETY * tolerance and current <= accuracy:
+        following = max(residual / before**2, STEEPEST) * residual**2 if damping == 1.0 and before > 0.0 else np.inf
+        if foresee and following <= SAFETY * tolerance and current <= accuracy:
             for k in range(segments + 1):
                 for i in range(2 * n):
                     Z[k, i] += step[2 * n * k + i]

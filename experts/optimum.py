@@ -9,12 +9,12 @@ import numpy as np
 
 from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario
-from leapnav.experts.certificate import certify, failure
+from leapnav.experts.certificate import failure
 from leapnav.experts.extremal import Extremal, Status
 from leapnav.experts.lattice import Lattice
 from leapnav.experts.leapfrog import FeasiblePath
-from leapnav.experts.multiple_shooting import polish
-from leapnav.experts.nodes import default_segments, start_nodes
+from leapnav.experts.multiple_shooting import confirm, polish
+from leapnav.experts.nodes import Settings, default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem, Path
 
 TOLERANCE = 1e-9
@@ -50,7 +50,9 @@ class _Attempt:
 
     def certify(self, converged: Status) -> Extremal:
         track = self.track
-        return certify(track.problem, track.times, self.nodes, converged, tuple(track.history), track.work)
+        settings = Settings(TOLERANCE, NEWTON_ITERATIONS)
+        history = tuple(track.history)
+        return confirm(track.problem, track.times, self.nodes, converged, history, track.work, settings)
 
 
 def find_optimum(scenario: Scenario, candidates: int = 8) -> Extremal:

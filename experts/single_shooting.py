@@ -29,6 +29,9 @@ SMALLEST_DAMPING = 1.0 / 64.0
 MARGIN = 0.1
 FIRST_PARTS, MOST_PARTS = 8, 128  # of the horizon, by which the march advances
 MARCHING_TOLERANCE = 1e-7
+# A foreseen residual must be this much below the tolerance, with at least so large a constant of the quadratic term:
+# one step that happens to go well proves little.
+SAFETY, STEEPEST = 0.1, 100.0
 SMALLEST_TOLERANCE = 1e-13  # of the integrator, near rounding
 LOOSEST = 1e-4  # of the integrator, far from the solution
 
@@ -128,7 +131,8 @@ def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy
     """Damped Newton on the costate in z = (q_0, lam_0), in place; z_end becomes the end of the extremal.
 
     `goal` holds q_f where `free` is False; where it is True the costate must vanish at the end (transversality).
-    `log` (max_iterations + 1, 2) receives residual and cost of each iterate. Returns (status, iterations, residual,
+    `log` (max_iterations + 1, 2) receives residual and cost of each iterate but a last one whose residual is foreseen;
+    its cost is that of the one before with the gradient's correction. Returns (status, iterations, residual,
     cost, evaluations of the flow). Converged means max |residual| <= tolerance.
     """
     n = len(goal)
@@ -176,6 +180,7 @@ def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy
                 return STALLED, iteration - 1, best_residual, cost, work
             for i in range(n):
                 start[n + i] = best[n + i] + damping * best_rhs[i]
+        previous = best_residual
         best[:] = start
         z_end[:] = trial
         best_norm, best_residual, cost, current = norm, residual, trial_cost, wanted
@@ -187,11 +192,24 @@ def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy
         if residual <= tolerance and current <= accuracy:
             z[:] = best
             return CONVERGED, iteration, residual, cost, work
-        # Newton squares the residual, and an error of the integrator here is what remains of the residual thereafter.
+        # An error of the integrator here is what remains of the residual in the end.
         wanted = min(current, max(accuracy, 0.01 * residual**3))
         if not solve_dense(best_jacobian, best_rhs):
             z[:] = best
             return SINGULAR, iteration, residual, cost, work
+        # What convergence of order two makes of the residual.
+        foreseen = max(residual / previous**2, STEEPEST) * residual**2 if damping == 1.0 else np.inf
+        if foreseen <= SAFETY * tolerance and current <= accuracy:
+            z[:] = best
+            for i in range(n):
+                z[n + i] += best_rhs[i]
+                # dJ*/dq_f = -lambda(T); a free component's costate is as small as the residual.
+                if not free[i]:
+                    cost -= trial[n + i] * (goal[i] - trial[i])
+            for i in range(2 * n):
+                for j in range(n):
+                    z_end[i] += S[i, j] * best_rhs[j]
+            return CONVERGED, iteration, foreseen, cost, work
         damping = min(1.0, 2.0 * damping)
         for i in range(n):
             start[n + i] = best[n + i] + damping * best_rhs[i]
