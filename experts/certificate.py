@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numba import float64, int64, njit, types
@@ -342,7 +343,7 @@ def _zero(function: Callable[[float], float], step: float) -> float:
     """Where `function` changes its sign on [0, step]; the start, if it is too small there to have one."""
     if function(0.0) * function(step) >= 0.0:
         return 0.0
-    return float(brentq(function, 0.0, step, xtol=1e-12))
+    return cast(float, brentq(function, 0.0, step, xtol=1e-12))
 
 
 def verify(extremal: Extremal) -> float:

@@ -6,7 +6,7 @@ import json
 import os
 from dataclasses import asdict, dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
@@ -220,7 +220,7 @@ class Extremal:
         # Whoever only solves need not load Matplotlib.
         from leapnav.experts.plotting import plot_extremal
 
-        return plot_extremal(self, path, title=title)
+        return plot_extremal(cast(Any, self), path, title=title)
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain dictionaries, lists and numbers, as `leapnav solve --json` writes it."""

@@ -230,7 +230,7 @@ def _optimise(problem: OptimalControlProblem, U: np.ndarray) -> tuple[float, Pat
         H, g, G = np.diag(h * weight), h * weight * here.U.ravel(), np.empty((problem.system.n, count))
         _condense(here.Ad, here.Bd, here.phi_q, here.phi_qq, h, H, g, G)
         values = here.U.ravel()
-        held = np.zeros(count, dtype=bool)
+        held, move = np.zeros(count, dtype=bool), np.zeros(count)
         for _ in range(3):  # controls that would leave their bounds stay on them
             move, multiplier = _quadratic_step(H, g, G[fixed], -here.miss, ~held, lower - values, upper - values)
             leaving = (values + move < lower - 1e-12) | (values + move > upper + 1e-12)

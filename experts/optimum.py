@@ -11,8 +11,8 @@ from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.certificate import failure
 from leapnav.experts.extremal import Extremal, Status
+from leapnav.experts.feasible_path import FeasiblePath
 from leapnav.experts.lattice import Lattice
-from leapnav.experts.leapfrog import FeasiblePath
 from leapnav.experts.multiple_shooting import confirm, polish
 from leapnav.experts.nodes import Settings, default_segments, start_nodes
 from leapnav.experts.problem import OptimalControlProblem, Path
