@@ -22,8 +22,8 @@ from leapnav.experts.linear import solve_positive
 from leapnav.experts.problem import OptimalControlProblem, Path
 
 INTERVALS = 64
-STARTS = 12  # beginnings per winding of the goal angles
-AGREEING = 4  # so many beginnings with one and the same end are taken for a problem with one minimum
+STARTS = 16  # beginnings per winding of the goal angles
+AGREEING = 6  # so many beginnings with one and the same end are taken for a problem with one minimum
 ITERATIONS = 40
 HARMONICS = 4  # of a random beginning
 SAME_COST = 1e-4  # relative; paths this near in cost are one local minimum, or its mirror image
