@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from numba import float64, int64, njit, types
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 from leapnav.envs.obstacles import clearance
 from leapnav.experts.extremal import Certificate, Extremal, Iteration, Status
@@ -39,6 +39,7 @@ ACCURACY = 1e-12
 FAILED_ACCURACY = 1e-9
 ROUGH_ACCURACY = 1e-6
 MOST_ROWS = 100_000  # steps of an extremal; one that needs more has diverged
+DIP, TOUCHED = 0.3, 1e-5  # share of its size before to which a determinant dips; a singular value that is zero
 NO_RANK = 1e-9  # a determinant below this has no sign that rounding leaves
 
 
@@ -91,7 +92,8 @@ def _orthonormalise(S):
 def _trace(flow, control, times, Z, data, field, accuracy, m, out, terms, sensitivity):
     """Integrates each segment from its node, recording every accepted step.
 
-    Rows of `out`: time, accumulated cost, running cost, u (m), z (2n), z' (2n); `terms` holds the interpolant of the
+    Rows of `out`: time, accumulated cost, running cost, u (m), z (2n), z' (2n), determinant of dq/dlambda(0) in an
+    orthonormal basis; `terms` holds the interpolant of the
     step that starts at the row. Returns (rows or -1 if `out` is too short or -2 if the flow diverged, largest gap at a
     node, row of the step with the first conjugate point or -1, evaluations); `sensitivity` (2n, n) becomes the
     orthonormalised dz/dlambda(0) at the start of that step.
@@ -101,12 +103,12 @@ def _trace(flow, control, times, Z, data, field, accuracy, m, out, terms, sensit
     length = size * (1 + n)
     y, new = np.zeros(length), np.empty(length)
     K = np.empty((STAGES + 1 + EXTRA_STAGES, length))
-    L = np.empty(STAGES + 1)
+    L = np.empty(STAGES + 1 + EXTRA_STAGES)
     S = y[size:].reshape((size, n))
     before_step = np.zeros((size, n))
     for i in range(n):
         S[n + i, i] = 1.0
-    rows, gap, conjugate, total, sign, evaluations = 0, 0.0, -1, 0.0, 0.0, 0
+    rows, gap, conjugate, total, sign, evaluations, determinant = 0, 0.0, -1, 0.0, 0.0, 0, 0.0
     last = len(times) - 2
     h = (times[1] - times[0]) / 4.0
     for k in range(last + 1):
@@ -128,7 +130,8 @@ def _trace(flow, control, times, Z, data, field, accuracy, m, out, terms, sensit
                 out[rows, 2] = running
                 control(y[:size], data, out[rows, 3 : 3 + m])
                 out[rows, 3 + m : 3 + m + size] = y[:size]
-                out[rows, 3 + m + size :] = K[0, :size]
+                out[rows, 3 + m + size : 3 + m + 2 * size] = K[0, :size]
+                out[rows, 3 + m + 2 * size] = determinant
             if finished:
                 break
             while True:
@@ -136,7 +139,7 @@ def _trace(flow, control, times, Z, data, field, accuracy, m, out, terms, sensit
                 ends = elapsed + h >= duration * (1 - 1e-14)
                 if ends:
                     h = duration - elapsed
-                cost, error = step(flow, y, new, K, L, size, n, h, accuracy, data, field, running)
+                cost, error = step(flow, y, new, K, L, size, n, h, accuracy, ROUGH_ACCURACY, data, field, running)
                 evaluations += STAGES
                 taken, h = h, next_step(h, error)
                 if error <= 1.0:
@@ -145,7 +148,7 @@ def _trace(flow, control, times, Z, data, field, accuracy, m, out, terms, sensit
                     return -2, np.inf, conjugate, evaluations
             if ends:  # cut short by the node, so the wanted step was not refuted
                 h = max(h, wanted)
-            interpolant(flow, y, new, K, size, taken, data, field, terms[rows])
+            interpolant(flow, y, new, K, L, size, taken, cost, data, field, terms[rows])
             evaluations += EXTRA_STAGES
             rows += 1
             total += cost
@@ -224,12 +227,13 @@ def certify(
     """
     arrays = problem.arrays
     n, m = problem.system.n, problem.system.m
+    times, nodes = np.ascontiguousarray(times, dtype=float), np.ascontiguousarray(nodes, dtype=float)
     # A path that did not converge is only looked at.
     accuracy = ACCURACY if converged is Status.SUCCESS else FAILED_ACCURACY
     rows = 512
     sensitivity = np.empty((2 * n, n))
     while True:
-        out, terms = np.empty((rows, 3 + m + 4 * n)), np.empty((rows, DENSE_TERMS, 2 * n))
+        out, terms = np.empty((rows, 4 + m + 4 * n)), np.empty((rows, DENSE_TERMS, 2 * n + 1))
         count, gap, step_of_conjugate, _ = _trace(
             arrays.flow,
             arrays.control,
@@ -270,10 +274,11 @@ def certify(
     )
     if arrays.free.any():
         conjugate_point = _first_focal_time(extremal, arrays.free)
-    elif step_of_conjugate < 0:
-        conjugate_point = None
     else:
-        conjugate_point = _conjugate_time(extremal, step_of_conjugate, sensitivity)
+        conjugate_point = _first_touch(extremal, out[:, -1])
+        if step_of_conjugate >= 0:
+            crossing = _conjugate_time(extremal, step_of_conjugate, sensitivity)
+            conjugate_point = min((t for t in (conjugate_point, crossing) if t is not None), default=None)
     closest = None
     if problem.field is not None and problem.system.position is not None:
         ix, iy = (problem.system.state.index(symbol) for symbol in problem.system.position)
@@ -306,6 +311,56 @@ def _conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> floa
     return time if time < extremal.problem.horizon * (1 - 1e-9) else None
 
 
+def _first_touch(extremal: Extremal, determinants: np.ndarray) -> float | None:
+    """First time at which det dq(t)/dlambda(0) vanishes without a change of sign, as it does in symmetric problems."""
+    if not _dips(determinants).any():
+        return None
+    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    z = np.concatenate([extremal.states, extremal.costates], axis=1)
+    S = np.concatenate([np.zeros((n, n)), np.eye(n)])
+    frames = [S.copy()]
+
+    def advance(k: int, S: np.ndarray, time: float) -> np.ndarray:
+        S, duration = S.copy(), time - float(extremal.times[k])
+        if duration > 0.0:
+            propagate(arrays.flow, z[k].copy(), S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
+            _orthonormalise(S)
+        return S
+
+    for k in range(len(z) - 1):
+        frames.append(advance(k, frames[k], float(extremal.times[k + 1])))
+
+    def frame(time: float) -> np.ndarray:
+        k = min(int(np.searchsorted(extremal.times, time, side="right")) - 1, len(frames) - 1)
+        return advance(k, frames[k], time)
+
+    return _touch(extremal.times, determinants, frame)
+
+
+def _dips(determinants: np.ndarray) -> np.ndarray:
+    """Where |determinant| has a minimum well below what it was before, at inner points."""
+    size = np.abs(determinants)
+    lowest = np.zeros(len(size), dtype=bool)
+    before = np.maximum.accumulate(size)[1:-1]
+    lowest[1:-1] = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < DIP * before)
+    return lowest
+
+
+def _touch(times: np.ndarray, determinants: np.ndarray, frame: Callable[[float], np.ndarray]) -> float | None:
+    """First time (in the order of `times`) near a dip at which the frame's upper block loses rank."""
+    for i in np.flatnonzero(_dips(determinants)):
+        low, high = sorted((float(times[i - 1]), float(times[i + 1])))
+        found = minimize_scalar(
+            lambda t: np.linalg.svd(frame(t)[: frame(t).shape[1]], compute_uv=False)[-1],
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": 1e-9 * (high - low)},
+        )
+        if found.fun < TOUCHED:
+            return float(found.x)
+    return None
+
+
 def _first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
     """Last time at which the extremals that meet the end conditions focus, for free final components.
 
@@ -315,28 +370,40 @@ def _first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
     """
     arrays, n = extremal.problem.arrays, extremal.problem.system.n
     symplectic = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
-    basis = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
-    sign = 0.0
-    for k in range(len(extremal.times) - 2, -1, -1):
-        end = float(extremal.times[k + 1])
-        carried = basis
+    times = extremal.times[::-1]
+    frames = [np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])]
 
-        def back(duration: float, end: float = end, carried: np.ndarray = carried) -> np.ndarray:
-            if duration <= 0.0:
-                return np.ascontiguousarray(carried)
-            z, S = extremal.interpolate(np.array([end - duration]))[0], np.eye(2 * n)
+    def back(k: int, time: float) -> np.ndarray:
+        """The frame at a time up to a step before times[k], orthonormal."""
+        duration = float(times[k]) - time
+        basis = np.ascontiguousarray(frames[k])
+        if duration > 0.0:
+            z, S = extremal.interpolate(np.array([time]))[0], np.eye(2 * n)
             propagate(arrays.flow, z, S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
             # The inverse of a symplectic matrix.
-            return np.ascontiguousarray(-symplectic @ S.T @ symplectic @ carried)
+            basis = np.ascontiguousarray(-symplectic @ S.T @ symplectic @ basis)
+        return basis
 
-        step = end - float(extremal.times[k])
-        basis = back(step)
-        determinant = _orthonormalise(basis)
-        if abs(determinant) > NO_RANK:
-            if sign * determinant < 0:
-                return end - _zero(lambda duration, back=back: _orthonormalise(back(duration)), step)
-            sign = math.copysign(1.0, determinant)
-    return None
+    determinants = [0.0]
+    sign, crossing = 0.0, None
+    for k in range(len(times) - 1):
+        frames.append(back(k, float(times[k + 1])))
+        determinants.append(_orthonormalise(frames[-1]))
+        if abs(determinants[-1]) > NO_RANK:
+            if sign * determinants[-1] < 0:
+                step = float(times[k] - times[k + 1])
+                crossing = float(times[k]) - _zero(lambda d, k=k: _orthonormalise(back(k, float(times[k]) - d)), step)
+                break
+            sign = math.copysign(1.0, determinants[-1])
+
+    def frame(time: float) -> np.ndarray:
+        k = max(int(np.searchsorted(-times, -time, side="left")) - 1, 0)
+        basis = back(k, time)
+        _orthonormalise(basis)
+        return basis
+
+    touch = _touch(times, np.array(determinants), frame)
+    return max((t for t in (touch, crossing) if t is not None), default=None)
 
 
 def _zero(function: Callable[[float], float], step: float) -> float:
@@ -390,7 +457,7 @@ def failure(
         empty,
         np.empty(0),
         np.empty(0),
-        np.empty((0, DENSE_TERMS, 2 * n)),
+        np.empty((0, DENSE_TERMS, 2 * n + 1)),
         history,
         None,
         0,

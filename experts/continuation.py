@@ -5,6 +5,7 @@ E. L. Allgower and K. Georg, Numerical Continuation Methods, Springer (1990), ch
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -69,23 +70,35 @@ def continuation(
 def _walk(start: Extremal, target: OptimalControlProblem, method: Method, tol: float, smallest_step: float) -> Extremal:
     """The extremal of the target, by problems between it and that of `start`."""
     origin, here = start.problem, start
-    # The origin's goal carries the winding that its extremal found; the way there must not turn round.
-    target = target.with_winding_of(start.states)
+    target = _unwind(target, start)
     blend(origin, target, 0.5)  # names what cannot be blended before any work is done
-    reached, step = 0.0, 1.0
+    reached, step, first = 0.0, 1.0, None
     while True:
         share = min(1.0, reached + step)
         problem = target if share == 1.0 else blend(origin, target, share)
         extremal = solve(problem, method=method, guess=here, tol=tol)
-        if extremal.success:
-            if share == 1.0:
+        if share == 1.0:
+            if extremal.success:
                 return extremal
+            first = first or extremal
+        if extremal.success:
             reached, here = share, extremal
             step *= GROWTH
         else:
             step /= 2.0
             if step < smallest_step:
-                return extremal
+                # The failure of the target itself, not of a problem on the way.
+                assert first is not None
+                return first
+
+
+def _unwind(target: OptimalControlProblem, start: Extremal) -> OptimalControlProblem:
+    """The target with its angles at the windings nearest to those of an extremal, start and goal alike."""
+    begin = list(target.start)
+    for symbol in target.system.angles:
+        i = target.system.state.index(symbol)
+        begin[i] -= 2 * math.pi * round((begin[i] - float(start.states[0, i])) / (2 * math.pi))
+    return replace(target, start=tuple(begin)).with_winding_of(start.states)
 
 
 def blend(first: OptimalControlProblem, second: OptimalControlProblem, share: float) -> OptimalControlProblem:

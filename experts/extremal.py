@@ -48,10 +48,10 @@ class SolveError(RuntimeError):
 
     def __init__(self, extremal: Extremal, name: str = "") -> None:
         super().__init__(f"{name}{': ' if name else ''}{extremal.status.name}: {extremal.status.value}")
-        self.extremal = extremal
+        self.extremal, self.name = extremal, name
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return SolveError, (self.extremal,)
+        return SolveError, (self.extremal, self.name)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Extremal:
         times (N,), states (N, n), controls (N, m), costates (N, n): the solution at the integrator's own steps (s).
         accumulated (N,): cost from time 0.
         hamiltonian (N,): H, constant along an extremal.
-        terms (N - 1, 7, 2n): coefficients of the integrator's interpolant, for dense evaluation.
+        terms (N - 1, 7, 2n + 1): coefficients of the integrator's interpolant of (q, lambda, cost).
         history: one row per iteration.
         certificate: see `Certificate`; None if the solver returned no path.
         nodes: how many nodes the solver used.
@@ -185,13 +185,17 @@ class Extremal:
         """
         if len(self.times) == 0:
             raise ValueError(f"there is no path: {self.status.value}")
+        return np.ascontiguousarray(self._interpolate(times)[:, :-1])
+
+    def _interpolate(self, times: np.ndarray) -> np.ndarray:
+        """(q, lambda, cost so far) at times (K,), shape (K, 2n + 1)."""
         times = np.clip(times, 0.0, self.problem.horizon)
         k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         s = ((times - self.times[k]) / (self.times[k + 1] - self.times[k]))[:, None]
         value = np.zeros((len(times), self.terms.shape[2]))
         for j in range(self.terms.shape[1] - 1, -1, -1):
             value = (value + self.terms[k, j]) * (s if j % 2 == 0 else 1.0 - s)
-        return value + np.concatenate([self.states, self.costates], axis=1)[k]
+        return value + np.concatenate([self.states, self.costates, self.accumulated[:, None]], axis=1)[k]
 
     def cost_to_go(self, t: Any) -> Any:
         """Cost from time t to the horizon, scalar or (K,).
@@ -202,7 +206,8 @@ class Extremal:
         """
         if len(self.times) == 0:
             raise ValueError(f"there is no path: {self.status.value}")
-        return self.cost - np.interp(t, self.times, self.accumulated)
+        values = self.cost - self._interpolate(np.atleast_1d(np.asarray(t, dtype=float)))[:, -1]
+        return values if np.ndim(t) else float(values[0])
 
     def plot(self, path: str | os.PathLike[str] | None = None, title: str | None = None) -> Figure:
         """States, controls, costates and Hamiltonian over time, the path in the plane, and Leapfrog's sweeps.

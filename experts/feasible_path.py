@@ -21,6 +21,7 @@ from leapnav.experts.single_shooting import shoot
 
 SUBPROBLEM_ITERATIONS = 12
 LONG_ACCURACY = 1e-13  # of the integrator, for arcs over which errors grow
+EDGE = 0.05  # of a sub-problem's duration, within which its node stays
 CLOSED = 5e-10  # larger jumps of the states between arcs call for a better integrator
 STEERING_INTERVALS, STEERING_STARTS = 16, 6
 
@@ -365,7 +366,8 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
             rejected[i] = True
             continue
         middle = z.copy()
-        if half_cost:
+        elapsed = 0.0
+        if half_cost and cost > 0.0:
             reached, elapsed, step, target = 0.0, 0.0, duration / 16.0, cost / 2.0
             part, taken = 0.0, 0.0
             here = middle.copy()
@@ -385,7 +387,9 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
             part, _, _, evaluations = propagate(flow, middle, S, rest, data, field, accuracy, 0.0, False)
             elapsed += rest
             first_cost = reached + part
-        else:
+        # Where the cost comes all at one end, or is not positive, half of it marks no point between the neighbours.
+        if not EDGE * duration < elapsed < (1.0 - EDGE) * duration:
+            middle[:] = z
             elapsed = duration / 2.0
             first_cost, _, _, evaluations = propagate(flow, middle, S, elapsed, data, field, accuracy, 0.0, False)
         work += abs(evaluations)

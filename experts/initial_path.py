@@ -194,7 +194,9 @@ def local_minima(
     line = problem.straight_line(intervals + 1)
     drift, fields = problem.dynamics(line.states)
     rates = np.gradient(line.states, line.times, axis=0)
-    along = (np.linalg.pinv(fields) @ (rates - drift)[:, :, None])[:intervals, :, 0]
+    along = np.zeros((intervals, m))
+    if np.isfinite(fields).all() and np.isfinite(drift).all():
+        along = (np.linalg.pinv(fields) @ (rates - drift)[:, :, None])[:intervals, :, 0]
     # What a typical control is, until a solution tells.
     size = np.full(m, np.linalg.norm(rates[0]) + n / problem.horizon)
     phases = np.cos(np.outer(np.linspace(0.0, np.pi, intervals), np.arange(HARMONICS)))
@@ -307,7 +309,7 @@ def _evaluate(problem: OptimalControlProblem, U: np.ndarray) -> _Point | None:
         return None
     effort = 0.5 * h * float(np.sum(np.asarray(problem.control_weight) * U**2))
     cost = effort + h * float(phi.sum() - (phi[0] + phi[-1]) / 2)
-    if not math.isfinite(cost):
+    if not (math.isfinite(cost) and all(np.isfinite(a).all() for a in (Ad, Bd, phi_q, phi_qq))):
         return None
     miss = (X[-1] - arrays.goal)[~arrays.free]
     return _Point(U, X, Ad, Bd, phi_q, phi_qq, cost, miss)

@@ -37,23 +37,24 @@ EXTRA_STAGES = len(EXTRA_A)
 DENSE_TERMS = 3 + len(DENSE)  # of the interpolant of order 7
 
 MAX_STEPS = 10_000
-LIMIT = 1e8  # a state or costate beyond this has diverged
+LIMIT = 1e14  # a state or costate beyond this has diverged
 SMALLEST_STEP = 1e-13  # relative to the interval; below it rounding decides
 
 
 @njit(
     types.UniTuple(float64, 2)(
-        FLOW, vector, vector, matrix, vector, int64, int64, float64, float64, constant, constant, float64
+        FLOW, vector, vector, matrix, vector, int64, int64, float64, float64, float64, constant, constant, float64
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def step(flow, y, new, K, L, size, columns, h, tolerance, data, field, first_running):
+def step(flow, y, new, K, L, size, columns, h, tolerance, rough, data, field, first_running):
     """One step of length h from y = (z, S) to `new`, both flat: (cost, error relative to the tolerance).
 
-    K (stages + 1 + extra, len(y)) holds the slopes, its first row given, and L the running costs. An error above 1 is
-    to be rejected; it is infinite where the flow left the numbers.
+    K (stages + 1 + extra, len(y)) holds the slopes, its first row given, and L the running costs. The error is that of
+    z, and with `rough` > 0 also that of S, to this tolerance. One above 1 is to be rejected; it is infinite where the
+    flow left the numbers.
     """
     length = len(y)
     L[0] = first_running
@@ -80,12 +81,12 @@ def step(flow, y, new, K, L, size, columns, h, tolerance, data, field, first_run
     for s in range(STAGES):
         cost += WEIGHTS[s] * L[s]
     fifth, third = 0.0, 0.0
-    for i in range(size):
+    for i in range(length if rough > 0.0 else size):
         e5, e3 = 0.0, 0.0
         for s in range(STAGES + 1):
             e5 += ERROR_5[s] * K[s, i]
             e3 += ERROR_3[s] * K[s, i]
-        scale = tolerance * (1.0 + max(abs(y[i]), abs(new[i])))
+        scale = (tolerance if i < size else rough) * (1.0 + max(abs(y[i]), abs(new[i])))
         fifth += (e5 / scale) ** 2
         third += (e3 / scale) ** 2
     if not math.isfinite(fifth + third):
@@ -132,7 +133,7 @@ def propagate(flow, z, S, duration, data, field, tolerance, first_step, once):
         last = elapsed + h >= duration * (1 - 1e-14)
         if last:
             h = duration - elapsed
-        part, error = step(flow, y, new, K, L, size, columns, h, tolerance, data, field, running)
+        part, error = step(flow, y, new, K, L, size, columns, h, tolerance, 0.0, data, field, running)
         evaluations += STAGES
         following = next_step(h, error)
         if error <= 1.0:
@@ -155,13 +156,13 @@ def propagate(flow, z, S, duration, data, field, tolerance, first_step, once):
 
 
 @njit(
-    types.none(FLOW, vector, vector, matrix, int64, float64, constant, constant, matrix),
+    types.none(FLOW, vector, vector, matrix, vector, int64, float64, float64, constant, constant, matrix),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def interpolant(flow, y, new, K, size, h, data, field, terms):
-    """Coefficients (DENSE_TERMS, 2n) of the order-7 interpolant of z over an accepted step, with three more slopes.
+def interpolant(flow, y, new, K, L, size, h, cost, data, field, terms):
+    """Coefficients (DENSE_TERMS, 2n + 1) of the order-7 interpolant of z and the cost, with three more evaluations.
 
     Only the first `size` entries of y = (z, S) are interpolated. See `evaluate_interpolant`.
     """
@@ -173,16 +174,17 @@ def interpolant(flow, y, new, K, size, h, data, field, terms):
             for j in range(STAGES + 1 + s):
                 total += EXTRA_A[s, j] * K[j, i]
             z[i] = y[i] + h * total
-        flow(z, data, field, none, K[STAGES + 1 + s, :size], d_none)
-    for i in range(size):
-        gap = new[i] - y[i]
+        L[STAGES + 1 + s] = flow(z, data, field, none, K[STAGES + 1 + s, :size], d_none)
+    for i in range(size + 1):
+        gap = new[i] - y[i] if i < size else cost
+        first, last = (K[0, i], K[STAGES, i]) if i < size else (L[0], L[STAGES])
         terms[0, i] = gap
-        terms[1, i] = h * K[0, i] - gap
-        terms[2, i] = 2.0 * gap - h * (K[STAGES, i] + K[0, i])
+        terms[1, i] = h * first - gap
+        terms[2, i] = 2.0 * gap - h * (last + first)
         for d in range(DENSE_TERMS - 3):
             total = 0.0
             for j in range(STAGES + 1 + EXTRA_STAGES):
-                total += DENSE[d, j] * K[j, i]
+                total += DENSE[d, j] * (K[j, i] if i < size else L[j])
             terms[3 + d, i] = h * total
 
 

@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import boolean, int64, njit
 
 from leapnav.experts.integrator import matrix, vector
+
+SMALLEST_PIVOT = 1e-14  # relative to the largest entry: rounding
 
 
 @njit(boolean(matrix, vector), cache=True, error_model="numpy", nogil=True)
 def solve_dense(A, b):
     """Gaussian elimination with partial pivoting, in place: b becomes the solution. False if A is singular."""
     n = len(b)
+    largest = np.abs(A).max()
     for k in range(n):
         pivot = k
         for i in range(k + 1, n):
             if abs(A[i, k]) > abs(A[pivot, k]):
                 pivot = i
-        if not abs(A[pivot, k]) > 1e-14:
+        if not abs(A[pivot, k]) > SMALLEST_PIVOT * largest:
             return False
         if pivot != k:
             for j in range(k, n):

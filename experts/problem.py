@@ -83,6 +83,14 @@ class OptimalControlProblem:
             for low, high in self.control_bounds:
                 if not low < high:
                     raise ValueError(f"control_bounds: expected lowest < highest, got ({low!r}, {high!r})")
+        # SymPy's or NumPy's numbers are as good as Python's, but not to compiled functions.
+        for name in ("start", "goal", "control_weight", "parameters"):
+            values = tuple(None if v is None else float(v) for v in getattr(self, name))
+            object.__setattr__(self, name, values)
+        object.__setattr__(self, "horizon", float(self.horizon))
+        if self.control_bounds is not None:
+            bounds = tuple((float(low), float(high)) for low, high in self.control_bounds)
+            object.__setattr__(self, "control_bounds", bounds)
         unknown = sp.sympify(self.state_cost).free_symbols - {*self.system.state, *self.system.parameters}
         if unknown:
             raise ValueError(

@@ -71,7 +71,7 @@ def solve(
         An `Extremal` whose status comes from its certificate.
 
     Raises:
-        ValueError: an argument is impossible; the message names it.
+        ValueError, TypeError: an argument is impossible; the message names it.
         SolveError: `raise_on_failure`, and there is no success; its `extremal` is the failed result.
 
     """
@@ -137,8 +137,10 @@ def _from_guess(
         values = guess.interpolate(np.linspace(0.0, guess.times[-1], points))
         # Another horizon stretches the path.
         path = Path(np.linspace(0.0, problem.horizon, points), values[:, :n], values[:, n:])
-    else:
+    elif isinstance(guess, Path):
         path = _checked(guess, problem)
+    else:
+        raise TypeError(f"guess: expected a Path or an Extremal, got {type(guess).__name__}")
     return problem.with_winding_of(path.states), path, settings
 
 
@@ -151,8 +153,10 @@ def _settings(
         raise ValueError(f"tol: expected a positive number, got {tol!r}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations: expected at least 1, got {max_iterations!r}")
-    if segments is not None and segments < 1:
-        raise ValueError(f"segments: expected at least 1, got {segments!r}")
+    if segments is not None:
+        if not isinstance(segments, (int, np.integer)) or segments < 1:
+            raise ValueError(f"segments: expected a whole number of at least 1, got {segments!r}")
+        segments = int(segments)
     if update not in ("mean_time", "half_cost"):
         raise ValueError(f"update: expected 'mean_time' or 'half_cost', got {update!r}")
     if order not in ("sequential", "red_black"):

@@ -23,11 +23,14 @@ from typing import Any
 import platformdirs
 import sympy as sp
 from numba import types
+from sympy.printing.precedence import PRECEDENCE
+from sympy.printing.pycode import PythonCodePrinter
+from sympy.simplify.cse_main import tree_cse
 
 from leapnav.envs import obstacles
 from leapnav.experts.integrator import CONTROL, FLOW
 
-GENERATOR_VERSION = "2"  # part of the file name: raise it whenever the generated text changes
+GENERATOR_VERSION = "3"  # part of the file name: raise it whenever the generated text changes
 
 
 @dataclass(frozen=True)
@@ -274,6 +277,50 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
     return _render(n, m, len(parameters), switching, value, rate, jacobian, at)
 
 
+class _Printer(PythonCodePrinter):
+    """Python text whose numbers are floats: compiled, they divide by zero without an error, and none is too large."""
+
+    def _print_Integer(self, expr: Any) -> str:  # noqa: N802
+        return f"{float(expr)!r}"
+
+    def _print_Rational(self, expr: Any) -> str:  # noqa: N802
+        return f"{float(expr)!r}"
+
+    def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802
+        base, exponent = expr.as_base_exp()
+        text = self.parenthesize(base, PRECEDENCE["Atom"])
+        if exponent.is_Integer and 0 < abs(int(exponent)) <= 4:
+            power = "*".join([text] * abs(int(exponent)))
+            return f"({power})" if exponent > 0 else f"(1.0/({power}))"
+        if exponent == sp.Rational(1, 2):
+            return f"math.sqrt({self.doprint(base)})"
+        if exponent == sp.Rational(-1, 2):
+            return f"(1.0/math.sqrt({self.doprint(base)}))"
+        return f"({text}**({self.doprint(exponent)}))"
+
+
+_PRINTER = _Printer({"fully_qualified_modules": True})
+
+
+def _check_same(plain: list[Any], shared: Sequence[tuple[Any, Any]], reduced: Sequence[Any]) -> None:
+    """Compares expressions with their reduced forms at a point: nothing that comes later could tell a wrong flow."""
+    symbols = sorted(set().union(*(e.free_symbols for e in plain)), key=str)
+    point = {symbol: sp.Float(0.3 + 0.61803398875 * k % 0.5) for k, symbol in enumerate(symbols)}
+    values = dict(point)
+    for symbol, definition in shared:
+        values[symbol] = sp.sympify(definition).xreplace(values)
+    for expression, short in zip(plain, reduced, strict=True):
+        expected, found = (complex(sp.sympify(e).xreplace(values).evalf()) for e in (expression, short))
+        if abs(expected - found) > 1e-9 * (1.0 + abs(expected)):
+            raise RuntimeError(f"the generated code does not compute {expression}: {found} instead of {expected}")
+
+
+def _smooth(expression: sp.Expr) -> sp.Expr:
+    """Second derivatives of |x| and max(x, 0) as they are off the kink."""
+    expression = expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+    return expression.replace(sp.Heaviside, lambda x, *_: (1 + sp.sign(x)) / 2)
+
+
 def _render(
     n: int,
     m: int,
@@ -290,9 +337,10 @@ def _render(
         *(f"rate{i}" for i in range(2 * n)),
         *(f"A{a}_{b}" for a, b in jacobian),
     ]
-    shared, reduced = sp.cse(
-        [*switching, value, *rate, *jacobian.values()], symbols=sp.numbered_symbols("w"), order="none"
-    )
+    plain = [_smooth(sp.sympify(e)) for e in (*switching, value, *rate, *jacobian.values())]
+    # Common subtrees only: the optimisations of sympy.cse have turned a sum into a product.
+    shared, reduced = tree_cse(plain, sp.numbered_symbols("w"), order="none")
+    _check_same(plain, shared, reduced)
     expressions: dict[str, Any] = dict(zip(names, reduced, strict=True))
 
     emitted: set[sp.Symbol] = set()
@@ -305,10 +353,10 @@ def _render(
                 if symbol in e.free_symbols and symbol not in emitted:
                     require(definition)
                     emitted.add(symbol)
-                    lines.append(f"{indent}{symbol} = {sp.pycode(definition)}")
+                    lines.append(f"{indent}{symbol} = {_PRINTER.doprint(definition)}")
 
         require(expression)
-        return [*lines, f"{indent}{target} = {sp.pycode(expression)}"]
+        return [*lines, f"{indent}{target} = {_PRINTER.doprint(expression)}"]
 
     unpack = [
         "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),

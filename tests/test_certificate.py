@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from helpers import best_known, published_problems, shooting_guess
+from scipy.integrate import cumulative_simpson
 
 from leapnav.envs import Scenario
 from leapnav.envs.obstacles import clearances
@@ -17,6 +18,7 @@ from leapnav.experts import (
     solve,
     verify,
 )
+from leapnav.experts.solve import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
@@ -143,3 +145,44 @@ def test_a_wrong_solution_is_not_certified():
         found = certify(extremal.problem, times, wrong, Status.SUCCESS)
         assert found.status is Status.NOT_CERTIFIED
         assert max(found.certificate.residual, found.certificate.defect) > 1e-7
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_conjugate_point_of_even_multiplicity_is_seen(method):
+    # Two oscillators alike: det dq(t)/dlambda(0) is a square, and touches zero without a change of sign.
+    x, y = sp.symbols("x y")
+    system = ControlAffineSystem(state=(x, y), drift=(0, 0), fields=((1, 0), (0, 1)))
+    for goal, horizon, first in (
+        ((0, 0), 3.0, None),
+        ((0, 0), 4.0, math.pi),
+        ((None, None), 1.5, None),
+        ((None, None), 2.0, 2.0 - math.pi / 2),
+    ):
+        problem = OptimalControlProblem(system, (0, 0), goal, horizon, (1, 1), state_cost=-(x**2 + y**2) / 2)
+        extremal = solve(problem, method=method)
+        if first is None:
+            assert extremal.success
+        else:
+            assert extremal.status is Status.CONJUGATE_POINT
+            assert extremal.certificate.conjugate_point == pytest.approx(first, abs=1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("horizon", [4.0, 7.0, 13.0])
+def test_an_extremal_at_rest_hides_no_conjugate_point(horizon, method):
+    # The integrator could take the whole horizon in one step if it looked at the extremal alone.
+    x = sp.Symbol("x")
+    system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
+    problem = OptimalControlProblem(system, (0,), (0,), horizon, (1.0,), state_cost=-(x**2) / 2)
+    extremal = solve(problem, method=method)
+    assert extremal.status is Status.CONJUGATE_POINT
+    assert extremal.certificate.conjugate_point == pytest.approx(math.pi, abs=1e-3)
+
+
+def test_the_cost_to_go_is_exact_between_the_integrator_s_steps():
+    extremal = solve(PROBLEMS["van-der-pol-free-end"][0])
+    times = np.linspace(0.0, 2.0, 4001)
+    states, controls, _ = extremal.evaluate(times)
+    running = 0.5 * (controls[:, 0] ** 2 + (states**2).sum(axis=1))
+    spent = cumulative_simpson(running, x=times, initial=0.0)
+    assert extremal.cost_to_go(times) == pytest.approx(extremal.cost - spent, abs=1e-10)

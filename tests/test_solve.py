@@ -1,4 +1,5 @@
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -262,9 +263,19 @@ def test_a_failure_is_raised_on_request_with_the_failed_result():
     with pytest.raises(SolveError, match=r"STALLED: .*Try") as caught:
         solve(unreachable(), method="multiple_shooting", raise_on_failure=True)
     assert caught.value.extremal.status is Status.STALLED
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     with pytest.raises(SolveError, match="clutter-0: NO_PATH"):
         solve(shut(), raise_on_failure=True)
     assert solve(VAN_DER_POL, raise_on_failure=True).success
+
+
+def test_half_of_a_cost_that_is_not_positive_moves_no_node():
+    system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
+    problem = OptimalControlProblem(system, (1,), (1,), 2.0, (1.0,), state_cost=-(x**2) / 2)
+    for polish in (True, False):
+        extremal = solve(problem, method="leapfrog", update="half_cost", polish=polish)
+        assert extremal.success
+        assert extremal.cost == pytest.approx(-math.tan(1.0), rel=1e-8)
 
 
 def test_a_tighter_tolerance_gives_a_smaller_residual():

@@ -3,7 +3,9 @@ import pytest
 import sympy as sp
 from helpers import best_known, published_problems
 
-from leapnav.experts import ControlAffineSystem, OptimalControlProblem
+from leapnav.experts import ControlAffineSystem, OptimalControlProblem, solve
+from leapnav.experts.solve import METHODS
+from leapnav.experts.system import _check_same
 
 x, v = sp.symbols("x v")
 
@@ -103,3 +105,60 @@ def test_a_wrong_problem_is_named(arguments, message):
     good = {"start": (0, 0), "goal": (1, 0), "horizon": 1.0, "control_weight": (1,)}
     with pytest.raises(ValueError, match=message):
         OptimalControlProblem(system, **{**good, **arguments})
+
+
+def attitude():
+    """Modified Rodrigues parameters s and angular velocities w of a body with moments of inertia 1, 2, 3."""
+    s, w = sp.Matrix(sp.symbols("s1:4")), sp.Matrix(sp.symbols("w1:4"))
+    cross = sp.Matrix([[0, -s[2], s[1]], [s[2], 0, -s[0]], [-s[1], s[0], 0]])
+    rates = sp.Rational(1, 4) * ((1 - s.dot(s)) * sp.eye(3) + 2 * cross + 2 * s * s.T) * w
+    inertia = sp.diag(1, 2, 3)
+    turning = -inertia.inv() * w.cross(inertia * w)
+    fields = [(0, 0, 0, *column) for column in inertia.inv().tolist()]
+    return ControlAffineSystem(state=(*s, *w), drift=(*rates, *turning), fields=fields)
+
+
+def test_the_compiled_flow_computes_what_was_declared():
+    # An expression of this system is one that sympy.cse gets wrong.
+    system = attitude()
+    problem = OptimalControlProblem(system, (0,) * 6, (0.3, 0.5, -0.2, 0, 0, 0), 5.0, (1, 1, 1))
+    drift = sp.lambdify(system.state, system.drift)
+    for z in sample_points(problem):
+        control = -np.array([z[9], z[10] / 2, z[11] / 3])
+        expected = np.array(drift(*z[:6])) + np.concatenate([np.zeros(3), control / (1, 2, 3)])
+        assert rates(problem, z)[:6] == pytest.approx(expected, abs=1e-12)
+    costs = [solve(problem, method=method).cost for method in METHODS]
+    assert costs == pytest.approx([0.80069849692] * 4, rel=1e-9)
+
+
+def test_a_slip_in_the_generated_code_is_found_before_it_is_used():
+    a, b, w0 = sp.symbols("a b w0")
+    _check_same([a * b + 1], [(w0, a * b)], [w0 + 1])
+    with pytest.raises(RuntimeError, match="does not compute"):
+        _check_same([a * b + 1], [(w0, a + b)], [w0 + 1])
+
+
+@pytest.mark.parametrize(
+    ("cost", "fields", "start", "goal"),
+    [
+        (sp.sqrt(x**2 + v**2), ((1, 0), (0, 1)), (0, 0), (1, 1)),
+        (sp.log(x), ((1, 0), (0, 1)), (0, 0), (1, 1)),
+        (0, ((1, 0), (0, 1 / x)), (-1, 0), (1, 1)),
+        (0, ((1, sp.sqrt(x)), (0, 1)), (0, 0), (1, 1)),
+    ],
+)
+def test_expressions_without_a_value_end_in_a_failure_and_not_in_a_crash(cost, fields, start, goal, capfd):
+    system = ControlAffineSystem(state=(x, v), drift=(0, 0), fields=fields)
+    for method in METHODS:
+        extremal = solve(OptimalControlProblem(system, start, goal, 1.0, (1, 1), state_cost=cost), method=method)
+        assert isinstance(extremal.status.value, str)
+    assert "Exception" not in capfd.readouterr().err
+
+
+def test_kinks_and_any_kind_of_number_are_taken():
+    system = ControlAffineSystem(state=(x, v), drift=(v, 0), fields=((0, 1),))
+    for cost in (sp.Abs(x), sp.Max(x, 0) ** 2, sp.Integer(10) ** 20 * x**2 / sp.Integer(10) ** 20):
+        problem = OptimalControlProblem(
+            system, (0, 0), (sp.Integer(1), 0), sp.Integer(2), (np.int64(2),), state_cost=cost
+        )
+        assert solve(problem, method="multiple_shooting", segments=np.int64(20)).success
