@@ -366,7 +366,7 @@ def sweep(flow, times, Z, goal, free, data, field, tolerance, accuracy, half_cos
             rejected[i] = True
             continue
         middle = z.copy()
-        elapsed = 0.0
+        elapsed, first_cost = 0.0, 0.0
         if half_cost and cost > 0.0:
             reached, elapsed, step, target = 0.0, 0.0, duration / 16.0, cost / 2.0
             part, taken = 0.0, 0.0
