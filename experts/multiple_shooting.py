@@ -251,6 +251,13 @@ def newton(flow, times, Z, start, goal, free, data, field, tolerance, accuracy, 
         log[iteration, 0] = residual
         log[iteration, 1] = costs.sum()
         log[iteration, 2] = damping
+        if residual <= tolerance and current > accuracy:  # a guess that is a solution already, maybe a degenerate one
+            current = accuracy
+            norm, residual, more = _residual(
+                flow, times, Z, start, goal, free, data, field, current, rows, rhs, costs, hint
+            )
+            work += more
+            log[iteration, 0] = residual
         if residual <= tolerance and current <= accuracy:
             return CONVERGED, iteration, residual, work
         if iteration == max_iterations:

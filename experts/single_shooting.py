@@ -192,6 +192,9 @@ def shoot(flow, z, goal, z_end, free, duration, data, field, tolerance, accuracy
         if residual <= tolerance and current <= accuracy:
             z[:] = best
             return CONVERGED, iteration, residual, cost, work
+        if residual <= tolerance:  # a guess that is a solution already, maybe a degenerate one: only looked at again
+            wanted = accuracy
+            continue
         # An error of the integrator here is what remains of the residual in the end.
         wanted = min(current, max(accuracy, 0.01 * residual**3))
         if not solve_dense(best_jacobian, best_rhs):
