@@ -39,7 +39,9 @@ ACCURACY = 1e-12
 FAILED_ACCURACY = 1e-9
 ROUGH_ACCURACY = 1e-6
 MOST_ROWS = 100_000  # steps of an extremal; one that needs more has diverged
-DIP, TOUCHED = 0.3, 1e-5  # share of its size before to which a determinant dips; a singular value that is zero
+# A determinant that touches zero dips to this share of its size before, and the parabola through the points around goes
+# to this share of the lowest; a singular value that counts as zero.
+DIP, DEEPER, TOUCHED = 0.3, 0.7, 1e-5
 NO_RANK = 1e-9  # a determinant below this has no sign that rounding leaves
 
 
@@ -313,7 +315,7 @@ def _conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> floa
 
 def _first_touch(extremal: Extremal, determinants: np.ndarray) -> float | None:
     """First time at which det dq(t)/dlambda(0) vanishes without a change of sign, as it does in symmetric problems."""
-    if not _dips(determinants).any():
+    if not _dips(extremal.times, determinants, likely=True):
         return None
     arrays, n = extremal.problem.arrays, extremal.problem.system.n
     z = np.concatenate([extremal.states, extremal.costates], axis=1)
@@ -334,21 +336,27 @@ def _first_touch(extremal: Extremal, determinants: np.ndarray) -> float | None:
         k = min(int(np.searchsorted(extremal.times, time, side="right")) - 1, len(frames) - 1)
         return advance(k, frames[k], time)
 
-    return _touch(extremal.times, determinants, frame)
+    return _touch(extremal.times, determinants, frame, likely=True)
 
 
-def _dips(determinants: np.ndarray) -> np.ndarray:
-    """Where |determinant| has a minimum well below what it was before, at inner points."""
+def _dips(times: np.ndarray, determinants: np.ndarray, likely: bool) -> list[int]:
+    """Inner points at which |determinant| has a low minimum; the `likely` ones by the parabola through three points."""
     size = np.abs(determinants)
-    lowest = np.zeros(len(size), dtype=bool)
     before = np.maximum.accumulate(size)[1:-1]
-    lowest[1:-1] = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < DIP * before)
-    return lowest
+    lowest = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < DIP * before)
+    found = []
+    for i in np.flatnonzero(lowest) + 1:
+        a, b, c = np.polyfit(times[i - 1 : i + 2] - times[i], size[i - 1 : i + 2], 2)
+        if not likely or a <= 0.0 or c - b * b / (4.0 * a) < DEEPER * size[i]:
+            found.append(int(i))
+    return found
 
 
-def _touch(times: np.ndarray, determinants: np.ndarray, frame: Callable[[float], np.ndarray]) -> float | None:
+def _touch(
+    times: np.ndarray, determinants: np.ndarray, frame: Callable[[float], np.ndarray], likely: bool
+) -> float | None:
     """First time (in the order of `times`) near a dip at which the frame's upper block loses rank."""
-    for i in np.flatnonzero(_dips(determinants)):
+    for i in _dips(times, determinants, likely):
         low, high = sorted((float(times[i - 1]), float(times[i + 1])))
         found = minimize_scalar(
             lambda t: np.linalg.svd(frame(t)[: frame(t).shape[1]], compute_uv=False)[-1],
@@ -402,7 +410,7 @@ def _first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
         _orthonormalise(basis)
         return basis
 
-    touch = _touch(times, np.array(determinants), frame)
+    touch = _touch(times, np.array(determinants), frame, likely=False)
     return max((t for t in (touch, crossing) if t is not None), default=None)
 
 
