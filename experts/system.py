@@ -172,9 +172,8 @@ class CompiledFunction:
     """
 
     def __init__(self, dispatcher: Any, kind: types.FunctionType) -> None:
-        compiled = dispatcher.get_compile_result(kind.signature)
         self._numba_type_ = kind
-        self._address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name)
+        self._address = types.CompileResultWAP(dispatcher.get_compile_result(kind.signature)).address
         self._dispatcher = dispatcher  # keeps the code alive
 
     def __wrapper_address__(self) -> int:

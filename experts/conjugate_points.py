@@ -1,0 +1,183 @@
+"""Conjugate and focal points: where extremals from one start, or to one end condition, meet again (Jacobi's test)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+from numba import float64, njit
+from scipy.optimize import brentq, minimize_scalar
+
+from leapnav.experts.extremal import Extremal
+from leapnav.experts.integrator import matrix, propagate
+
+ROUGH_ACCURACY = 1e-6
+# A determinant that touches zero dips to this share of its size before, and the parabola through the points around goes
+# to this share of the lowest; a singular value that counts as zero.
+DIP, DEEPER, TOUCHED = 0.3, 0.7, 1e-5
+NO_RANK = 1e-9  # a determinant below this has no sign that rounding leaves
+
+
+@njit(float64(matrix), cache=True, error_model="numpy", nogil=True)
+def orthonormalise(S):
+    """Modified Gram-Schmidt on the columns, in place; returns the determinant of the upper square block."""
+    size, n = S.shape
+    for j in range(n):
+        for i in range(j):
+            dot = 0.0
+            for r in range(size):
+                dot += S[r, i] * S[r, j]
+            for r in range(size):
+                S[r, j] -= dot * S[r, i]
+        norm = 0.0
+        for r in range(size):
+            norm += S[r, j] ** 2
+        norm = math.sqrt(norm)
+        for r in range(size):
+            S[r, j] /= norm
+    block = S[:n].copy()
+    determinant = 1.0
+    for k in range(n):
+        pivot = k
+        for i in range(k + 1, n):
+            if abs(block[i, k]) > abs(block[pivot, k]):
+                pivot = i
+        if block[pivot, k] == 0.0:
+            return 0.0
+        if pivot != k:
+            determinant = -determinant
+            for j in range(n):
+                block[k, j], block[pivot, j] = block[pivot, j], block[k, j]
+        determinant *= block[k, k]
+        for i in range(k + 1, n):
+            factor = block[i, k] / block[k, k]
+            for j in range(k, n):
+                block[i, j] -= factor * block[k, j]
+    return determinant
+
+
+def conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float | None:
+    """When det dq(t)/dlambda(0) vanishes within step k, at whose start dz/dlambda(0) spans `sensitivity` (2n, n)."""
+    arrays = extremal.problem.arrays
+
+    def determinant(duration: float) -> float:
+        z = np.concatenate([extremal.states[k], extremal.costates[k]])
+        S = sensitivity.copy()
+        if duration > 0.0:
+            propagate(arrays.flow, z, S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
+        return orthonormalise(S)
+
+    step = float(extremal.times[k + 1] - extremal.times[k])
+    time = float(extremal.times[k]) + _zero(determinant, step)
+    # One at the horizon itself does not contradict a minimum.
+    return time if time < extremal.problem.horizon * (1 - 1e-9) else None
+
+
+def first_touch(extremal: Extremal, determinants: np.ndarray) -> float | None:
+    """First time at which det dq(t)/dlambda(0) vanishes without a change of sign, as it does in symmetric problems."""
+    if not _dips(extremal.times, determinants, likely=True):
+        return None
+    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    z = np.concatenate([extremal.states, extremal.costates], axis=1)
+    S = np.concatenate([np.zeros((n, n)), np.eye(n)])
+    frames = [S.copy()]
+
+    def advance(k: int, S: np.ndarray, time: float) -> np.ndarray:
+        S, duration = S.copy(), time - float(extremal.times[k])
+        if duration > 0.0:
+            propagate(arrays.flow, z[k].copy(), S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
+            orthonormalise(S)
+        return S
+
+    for k in range(len(z) - 1):
+        frames.append(advance(k, frames[k], float(extremal.times[k + 1])))
+
+    def frame(time: float) -> np.ndarray:
+        k = min(int(np.searchsorted(extremal.times, time, side="right")) - 1, len(frames) - 1)
+        return advance(k, frames[k], time)
+
+    return _touch(extremal.times, determinants, frame, likely=True)
+
+
+def _dips(times: np.ndarray, determinants: np.ndarray, likely: bool) -> list[int]:
+    """Inner points at which |determinant| has a low minimum; the `likely` ones by the parabola through three points."""
+    size = np.abs(determinants)
+    before = np.maximum.accumulate(size)[1:-1]
+    lowest = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < DIP * before)
+    found = []
+    for i in np.flatnonzero(lowest) + 1:
+        a, b, c = np.polyfit(times[i - 1 : i + 2] - times[i], size[i - 1 : i + 2], 2)
+        if not likely or a <= 0.0 or c - b * b / (4.0 * a) < DEEPER * size[i]:
+            found.append(int(i))
+    return found
+
+
+def _touch(
+    times: np.ndarray, determinants: np.ndarray, frame: Callable[[float], np.ndarray], likely: bool
+) -> float | None:
+    """First time (in the order of `times`) near a dip at which the frame's upper block loses rank."""
+    for i in _dips(times, determinants, likely):
+        low, high = sorted((float(times[i - 1]), float(times[i + 1])))
+        found = minimize_scalar(
+            lambda t: np.linalg.svd(frame(t)[: frame(t).shape[1]], compute_uv=False)[-1],
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": 1e-9 * (high - low)},
+        )
+        if found.fun < TOUCHED:
+            return float(found.x)
+    return None
+
+
+def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
+    """Last time at which the extremals that meet the end conditions focus, for free final components.
+
+    These extremals are a Lagrangian subspace of (dq, dlambda): at the horizon dq_i = 0 where q_i is fixed and
+    dlambda_i = 0 where it is free. Carried backwards, its projection on dq loses rank at a focal point, and an extremal
+    with one before its horizon is no local minimum.
+    """
+    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    symplectic = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    times = extremal.times[::-1]
+    frames = [np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])]
+
+    def back(k: int, time: float) -> np.ndarray:
+        """The frame at a time up to a step before times[k], orthonormal."""
+        duration = float(times[k]) - time
+        basis = np.ascontiguousarray(frames[k])
+        if duration > 0.0:
+            z, S = extremal.interpolate(np.array([time]))[0], np.eye(2 * n)
+            propagate(arrays.flow, z, S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
+            # The inverse of a symplectic matrix.
+            basis = np.ascontiguousarray(-symplectic @ S.T @ symplectic @ basis)
+        return basis
+
+    determinants = [0.0]
+    sign, crossing = 0.0, None
+    for k in range(len(times) - 1):
+        frames.append(back(k, float(times[k + 1])))
+        determinants.append(orthonormalise(frames[-1]))
+        if abs(determinants[-1]) > NO_RANK:
+            if sign * determinants[-1] < 0:
+                step = float(times[k] - times[k + 1])
+                crossing = float(times[k]) - _zero(lambda d, k=k: orthonormalise(back(k, float(times[k]) - d)), step)
+                break
+            sign = math.copysign(1.0, determinants[-1])
+
+    def frame(time: float) -> np.ndarray:
+        k = max(int(np.searchsorted(-times, -time, side="left")) - 1, 0)
+        basis = back(k, time)
+        orthonormalise(basis)
+        return basis
+
+    touch = _touch(times, np.array(determinants), frame, likely=False)
+    return max((t for t in (touch, crossing) if t is not None), default=None)
+
+
+def _zero(function: Callable[[float], float], step: float) -> float:
+    """Where `function` changes its sign on [0, step]; the start, if it is too small there to have one."""
+    if function(0.0) * function(step) >= 0.0:
+        return 0.0
+    return cast(float, brentq(function, 0.0, step, xtol=1e-12))
