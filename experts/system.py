@@ -173,7 +173,7 @@ class CompiledFunction:
 
     def __init__(self, dispatcher: Any, kind: types.FunctionType) -> None:
         self._numba_type_ = kind
-        self._address = types.CompileResultWAP(dispatcher.get_compile_result(kind.signature)).address
+        self._address = types.CompileResultWAP(dispatcher.get_compile_result(kind.signature)).__wrapper_address__()
         self._dispatcher = dispatcher  # keeps the code alive
 
     def __wrapper_address__(self) -> int:
