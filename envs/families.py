@@ -1,19 +1,22 @@
-"""Random scenarios by family. A family is a function from a generator to obstacles; the rest is common to all."""
+"""Random scenarios by family. A family is a function from a generator to a layout; the rest is common to all."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import ConvexHull
 
 from leapnav.envs.obstacles import clearances, pack_field
-from leapnav.envs.scenario import Circle, Cost, Obstacle, Robot, Scenario
+from leapnav.envs.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario
 
 ARENA = (0.0, 0.0, 10.0, 10.0)
 PACE = 0.8  # m/s along the shortest path: the horizon is this path's length over the pace
+LONGEST_HORIZON = 40.0  # s
 SHORTEST_TASK = 4.0  # m between start and goal
 POSE_CLEARANCE = 0.25  # m around start and goal
 PASSAGE = 0.1  # m on either side of a robot in the narrowest gap that a task may need
@@ -21,29 +24,97 @@ GRID = 0.25  # m, of the search for the shortest path
 DECIMALS = 4  # of every sampled number, so that scenario files stay short
 
 
-def _open(rng: np.random.Generator) -> list[Obstacle]:
+Box = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
+ANYWHERE: Box = (0.5, 0.5, 9.5, 9.5)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A family's draw: the obstacles, and where start and goal may lie."""
+
+    obstacles: list[Obstacle]
+    start: Box = ANYWHERE
+    goal: Box = ANYWHERE
+
+
+def _open(rng: np.random.Generator) -> Layout:
     """Nothing but the walls."""
-    return []
+    return Layout([])
 
 
-def _clutter(rng: np.random.Generator) -> list[Obstacle]:
+def _clutter(rng: np.random.Generator) -> Layout:
     """6 to 12 discs of 0.3 to 1 m, which may overlap."""
-    return [
-        Obstacle(
-            circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=round(float(rng.uniform(0.3, 1.0)), DECIMALS))
-        )
-        for _ in range(rng.integers(6, 13))
-    ]
+    return Layout(
+        [
+            Obstacle(circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=_rounded(rng.uniform(0.3, 1.0))))
+            for _ in range(rng.integers(6, 13))
+        ]
+    )
 
 
-FAMILIES: dict[str, Callable[[np.random.Generator], list[Obstacle]]] = {"open": _open, "clutter": _clutter}
+def _polygons(rng: np.random.Generator) -> Layout:
+    """4 to 8 convex polygons, which may overlap: rotated boxes, and one in four the hull of random points."""
+    return Layout([_hull(rng) if rng.random() < 0.25 else _box(rng) for _ in range(rng.integers(4, 9))])
+
+
+def _box(rng: np.random.Generator) -> Obstacle:
+    half = np.array([rng.uniform(0.2, 0.8), rng.uniform(0.2, 1.2)])
+    angle = rng.uniform(-math.pi, math.pi)
+    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return _polygon(rng.uniform(1.0, 9.0, 2) + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ turn)
+
+
+def _hull(rng: np.random.Generator) -> Obstacle:
+    centre, reach = rng.uniform(1.0, 9.0, 2), rng.uniform(0.5, 1.0)
+    # One point in each sector, so that the hull is never a sliver.
+    angles = (np.arange(6) + rng.uniform(0.0, 1.0, 6)) * math.pi / 3
+    points = centre + reach * rng.uniform(0.5, 1.0, (6, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    points = points.round(DECIMALS)
+    return _polygon(points[ConvexHull(points).vertices])
+
+
+def _rooms(rng: np.random.Generator) -> Layout:
+    """Four rooms with a door (1.0 to 1.6 m, all the same) in each wall between two; in three of four one is shut."""
+    width = rng.uniform(1.0, 1.6)
+    shut = rng.integers(4) if rng.random() < 0.75 else None
+    walls = []
+    for number, (along, begin) in enumerate(((1, 0.0), (1, 5.0), (0, 0.0), (0, 5.0))):
+        door = rng.uniform(begin + 0.5, begin + 4.5 - width)
+        ends = [(begin, begin + 5.0)] if number == shut else [(begin, door), (door + width, begin + 5.0)]
+        for low, high in ends:
+            corners = (4.9, low, 5.1, high) if along == 1 else (low, 4.9, high, 5.1)
+            walls.append(_rectangle(*corners))
+    return Layout(walls)
+
+
+def _slalom(rng: np.random.Generator) -> Layout:
+    """2 to 4 walls from above and below in turn, with gaps of 1.4 to 3.5 m at their ends, between start and goal."""
+    count = int(rng.integers(2, 5))
+    above = bool(rng.integers(2))
+    walls = []
+    for number in range(count):
+        left = 10.0 * (number + 1) / (count + 1) - 0.15 + rng.uniform(-0.4, 0.4)
+        length = 10.0 - rng.uniform(1.4, 3.5)
+        low, high = (10.0 - length, 10.0) if above else (0.0, length)
+        walls.append(_rectangle(left, low, left + 0.3, high))
+        above = not above
+    return Layout(walls, start=(0.6, 1.0, 1.2, 9.0), goal=(8.8, 1.0, 9.4, 9.0))
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], Layout]] = {
+    "open": _open,
+    "clutter": _clutter,
+    "polygons": _polygons,
+    "rooms": _rooms,
+    "slalom": _slalom,
+}
 
 
 def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     """A random scenario; the same family and seed give the same one.
 
     Start and goal are at least 4 m apart, joined by a path that leaves the robot 0.1 m on either side, and the horizon
-    lets the robot follow the shortest such path at 0.8 m/s.
+    lets the robot follow the shortest such path at 0.8 m/s, but is 40 s at most.
 
     Args:
         family: one of `FAMILIES`.
@@ -58,32 +129,49 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
     name = family if isinstance(seed, np.random.Generator) else f"{family}-{seed}"
     robot, cost = Robot(), Cost()
-    while True:  # a third of the draws has no path; each draw is independent, so this ends
-        obstacles = FAMILIES[family](rng)
+    while True:  # some of the draws have no path; each draw is independent, so this ends
+        layout = FAMILIES[family](rng)
+        areas = np.array([layout.start, layout.goal])
         field = pack_field(
-            [obstacle.shape for obstacle in obstacles], ARENA, robot.radius, cost.proximity_weight, cost.proximity_scale
+            [obstacle.shape for obstacle in layout.obstacles],
+            ARENA,
+            robot.radius,
+            cost.proximity_weight,
+            cost.proximity_scale,
         )
-        poses = np.column_stack([rng.uniform(0.5, 9.5, (2, 2)), rng.uniform(-math.pi, math.pi, 2)])
+        poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
         if math.dist(poses[0, :2], poses[1, :2]) < SHORTEST_TASK or clearances(poses, field).min() < POSE_CLEARANCE:
             continue
         length = _shortest_path(field, poses[0, :2], poses[1, :2])
         if length is not None:
             break
-    start, goal = ((*_point(pose), round(float(pose[2]), DECIMALS)) for pose in poses)
+    start, goal = ((*_point(pose), _rounded(pose[2])) for pose in poses)
     return Scenario(
         name=name,
         arena=ARENA,
         robot=robot,
         start=start,
         goal=goal,
-        horizon=round(length / PACE, 1),
-        obstacles=tuple(obstacles),
+        horizon=round(min(length / PACE, LONGEST_HORIZON), 1),
+        obstacles=tuple(layout.obstacles),
         cost=cost,
     )
 
 
+def _rounded(value: float) -> float:
+    return round(float(value), DECIMALS)
+
+
+def _rectangle(x_min: float, y_min: float, x_max: float, y_max: float) -> Obstacle:
+    return _polygon(np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]))
+
+
+def _polygon(vertices: np.ndarray) -> Obstacle:
+    return Obstacle(polygon=Polygon(vertices=tuple(_point(vertex) for vertex in vertices)))
+
+
 def _point(values: np.ndarray) -> tuple[float, float]:
-    return round(float(values[0]), DECIMALS), round(float(values[1]), DECIMALS)
+    return _rounded(values[0]), _rounded(values[1])
 
 
 def _grid_edges() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
