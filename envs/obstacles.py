@@ -94,6 +94,17 @@ def _unpack(packed: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     return circles, polygons
 
 
+def obstacle_centres(packed: np.ndarray) -> np.ndarray:
+    """Middle of each obstacle (number, 2), a polygon's the mean of its vertices, in the scenario's order."""
+    circles, polygons = _unpack(packed)
+    centres = [*circles[:, :2], *(polygon[:, 3:].mean(axis=0) for polygon in polygons)]
+    numbers = packed[int(packed[GRID]) - len(centres) : int(packed[GRID])].astype(int)
+    ordered = np.empty((len(centres), 2))
+    for number, centre in zip(numbers, centres, strict=True):
+        ordered[number] = centre
+    return ordered
+
+
 def _pack_grid(packed: np.ndarray) -> np.ndarray:
     """The grid of a field; obstacles are felt up to CUTOFF scales from the robot's rim."""
     reach = packed[2] + CUTOFF * packed[1]
@@ -226,7 +237,10 @@ def proximity(x, y, field):
                     row = rows + 5 * j
                     nx, ny = field[row], field[row + 1]
                     # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
-                    share = math.exp((nx * x + ny * y - field[row + 2] - farthest) * steepness)
+                    exponent = (nx * x + ny * y - field[row + 2] - farthest) * steepness
+                    if exponent < -CUTOFF:
+                        continue
+                    share = math.exp(exponent)
                     total += share
                     mx += share * nx
                     my += share * ny
@@ -283,6 +297,73 @@ def clearances(points, field):
     for i in range(len(points)):
         result[i] = clearance(points[i, 0], points[i, 1], field)[0]
     return result
+
+
+@njit(
+    types.UniTuple(float64[:, ::1], 2)(_field, float64, float64, float64, int64, int64, float64),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def sample_grid(field, x0, y0, spacing, columns, lines, band):
+    """Phi and clearance (m), both (columns, lines), at the points (x0 + i spacing, y0 + j spacing).
+
+    Obstacles farther than `band` (m) are not felt, and clearance is `band` at most, so that every obstacle is looked at
+    near its own place only.
+    """
+    weight, steepness, radius = field[0], 1.0 / field[1], field[2]
+    phi = np.zeros((columns, lines))
+    closest = np.full((columns, lines), band)
+    for i in range(columns):
+        for j in range(lines):
+            x, y = x0 + i * spacing, y0 + j * spacing
+            for side in range(4):
+                sign = 1.0 if side < 2 else -1.0
+                distance = sign * ((x if side % 2 == 0 else y) - field[ARENA + side]) - radius
+                if distance < band:
+                    phi[i, j] += weight * math.exp(-distance * steepness)
+                    closest[i, j] = min(closest[i, j], distance)
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    at = SHAPES
+    for number in range(circles + polygons):
+        edges = 0 if number < circles else int(field[at])
+        rows = at + 1
+        if edges == 0:
+            low_x, high_x = field[at] - field[at + 2], field[at] + field[at + 2]
+            low_y, high_y = field[at + 1] - field[at + 2], field[at + 1] + field[at + 2]
+        else:
+            low_x = low_y = np.inf
+            high_x = high_y = -np.inf
+            for k in range(edges):
+                low_x, high_x = min(low_x, field[rows + 5 * k + 3]), max(high_x, field[rows + 5 * k + 3])
+                low_y, high_y = min(low_y, field[rows + 5 * k + 4]), max(high_y, field[rows + 5 * k + 4])
+        reach = band + radius
+        first = max(int((low_x - reach - x0) / spacing), 0)
+        last = min(int((high_x + reach - x0) / spacing) + 2, columns)
+        bottom = max(int((low_y - reach - y0) / spacing), 0)
+        top = min(int((high_y + reach - y0) / spacing) + 2, lines)
+        for i in range(first, last):
+            for j in range(bottom, top):
+                x, y = x0 + i * spacing, y0 + j * spacing
+                if edges == 0:
+                    gap = math.hypot(x - field[at], y - field[at + 1]) - field[at + 2] - radius
+                    if gap < band:
+                        phi[i, j] += weight * math.exp(-gap * steepness)
+                        closest[i, j] = min(closest[i, j], gap)
+                    continue
+                farthest = -np.inf
+                for k in range(edges):
+                    row = rows + 5 * k
+                    farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+                if farthest - radius < band:
+                    total = 0.0
+                    for k in range(edges):
+                        row = rows + 5 * k
+                        total += math.exp((field[row] * x + field[row + 1] * y - field[row + 2] - farthest) * steepness)
+                    phi[i, j] += weight * math.exp((radius - farthest) * steepness) / total
+                    closest[i, j] = min(closest[i, j], _polygon_distance(x, y, field, rows, edges) - radius)
+        at += 3 if edges == 0 else 1 + 5 * edges
+    return phi, closest
 
 
 @njit(float64(float64, float64, float64, float64, float64, _field), cache=True, error_model="numpy", nogil=True)
