@@ -1,18 +1,22 @@
 """Gymnasium environments of a two-wheeled robot among obstacles, and the scenarios that they play."""
 
+from leapnav.envs.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario, ScenarioError
 
 __all__ = [
     "FAMILIES",
+    "BankError",
     "Circle",
     "Cost",
     "NavigateEnv",
     "Obstacle",
     "Polygon",
+    "Reference",
     "Robot",
     "Scenario",
+    "ScenarioBank",
     "ScenarioError",
     "sample_scenario",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numba import float64, njit, types
 
+from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.envs.obstacles import clearance, proximity, sinc
 from leapnav.envs.physics import World
@@ -65,8 +67,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Starting state
     The scenario's start. The scenario is `options["scenario"]` (a `Scenario`, a dict in the layout of its file, or its
-    JSON text), else the argument `scenario`, else a fresh one of the argument `family` drawn from the environment's
-    own generator.
+    JSON text), else the argument `scenario`, else, with a bank, number `options["index"]` of it or one drawn by the
+    environment's own generator, else a fresh one of the argument `family` drawn by that generator.
 
     ## Episode end
     `terminated` at the horizon, which is part of the task (the time left is observed), or when something is touched
@@ -76,11 +78,14 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Info
     `cost` (J so far), `clearance` (m, smallest during the step), `collision`, `is_success`, `time` (s), `pose`
-    (x, y, unwrapped heading) and `reward_parts`; after a reset also `scenario`.
+    (x, y, unwrapped heading) and `reward_parts`; after a reset also `scenario`, and with a bank `index` and
+    `reference_cost`, the cost of its optimum.
 
     ## Arguments
     * `family`: family of random scenarios, see `leapnav.envs.FAMILIES`.
     * `scenario`: the one scenario of all episodes, instead of a family.
+    * `split`: `"train"` or `"test"`: scenarios of the family's bank that ships with leapnav, with known optima.
+    * `bank`: scenarios of this bank (a `ScenarioBank` or its file) instead of a family.
     * `control_period` (s): how long an action is held. The last period of an episode ends at the horizon.
     * `position_tolerance` (m), `heading_tolerance` (rad): of success.
     * `collision_penalty`, `miss_penalty`: should be larger than the optimum's cost, or standing still pays; 50 is, for
@@ -101,6 +106,8 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         family: str = "clutter",
         scenario: Scenario | Mapping[str, Any] | str | None = None,
         *,
+        split: str | None = None,
+        bank: ScenarioBank | str | os.PathLike[str] | None = None,
         control_period: float = 0.05,
         position_tolerance: float = 0.1,
         heading_tolerance: float = 0.1,
@@ -130,8 +137,16 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"lidar_beams: expected an integer >= 0, got {lidar_beams!r}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}")
+        given = [
+            name for name, value in (("scenario", scenario), ("split", split), ("bank", bank)) if value is not None
+        ]
+        if len(given) > 1:
+            raise ValueError(f"{given[1]}: cannot be combined with {given[0]}")
+        if split is not None:
+            bank = ScenarioBank.shipped(family, split)
         self.family = family
         self.fixed_scenario = None if scenario is None else _as_scenario(scenario)
+        self.bank = bank if bank is None or isinstance(bank, ScenarioBank) else ScenarioBank(bank)
         self.control_period = float(control_period)
         self.position_tolerance = float(position_tolerance)
         self.heading_tolerance = float(heading_tolerance)
@@ -159,23 +174,38 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; `options={"scenario": ...}` chooses its scenario.
+        """Starts an episode; `options={"scenario": ...}`, or with a bank `{"index": ...}`, chooses its scenario.
 
         Raises:
             ScenarioError: the scenario is not a valid one.
-            ValueError: an unknown option.
+            IndexError: the bank has fewer scenarios.
+            ValueError: an unknown or impossible option.
 
         """
         super().reset(seed=seed)
-        unknown = set(options or {}) - {"scenario"}
-        if unknown:
-            raise ValueError(f"options: expected 'scenario', got {sorted(unknown)[0]!r}")
-        chosen = (options or {}).get("scenario")
-        chosen = self.fixed_scenario if chosen is None else chosen
-        self.scenario = sample_scenario(self.family, self.np_random) if chosen is None else _as_scenario(chosen)
+        extra = self._choose_scenario(options or {})
         self._begin()
         info = self._info(clearance(self.pose[0], self.pose[1], self.scenario.field)[0], False, dict(_NO_REWARD))
-        return self._observation(), {**info, "scenario": self.scenario}
+        return self._observation(), {**info, "scenario": self.scenario, **extra}
+
+    def _choose_scenario(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Sets the episode's scenario; returns what `info` says of it if it comes from a bank."""
+        unknown = set(options) - {"scenario", "index"}
+        if unknown:
+            raise ValueError(f"options: expected 'scenario' or 'index', got {sorted(unknown)[0]!r}")
+        chosen, index = options.get("scenario"), options.get("index")
+        if index is not None and (chosen is not None or self.bank is None):
+            raise ValueError(f"options: 'index' needs a bank and no 'scenario', got {index!r}")
+        if chosen is None and self.bank is not None:
+            if index is None:
+                index = int(self.np_random.integers(len(self.bank)))
+            elif not isinstance(index, (int, np.integer)):
+                raise ValueError(f"options: index: expected an integer, got {index!r}")
+            self.scenario = self.bank[int(index)]
+            return {"index": int(index), "reference_cost": float(self.bank.costs[index])}
+        chosen = self.fixed_scenario if chosen is None else chosen
+        self.scenario = sample_scenario(self.family, self.np_random) if chosen is None else _as_scenario(chosen)
+        return {}
 
     def _begin(self) -> None:
         scenario = self.scenario

@@ -1,9 +1,10 @@
 """Optimal control by the minimum principle: solvers, the search for the optimum, and the expert that drives it."""
 
+from leapnav.experts.banks import build_bank
 from leapnav.experts.certificate import certify, verify
 from leapnav.experts.continuation import continuation
 from leapnav.experts.extremal import Certificate, Extremal, Iteration, SolveError, Status
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.problem import OptimalControlProblem, Path
 from leapnav.experts.solve import solve
@@ -17,9 +18,11 @@ __all__ = [
     "Iteration",
     "NoOptimumError",
     "OptimalControlProblem",
+    "Optimum",
     "Path",
     "SolveError",
     "Status",
+    "build_bank",
     "certify",
     "continuation",
     "differential_drive",

@@ -165,8 +165,8 @@ def _merit(h, q, u, multipliers, end_multipliers, goal, free, turn_weight, unit,
 def _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps, W):
     """Second-order expansion about a path.
 
-    `near` (N + 1, 5): gradient and Hessian of the weighted proximity cost; `A` (N, 2, 1) and `B` (N, 2, 2): what x and y
-    gain by heading and by controls; `gaps` (N, 3): violations; `W` (N, 3, 3): curvature of costates times dynamics in
+    `near` (N + 1, 5): gradient and Hessian of the weighted proximity cost; `A` (N, 2, 1) and `B` (N, 2, 2): what x and
+    y gain by heading and by controls; `gaps` (N, 3): violations; `W` (N, 3, 3): curvature of costates times dynamics in
     (theta, v, omega).
     """
     intervals = len(h)

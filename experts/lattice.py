@@ -4,8 +4,8 @@ On an extremal of the driftless robot H = -E is constant, so |u|_R = sqrt(2 (E +
 path for ds = sqrt(2 (E + Phi)) sqrt(r_v ds_xy^2 + r_w dtheta^2) (Maupertuis' principle); E follows from the horizon,
 T = integral of ds / (2 (E + Phi)). The search therefore knows about reversing, cusps, windings of the heading and the
 allocation of time together. Shortest paths in the plane, for which turning is free, bound those on the lattice from
-below and so direct one tree from the goal, whose costs then direct one from the start. Where the trees share an edge the
-path through it is locally shortest; the cheapest such paths that are distinct are the candidates.
+below and so direct one tree from the goal, whose costs then direct one from the start. Where the trees share an edge,
+the path through it is locally shortest; the cheapest such paths that are distinct are the candidates.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,8 @@ TOLERATED_DEPTH = 0.4
 FELT = 12.0  # proximity scales; farther obstacles change the order of paths by less than a millionth
 TURNING = 1.2  # how much longer a path is than the shortest one in the plane, at first; corrected if far off
 LARGEST_CORRECTION = 0.5  # of log E: the order of candidates hardly depends on it
+LEAST_ENERGY = 1e-4
+LATTICE_ERROR = 1.07
 SEED_ANGLE = math.radians(30)
 Pose = tuple[float, float, float | None]
 
@@ -50,6 +53,13 @@ class Candidate:
     times: np.ndarray
     poses: np.ndarray
     cost: float
+
+
+class Tree(NamedTuple):
+    """Cost of each node from the root, and its predecessor (-1: none)."""
+
+    cost: np.ndarray
+    parent: np.ndarray
 
 
 class Lattice:
@@ -102,55 +112,66 @@ class Lattice:
         if self.energy == 0.0:
             return
         ahead, behind, limit = self._trees(start, goal)
-        best = meeting_nodes(ahead[1], behind[1], ahead[0], behind[0], limit)[:1]
-        if len(best) == 0:
+        nodes = meeting_nodes(ahead.parent, behind.parent, ahead.cost, behind.cost, limit)
+        if len(nodes) == 0:
             return
-        lengths, phi = self._pieces(self._poses(path_through(best[0], ahead[1], behind[1])))
+        lengths, phi = self._pieces(self._poses(path_through(nodes[0], ahead.parent, behind.parent)))
         energy = energy_of(lengths, phi, self.scenario.horizon)
         if abs(math.log(energy / self.energy)) > LARGEST_CORRECTION:
             self.energy = energy
             ahead, behind, limit = self._trees(start, goal)
+            nodes = meeting_nodes(ahead.parent, behind.parent, ahead.cost, behind.cost, limit)
         taken = np.zeros(self.columns * self.lines * HEADINGS, dtype=bool)
-        for node in meeting_nodes(ahead[1], behind[1], ahead[0], behind[0], limit):
+        for node in nodes:
             if not taken[node]:
-                path = path_through(node, ahead[1], behind[1])
+                path = path_through(node, ahead.parent, behind.parent)
                 mark(taken, path, self.lines, self.SAME_CELLS, self.SAME_HEADINGS)
-                yield self._candidate(path, float(ahead[0][node] + behind[0][node]))
+                yield self._candidate(path, float(ahead.cost[node] + behind.cost[node]))
+
+    def explains(self, cost: float, first: float, last: float) -> bool:
+        """Whether no path but those from the `first` to the `last` candidate's cost can be expected to beat J = `cost`.
+
+        For any E, a path of length D in the metric has J >= D - E T, with equality for an extremal of that E. Lattice
+        paths are a little longer than the extremals near them, by LATTICE_ERROR at most in hundreds of scenarios, and
+        rarely shorter; so either the first candidate is near the best path, or the last one must be too long.
+        """
+        length = cost + self.energy * self.scenario.horizon
+        return first >= length / LATTICE_ERROR or last >= length * LATTICE_ERROR
 
     def _first_energy(self) -> float:
         """E of a path somewhat longer than the shortest one in the plane; 0 if there is none."""
         weight, horizon = self.scenario.cost.speed_weight, self.scenario.horizon
-        distance = math.dist(self.scenario.start[:2], self.scenario.goal[:2])
-        # Any E finds a short path, whose length then gives a better one.
-        energy = max(0.5 * weight * (distance / horizon) ** 2, 1e-4)
-        speed = np.sqrt(2.0 * (energy + self.phi))
-        seeds = np.unique(self._seeds(*self.scenario.start, speed)[0] // HEADINGS)
-        targets = np.unique(self._seeds(*self.scenario.goal, speed)[0] // HEADINGS)
-        if len(seeds) == 0 or len(targets) == 0:
-            return 0.0
-        cost = plane_costs(speed, seeds, np.zeros(len(seeds)), self.cell, weight)[targets].min()
-        if not np.isfinite(cost):
-            return 0.0
-        length = TURNING * float(cost) / math.sqrt(2.0 * energy)
-        return max(0.5 * (length / horizon) ** 2, 1e-4)
+        start, goal = self.scenario.start, self.scenario.goal
+        energy = max(0.5 * weight * (math.dist(start[:2], goal[:2]) / horizon) ** 2, LEAST_ENERGY)
+        for _ in range(3):
+            speed = np.sqrt(2.0 * (energy + self.phi))
+            cost = self._plane_costs(self._seeds(*start, speed)[0], speed)
+            targets = self._seeds(*goal, speed)[0] // HEADINGS
+            shortest = float(cost[targets].min()) if len(targets) else math.inf
+            if not math.isfinite(shortest):
+                return 0.0
+            # As if Phi were small, which it is compared with an E that is no longer the straight line's.
+            length = TURNING * shortest / math.sqrt(2.0 * energy)
+            before, energy = energy, max(0.5 * (length / horizon) ** 2, LEAST_ENERGY)
+            if abs(math.log(energy / before)) < LARGEST_CORRECTION:
+                break
+        return energy
 
-    def _trees(
-        self, start: Pose, goal: Pose
-    ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], float]:
-        """Costs and predecessors of the nodes from the start and from the goal, and the cost of the dearest path."""
+    def _plane_costs(self, seeds: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Costs of the cells from those of the seeds if turning were free."""
+        cells = np.unique(seeds // HEADINGS)
+        return plane_costs(speed, cells, np.zeros(len(cells)), self.cell, self.scenario.cost.speed_weight)
+
+    def _trees(self, start: Pose, goal: Pose) -> tuple[Tree, Tree, float]:
+        """The trees from the start and from the goal, and the cost of the dearest path."""
         weights = self.scenario.cost.speed_weight, self.scenario.cost.turn_weight
         speed = np.sqrt(2.0 * (self.energy + self.phi))
-        seeds, seed_costs = self._seeds(*start, speed)
-        ends, end_costs = self._seeds(*goal, speed)
-        bound = plane_costs(speed, np.unique(seeds // HEADINGS), np.zeros(len(np.unique(seeds // HEADINGS))), self.cell, weights[0])
-        arguments = (self.cell, *weights, self.reach, self.slack)
-        cost_behind, behind, limit = tree(
-            speed, ends, end_costs, seeds, seed_costs, bound, False, *arguments, np.inf
-        )
-        cost_ahead, ahead, _ = tree(
-            speed, seeds, seed_costs, ends, end_costs, cost_behind, True, *arguments, limit
-        )
-        return (cost_ahead, ahead), (cost_behind, behind), limit
+        seeds, ends = self._seeds(*start, speed), self._seeds(*goal, speed)
+        bound = self._plane_costs(seeds[0], speed)
+        parameters = self.cell, *weights, self.reach, self.slack
+        cost_behind, behind, limit = tree(speed, *ends, *seeds, bound, False, *parameters, np.inf)
+        cost_ahead, ahead, _ = tree(speed, *seeds, *ends, cost_behind, True, *parameters, limit)
+        return Tree(cost_ahead, ahead), Tree(cost_behind, behind), limit
 
     def _seeds(self, x: float, y: float, heading: float | None, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes around a pose and the cost to reach them from it."""

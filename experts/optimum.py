@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
@@ -21,21 +22,22 @@ from leapnav.experts.problem import OptimalControlProblem, Path
 
 TOLERANCE = 1e-9
 NEWTON_ITERATIONS = 40
-# Intervals of the direct path per segment of multiple shooting, and how often the intervals are halved: once always,
-# more often as long as Newton's method does not converge from there.
+# Intervals of the refined direct path per segment of multiple shooting, and from how many refinements it is tried.
 INTERVALS_PER_SEGMENT, FEWEST_SEGMENTS = 8, 8
-REFINEMENTS = 4
-MOST_ROUNDS = 3
-# Refinement and margin (m) of one lattice after the other, as long as nothing is certified: all candidates may lead
-# through a gap in which the optimum grazes, which a margin shuts, and a gap or a short way may need smaller cells.
+REFINEMENTS = 3
+MOST_ROUNDS = 4
+# Refinement and margin (m) of one lattice after the other, as long as nothing is certified or a better path may have
+# been missed: all candidates may lead through a gap that is too narrow or in which the optimum grazes, which a margin
+# shuts, and a gap or a short way may need smaller cells.
 LATTICES = ((1, None), (1, 0.05), (2, None), (2, 0.05))
 # Two paths this near at all times (metres, and as much in radians) lead to the same extremal; two extremals are the
 # same if their costs agree as well.
 SAME_PATH, SAME_COST = 0.15, 1e-6
 # The cost of a direct path is off by less than this share, so what is dearer by more needs no look.
 DIRECT_ERROR = 0.01
-# How deep (m) an extremal may cut into an obstacle for a path along it that just touches to be thinkable.
+# How deep (m) an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
 SLIGHT = 0.1
+CLOSED = 1e-3  # sum of the violations of a direct path's constraints
 COMPARED = np.linspace(0.0, 1.0, 65)
 
 
@@ -45,13 +47,14 @@ class Optimum(Extremal):
 
     Attributes:
         alternatives: the other distinct local optima found, certified, in order of cost (theirs are empty).
-        touching: extremals found that are cheaper than this one, but cut into an obstacle by up to 0.1 m. If there are
-            any, a path may exist that just touches and is cheaper than this optimum, which then is no safe reference.
+        doubts: solutions found that are cheaper than this one but not certified: their status is COLLISION for those
+            that cut into an obstacle by up to 0.1 m (a path that just touches may then be cheaper than this optimum),
+            or says why there is no certificate. Without any the optimum is a safe reference, as far as is known.
 
     """
 
     alternatives: tuple[Optimum, ...] = ()
-    touching: tuple[Extremal, ...] = ()
+    doubts: tuple[Extremal, ...] = ()
 
     @property
     def path_class(self) -> tuple[Side, ...]:
@@ -64,6 +67,22 @@ class Optimum(Extremal):
     def driving_modes(self) -> tuple[Mode, ...]:
         """Forwards and backwards, in turn."""
         return driving_modes(self.times, self.controls[:, 0])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain dictionaries, lists and numbers, with the alternatives and their path classes."""
+        described = {}
+        if len(self.times):
+            described = {
+                "path_class": list(self.path_class),
+                "driving_modes": list(self.driving_modes),
+                "heading_winding": self.heading_winding,
+            }
+        return {
+            **super().to_dict(),
+            **described,
+            "alternatives": [alternative.to_dict() for alternative in self.alternatives],
+            "doubts": [doubt.to_dict() for doubt in self.doubts],
+        }
 
     @property
     def heading_winding(self) -> int:
@@ -97,15 +116,20 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
     search = Search(scenario, problem)
     shortest_time = np.inf
     for refinement, margin in LATTICES:
-        paths = Lattice(scenario, refinement, margin).candidates()
+        lattice = Lattice(scenario, refinement, margin)
+        paths = lattice.candidates()
+        first = None
         for _ in range(MOST_ROUNDS):
-            batch = [Path(c.times, c.poses) for c in islice(paths, candidates)]
+            batch = list(islice(paths, candidates))
             if not batch:
                 break
-            shortest_time = min(shortest_time, *(_shortest_time(path, scenario) for path in batch))
-            search.add(batch)
-            if search.certified:
+            first = first or batch[0]
+            shortest_time = min(shortest_time, *(_shortest_time(c.poses, scenario) for c in batch))
+            search.add(Path(c.times, c.poses) for c in batch)
+            if search.certified and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
                 return search.result()
+    if search.certified:
+        return search.result()
     if shortest_time == np.inf:
         return as_optimum(failure(problem, Status.NO_PATH))
     if shortest_time > scenario.horizon:
@@ -121,7 +145,12 @@ class Search:
         self.certified: list[Extremal] = []
         self.refused: list[Extremal] = []
         self._seen: list[np.ndarray] = []
-        self._stalled: list[Extremal] = []
+        self._stalled: list[tuple[float, Extremal]] = []
+
+    @property
+    def best(self) -> Extremal:
+        """The cheapest certified extremal."""
+        return min(self.certified, key=lambda extremal: extremal.cost)
 
     def add(self, paths: Iterable[Path]) -> None:
         """Takes paths to local optima, the cheapest first."""
@@ -134,15 +163,18 @@ class Search:
 
     def add_direct(self, problem: OptimalControlProblem, direct: DirectPath) -> None:
         """Takes a solution of the discretised problem to an extremal, unless that is known or of no interest."""
-        shape = _shape(direct.times, direct.states)
-        if any(np.abs(shape - other).max() < SAME_PATH for other in self._seen):
+        best = self.best.cost if self.certified else np.inf
+        if self._known(direct):
             return
-        best = min((extremal.cost for extremal in self.certified), default=np.inf)
-        collides = clearances(direct.states, self.scenario.field).min() <= 0
-        if collides and direct.cost > (1 + DIRECT_ERROR) * best:
+        if direct.cost > (1 + DIRECT_ERROR) * best and clearances(direct.states, self.scenario.field).min() <= 0:
             return
-        self._seen.append(shape)
-        extremal = _extremal(problem, direct)
+        # Where the cost is flat, paths to the same optimum are told from others by their refinement only.
+        refined = optimise(problem, direct.refined())
+        known = self._known(refined)
+        self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
+        if known:
+            return
+        extremal = _extremal(problem, refined)
         if any(_same(extremal, other) for other in (*self.certified, *self.refused)):
             return
         if extremal.success:
@@ -150,22 +182,22 @@ class Search:
         elif extremal.status in (Status.COLLISION, Status.CONJUGATE_POINT, Status.NOT_CERTIFIED):
             self.refused.append(extremal)
         else:
-            self._stalled.append(extremal)
+            # Whatever path these nodes make, the discretised problem knows better what one near them costs.
+            self._stalled.append((refined.cost if refined.gap < CLOSED else np.inf, extremal))
+
+    def _known(self, direct: DirectPath) -> bool:
+        shape = _shape(direct.times, direct.states)
+        return any(np.abs(shape - other).max() < SAME_PATH for other in self._seen)
 
     def result(self) -> Optimum:
-        """The best extremal with the others, or, if none is certified, the cheapest that was refused or that stalled."""
+        """The best extremal with the others, or, if none is certified, the cheapest that was refused or stalled."""
         if not self.certified:
-            return as_optimum(min(self.refused or self._stalled, key=lambda extremal: extremal.cost))
+            found = self.refused or [extremal for _, extremal in self._stalled]
+            return as_optimum(min(found, key=lambda extremal: extremal.cost))
         best, *others = sorted(self.certified, key=lambda extremal: extremal.cost)
-        touching = [
-            extremal
-            for extremal in self.refused
-            if extremal.cost < best.cost
-            and extremal.certificate is not None
-            and extremal.certificate.clearance is not None
-            and -SLIGHT <= extremal.certificate.clearance <= 0
-        ]
-        return replace(as_optimum(best), alternatives=tuple(map(as_optimum, others)), touching=tuple(touching))
+        doubts = [extremal for extremal in self.refused if extremal.cost < best.cost and _may_be_beaten(extremal)]
+        doubts += [extremal for cost, extremal in self._stalled if cost < best.cost * (1 - SAME_COST)]
+        return replace(as_optimum(best), alternatives=tuple(map(as_optimum, others)), doubts=tuple(doubts))
 
 
 def as_optimum(extremal: Extremal) -> Optimum:
@@ -174,23 +206,30 @@ def as_optimum(extremal: Extremal) -> Optimum:
 
 
 def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
-    """Multiple shooting from a direct path, refined as often as it needs."""
+    """Multiple shooting from a direct path, which is refined further as long as that fails."""
     history, work = (), 0
     settings = Settings(TOLERANCE, NEWTON_ITERATIONS)
-    for refinement in range(1, REFINEMENTS + 1):
-        direct = optimise(problem, direct.refined())
+    for refinement in range(REFINEMENTS):
+        if refinement > 0:
+            direct = optimise(problem, direct.refined())
         intervals = len(direct.controls)
-        segments = max(round(intervals / (INTERVALS_PER_SEGMENT * 2 ** (refinement - 1))), FEWEST_SEGMENTS)
-        at = np.rint(np.linspace(0, intervals, segments * 2 ** (refinement - 1) + 1)).astype(int)
+        segments = max(round(intervals / (INTERVALS_PER_SEGMENT * 2**refinement)), FEWEST_SEGMENTS) * 2**refinement
+        at = np.rint(np.linspace(0, intervals, segments + 1)).astype(int)
         times, nodes = direct.times[at], np.concatenate([direct.states[at], direct.costates[at]], axis=1)
         arrays = problem.arrays
         nodes[-1, :3] = np.where(arrays.free, nodes[-1, :3], arrays.goal)
         status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, NEWTON_ITERATIONS)
         history += rows
         work += evaluations
-        if status is Status.SUCCESS or refinement == REFINEMENTS:
+        if status is Status.SUCCESS:
             break
     return confirm(problem, times, nodes, status, history, work, settings)
+
+
+def _may_be_beaten(extremal: Extremal) -> bool:
+    """Whether a collision-free path that is about as cheap is thinkable: not where an extremal cuts deep."""
+    clearance = extremal.certificate.clearance if extremal.certificate is not None else None
+    return clearance is None or clearance >= -SLIGHT
 
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -206,8 +245,8 @@ def _same(extremal: Extremal, other: Extremal) -> bool:
     return bool(np.abs(np.subtract(*shapes)).max() < SAME_PATH)
 
 
-def _shortest_time(path: Path, scenario: Scenario) -> float:
+def _shortest_time(poses: np.ndarray, scenario: Scenario) -> float:
     """How long (s) a path takes at the robot's limits."""
-    step = np.abs(np.diff(path.states, axis=0))
+    step = np.abs(np.diff(poses, axis=0))
     driving = np.hypot(step[:, 0], step[:, 1]) / scenario.robot.max_speed
     return float(np.maximum(driving, step[:, 2] / scenario.robot.max_turn_rate).sum())

@@ -19,9 +19,9 @@ SHORTEST_STRETCH = 0.02
 def path_sides(positions: np.ndarray, field: np.ndarray) -> tuple[Side, ...]:
     """On which side of the path each obstacle lies, in the scenario's order.
 
-    The angle that the path sweeps as seen from the obstacle's middle is positive if the obstacle lies to its left. Between
-    the same ends it differs by multiples of 2 pi from path to path, so paths with the same sides can be pulled into
-    each other, short of loops around an obstacle.
+    The angle that the path sweeps as seen from the obstacle's middle is positive if the obstacle lies to its left.
+    Between the same ends it differs by multiples of 2 pi from path to path, so paths with the same sides can be pulled
+    into each other, short of loops around an obstacle.
 
     Args:
         positions: (N, 2), dense.

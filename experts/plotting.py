@@ -16,15 +16,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal, Iteration
 from leapnav.experts.integrator import propagate
+from leapnav.experts.optimum import Optimum
 from leapnav.experts.problem import OptimalControlProblem
 
 OBSTACLE, EDGE, WALL, START, GOAL, OPTIMUM = "#c3c8d1", "#7a8190", "#3c4048", "#2662ab", "#22804f", "#1a1a1a"
 # Told apart by their lightness too, so also by the colour-blind.
 CURVES = (START, "#e08a00", GOAL, "#cc79a7", "#56b4e9", OPTIMUM)
+ALTERNATIVE_COLORS = ("#e08a00", "#56b4e9", "#cc79a7", "#22804f")
+ALTERNATIVES_DRAWN = len(ALTERNATIVE_COLORS)
 ROBOTS_DRAWN = 9  # along a path, evenly spaced in time
 POINTS = 400  # of a dense path
 FIELD_POINTS = 200  # per side, of an obstacle field
@@ -85,7 +89,7 @@ def plot_extremal(
 
     A system with a position also has its path in the plane. A Leapfrog solve shows how it came about: the feasible
     paths of its sweeps, from light to dark, in the plane (of the first two states, for a system without a position),
-    and the cost against the sweep, in the same colours.
+    and the cost against the sweep, in the same colours. The optimum of a scenario is drawn with its alternatives.
 
     Args:
         extremal: of any problem; it need not be certified.
@@ -107,6 +111,8 @@ def plot_extremal(
         grid = figure.add_gridspec(4, 2, width_ratios=(1.2, 1))
         plane = figure.add_subplot(grid[:3, 0] if sweeps else grid[:, 0])
         if in_plane:
+            if isinstance(extremal, Optimum):
+                _draw_alternatives(plane, extremal)
             _draw_plane(plane, extremal, scenario, sweeps)
         else:
             _draw_state_space(plane, extremal, sweeps)
@@ -226,6 +232,56 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
         ylabel=f"${sp.latex(system.position[1])}$",
     )
     axes.grid(alpha=0.3)
+
+
+def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
+    """The cheapest of the other local optima, with a legend that says what tells them apart."""
+    shown = optimum.alternatives[:ALTERNATIVES_DRAWN]
+    if not shown:
+        return
+    entries = [(optimum, OPTIMUM, 1.8), *((other, ALTERNATIVE_COLORS[k], 1.3) for k, other in enumerate(shown))]
+    for other, color, width in entries:
+        positions = other.evaluate(_dense_times(other))[0][:, :2]
+        label = f"J = {other.cost:.4g}"
+        if other is not optimum:
+            label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
+        label += f", {', '.join(other.driving_modes) or 'turn on the spot'}"
+        if other.heading_winding:
+            label += f", winding {other.heading_winding:+d}"
+        axes.plot(*positions.T, color=color, linewidth=width, zorder=2.5, label=label)
+    hidden = len(optimum.alternatives) - len(shown)
+    axes.legend(
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        frameon=False,
+        fontsize=9,
+        title=f"the best of {hidden + len(entries)} local optima" if hidden else None,
+        title_fontsize=9,
+    )
+
+
+def plot_bank(bank: ScenarioBank, path: str | os.PathLike[str], count: int = 24, columns: int = 6) -> None:
+    """A contact sheet: scenarios of a bank, evenly spaced in it, with their optima.
+
+    Raises:
+        ValueError: count < 1, or the file's ending is no picture format.
+
+    """
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count!r}")
+    chosen = np.unique(np.linspace(0, len(bank) - 1, min(count, len(bank))).round().astype(int))
+    columns = min(columns, len(chosen))
+    rows = math.ceil(len(chosen) / columns)
+    figure = Figure(figsize=(2.4 * columns, 2.65 * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, index in zip(grid, chosen.tolist(), strict=False):
+        reference = bank.reference(index)
+        draw_scenario(axes, bank[index])
+        axes.plot(*reference.states[:, :2].T, color=OPTIMUM, linewidth=1.4)
+        axes.set_title(f"{index}: J* = {reference.cost:.3g}, {bank[index].horizon:g} s", fontsize=8)
+    for axes in grid[len(chosen) :]:
+        axes.set_visible(False)
+    figure.savefig(path, dpi=130)
 
 
 def _draw_field(axes: Axes, field: np.ndarray, center: np.ndarray, reach: float) -> None:

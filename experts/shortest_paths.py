@@ -46,6 +46,9 @@ MOVES = _moves()
 MOVES.flags.writeable = False
 numbers = types.Array(types.int64, 1, "C")
 indices = types.Array(types.int32, 1, "C")
+links_type = types.Array(types.int32, 2, "C")
+# A ring of buckets, and how many of them the least cost of a path from end to end fills.
+BUCKETS, BUCKETS_PER_COST = 4096, 2000
 
 
 @njit(vector(matrix, numbers, vector, float64, float64), cache=True, error_model="numpy", nogil=True)
@@ -79,6 +82,38 @@ def plane_costs(speed, seeds, seed_costs, cell, speed_weight):
     return cost
 
 
+@njit(int64(indices, links_type, int64), cache=True, nogil=True)
+def _dequeue(bucket, links, node):
+    """Takes a node out of its bucket; returns 1, or 0 if it is in none."""
+    place = links[node, 2]
+    if place < 0:
+        return 0
+    before, after = links[node, 0], links[node, 1]
+    if before >= 0:
+        links[before, 1] = after
+    else:
+        bucket[place] = after
+    if after >= 0:
+        links[after, 0] = before
+    links[node, 2] = -1
+    return 1
+
+
+@njit(int64(indices, links_type, int64, int64), cache=True, nogil=True)
+def _enqueue(bucket, links, node, place):
+    """Puts a node into a bucket, out of the one that it may be in; returns by how many nodes the queue grew.
+
+    `links` (nodes, 3): the node before and the one after in the bucket's chain, and the bucket (-1: none).
+    """
+    grown = 1 - _dequeue(bucket, links, node)
+    head = bucket[place]
+    links[node, 0], links[node, 1], links[node, 2] = -1, head, place
+    if head >= 0:
+        links[head, 0] = node
+    bucket[place] = node
+    return grown
+
+
 @njit(
     types.Tuple((vector, indices, float64))(
         matrix, numbers, vector, numbers, vector, vector, boolean, float64, float64, float64, float64, float64, float64
@@ -87,12 +122,14 @@ def plane_costs(speed, seeds, seed_costs, cell, speed_weight):
     error_model="numpy",
     nogil=True,
 )
-def tree(speed, seeds, seed_costs, targets, target_costs, rest, exact, cell, speed_weight, turn_weight, reach, slack, limit):
+def tree(
+    speed, seeds, seed_costs, targets, target_costs, rest, exact, cell, speed_weight, turn_weight, reach, slack, limit
+):
     """Cost from the seeds to every node worth it, and its predecessor (-1: none); A* with the lower bounds `rest`.
 
-    `rest` holds what remains to the targets at least: per cell, or, if `exact`, per node. Nodes through which paths cost
-    more than `limit` are left out; it becomes `reach` times the cost of the best target, and `slack` more, once that is
-    known, and is returned.
+    `rest` holds what remains to the targets at least: per cell, or, if `exact`, per node. Nodes through which paths
+    cost more than `limit` are left out; it becomes `reach` times the cost of the best target, and `slack` more, once
+    that is known, and is returned.
     """
     lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
     flat = speed.ravel()
@@ -116,26 +153,37 @@ def tree(speed, seeds, seed_costs, targets, target_costs, rest, exact, cell, spe
             middle[k, number] = dx * stride + dy
             square = speed_weight * (dx * dx + dy * dy) * cell * cell + turn_weight * turn * turn
             length[k, number] = math.sqrt(square) / 6.0
-    best = np.inf
-    queue = [(0.0, 0.0, 0)]
-    queue.pop()
+    first = np.inf
+    for k in range(len(seeds)):
+        first = min(first, seed_costs[k] + (rest[seeds[k]] if exact else rest[seeds[k] // HEADINGS]))
+    if first == np.inf:
+        return cost, parent, limit
+    # Within a bucket the order is arbitrary: a node that turns out cheaper later is queued again.
+    width = max(first, slack) / BUCKETS_PER_COST
+    bucket = np.full(BUCKETS, -1, dtype=np.int32)
+    links = np.full((size, 3), -1, dtype=np.int32)
+    current, waiting = 0, 0
     for k in range(len(seeds)):
         node = seeds[k]
-        if seed_costs[k] < cost[node]:
+        bound = seed_costs[k] + (rest[node] if exact else rest[node // HEADINGS])
+        if seed_costs[k] < cost[node] and bound <= limit:
             cost[node] = seed_costs[k]
-            bound = rest[node] if exact else rest[node // HEADINGS]
-            heapq.heappush(queue, (seed_costs[k] + bound, seed_costs[k], node))
-    while len(queue) > 0:
-        through, key, node = heapq.heappop(queue)
-        if key > cost[node]:
+            waiting += _enqueue(bucket, links, node, min(int((bound - first) / width), BUCKETS - 1))
+    best = np.inf
+    while waiting > 0:
+        node = bucket[current % BUCKETS]
+        if node < 0:
+            current += 1
             continue
-        if through > limit:
-            break
+        waiting -= _dequeue(bucket, links, node)
+        key = cost[node]
+        k = node % HEADINGS
+        position = node // HEADINGS
+        if key + (rest[node] if exact else rest[position]) > limit:
+            continue
         if key + arrival[node] < best:
             best = key + arrival[node]
             limit = min(limit, reach * best + slack)
-        k = node % HEADINGS
-        position = node // HEADINGS
         here = 2 * (position // lines) * stride + 2 * (position % lines)
         for number in range(count):
             following = node + ahead[k, number]
@@ -146,7 +194,9 @@ def tree(speed, seeds, seed_costs, targets, target_costs, rest, exact, cell, spe
                 if bound <= limit:
                     cost[following] = total
                     parent[following] = node
-                    heapq.heappush(queue, (bound, total, following))
+                    # Farther ahead than the ring of buckets is long is treated as less far: early, but not wrong.
+                    place = min(max(int((bound - first) / width), current), current + BUCKETS - 1)
+                    waiting += _enqueue(bucket, links, following, place % BUCKETS)
     return cost, parent, limit
 
 
@@ -193,20 +243,16 @@ def path_through(node, ahead, behind):
     return path
 
 
-@njit(float64(boolean[::1], numbers, int64, int64, int64), cache=True, nogil=True)
+@njit(types.void(boolean[::1], numbers, int64, int64, int64), cache=True, nogil=True)
 def mark(taken, path, lines, cells, headings):
-    """Marks the nodes within `cells` in x and y and `headings` steps of heading of a path; returns their share before."""
+    """Marks the nodes within `cells` in x and y and `headings` steps of heading of a path."""
     columns = len(taken) // (lines * HEADINGS)
-    known = 0
-    for node in path:
-        known += taken[node]
     for node in path:
         i, j, k = node // (lines * HEADINGS), node // HEADINGS % lines, node % HEADINGS
         for a in range(max(0, i - cells), min(columns, i + cells + 1)):
             for b in range(max(0, j - cells), min(lines, j + cells + 1)):
                 for c in range(k - headings, k + headings + 1):
                     taken[(a * lines + b) * HEADINGS + c % HEADINGS] = True
-    return known / len(path)
 
 
 @njit(float64(vector, vector, float64), cache=True, error_model="numpy", nogil=True)

@@ -16,7 +16,7 @@ from leapnav.training.config import CloningConfig
 
 if TYPE_CHECKING:
     from leapnav.envs.scenario import Scenario
-    from leapnav.experts import Extremal
+    from leapnav.experts import Extremal, Optimum
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 PICTURES = (".png", ".pdf", ".svg")
@@ -48,7 +48,7 @@ class Solve:
         return self._compare(scenario) if self.method == "all" else self._solve(scenario)
 
     def _solve(self, scenario: Scenario) -> int:
-        from leapnav.experts import find_optimum, solve
+        from leapnav.experts import Optimum, find_optimum, solve
 
         assert self.method != "all"
         extremal = find_optimum(scenario) if self.method == "optimum" else solve(scenario, method=self.method)
@@ -65,6 +65,8 @@ class Solve:
             scope = " (of the best candidate alone)" if self.method == "optimum" else ""
             print(f"  iterations         {len(extremal.history)}{scope}")
             print(f"  evaluations        {extremal.work}{scope}")
+        if isinstance(extremal, Optimum) and extremal.success:
+            _print_alternatives(extremal)
         self._write(scenario, extremal, extremal.to_json())
         return 0 if extremal.success else FAILED
 
@@ -303,6 +305,32 @@ def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, f
             str(extremal.work),
             f"{1000 * seconds[method]:.1f}",
         )
+    Console().print(table)
+
+
+def _print_alternatives(optimum: Optimum) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    for doubt in optimum.doubts:
+        print(f"  in doubt           J = {doubt.cost:.6g} was found too: {doubt.status.value}")
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for column in ("cost", "dearer", "winding", "clearance"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("driving", overflow="fold")
+    table.add_column("sides", overflow="fold")
+    for extremal in (optimum, *optimum.alternatives):
+        clearance = extremal.certificate.clearance if extremal.certificate is not None else None
+        table.add_row(
+            f"{extremal.cost:.6f}",
+            f"{100 * (extremal.cost / optimum.cost - 1):.2f} %",
+            f"{extremal.heading_winding:+d}" if extremal.heading_winding else "0",
+            "-" if clearance is None else f"{clearance:.3f} m",
+            ", ".join(extremal.driving_modes) or "turn on the spot",
+            "".join(side[0].upper() for side in extremal.path_class) or "-",
+        )
+    print("Local optima (sides: where each obstacle lies as seen from the path, Left or Right)")
     Console().print(table)
 
 
