@@ -128,6 +128,16 @@ class Lattice:
                 mark(taken, path, self.lines, self.SAME_CELLS, self.SAME_HEADINGS)
                 yield self._candidate(path, float(ahead.cost[node] + behind.cost[node]))
 
+    def random_candidates(self, count: int, rng: np.random.Generator) -> Iterator[Candidate]:
+        """Shortest paths through random nodes, so by detours; none if the goal cannot be reached."""
+        self.energy = self._first_energy()
+        if self.energy == 0.0:
+            return
+        ahead, behind, _ = self._trees(self.scenario.start, self.scenario.goal)
+        through = ahead.cost + behind.cost
+        for node in rng.choice(np.flatnonzero(np.isfinite(through)), count):
+            yield self._candidate(path_through(node, ahead.parent, behind.parent), float(through[node]))
+
     def explains(self, cost: float, first: float, last: float) -> bool:
         """Whether no path but those from the `first` to the `last` candidate's cost can be expected to beat J = `cost`.
 

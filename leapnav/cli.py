@@ -1,4 +1,4 @@
-"""The command line: `leapnav solve | rollout | train | evaluate | demo`."""
+"""The command line: `leapnav solve | bank | rollout | train | evaluate | demo`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
+from leapnav.bank_commands import Build, Show
+from leapnav.outputs import check_outputs
 from leapnav.training.config import CloningConfig
 
 if TYPE_CHECKING:
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
     from leapnav.experts import Extremal, Optimum
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
-PICTURES = (".png", ".pdf", ".svg")
 DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
 
 
@@ -44,7 +45,7 @@ class Solve:
         from leapnav.envs.scenario import Scenario
 
         scenario = Scenario.from_json(self.scenario)
-        _check_outputs(self.json, self.plot)
+        check_outputs(self.json, self.plot)
         return self._compare(scenario) if self.method == "all" else self._solve(scenario)
 
     def _solve(self, scenario: Scenario) -> int:
@@ -97,7 +98,7 @@ class Rollout:
     out: Path
     """New folder for the dataset."""
     family: str = "clutter"
-    """Family of the scenarios: open or clutter."""
+    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     count: int = 100
     """How many scenarios."""
     seed: int = 0
@@ -189,7 +190,7 @@ class Evaluate:
         repeated = {name for name in self.policies if self.policies.count(name) > 1}
         if repeated:
             raise ValueError(f"policies: {sorted(repeated)[0]}: named more than once")
-        _check_outputs(self.json, self.plot)
+        check_outputs(self.json, self.plot)
         for name in self.policies:  # before minutes are spent on the references
             if name not in ("expert", "random") and not (Path(name) / "policy.json").is_file():
                 raise FileNotFoundError(
@@ -228,8 +229,22 @@ class Demo:
         return 0
 
 
+@dataclass(frozen=True)
+class Bank:
+    """Scenario banks: scenarios with their certified optima in one file."""
+
+    action: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Show, tyro.conf.subcommand("show")]
+    ]
+
+    def run(self) -> int:
+        """Builds or shows a bank."""
+        return self.action.run()
+
+
 COMMANDS = {
     "solve": Solve,
+    "bank": Bank,
     "rollout": Rollout,
     "train": Train,
     "evaluate": Evaluate,
@@ -332,14 +347,3 @@ def _print_alternatives(optimum: Optimum) -> None:
         )
     print("Local optima (sides: where each obstacle lies as seen from the path, Left or Right)")
     Console().print(table)
-
-
-def _check_outputs(json: Path | None, plot: Path | None) -> None:
-    """A place that cannot be written to is told before the work, not after."""
-    for path in (json, plot):
-        if path is not None and not path.parent.is_dir():
-            raise FileNotFoundError(f"{path}: its folder does not exist")
-        if path is not None and path.is_dir():
-            raise IsADirectoryError(f"{path}: is a folder")
-    if plot is not None and plot.suffix not in PICTURES:
-        raise ValueError(f"{plot}: expected a name that ends in {', '.join(PICTURES)}")

@@ -40,5 +40,5 @@ def test_clutter_is_6_to_12_discs_and_open_is_empty():
 
 
 def test_an_unknown_family_is_named():
-    with pytest.raises(ValueError, match="family: expected one of open, clutter, got 'maze'"):
+    with pytest.raises(ValueError, match="family: expected one of open, clutter, polygons, rooms, slalom, got 'maze'"):
         sample_scenario("maze", 0)
