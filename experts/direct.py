@@ -31,7 +31,9 @@ CLOSE = 1e-3  # of the scale of the path: converged when a full step is smaller
 # In units of the horizon and of the cost: a first shift of the Hessian, the largest one, and penalties on the end
 # conditions (in the recursion) and on all constraints (in the line search).
 SHIFT, LARGEST_SHIFT, END_PENALTY, PENALTY = 100.0, 1e7, 1e4, 300.0
+ACTIVE_SETS = 8  # rounds of a step in which the controls at their limits are found
 flags = types.Array(boolean, 1, "C")
+signs = types.Array(types.int8, 2, "C")
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ def _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps,
 
 @njit(
     boolean(
-        vector, matrix, vector, vector, flags, float64, constant, float64, float64, boolean,
+        vector, matrix, signs, vector, vector, flags, float64, constant, float64, float64, boolean,
         matrix, cube, cube, matrix, cube, cube, matrix, cube, matrix, cube, cube, matrix, vector,
     ),
     cache=True,
@@ -206,14 +208,14 @@ def _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps,
     nogil=True,
 )  # fmt: skip
 def _backward(
-    h, u, end, goal, free, turn_weight, limits, shift, penalty, convex,
+    h, u, held, end, goal, free, turn_weight, limits, shift, penalty, convex,
     near, A, B, gaps, W, P, p, F, step, gain, end_gain, G, g,
 ):  # fmt: skip
     """Riccati recursion of the quadratic model; False if it is not convex.
 
     The model's value at node k is 1/2 dq'P dq + p'dq + dq'F nu + 1/2 nu'G nu + g'nu, the controls that minimise it are
     -(step + gain dq + end_gain nu). `convex`: the curvature of the dynamics and negative curvature of the proximity
-    cost are left out, for a start far from any optimum. Controls at their limits that push outwards stay.
+    cost are left out, for a start far from any optimum. `held` (N, 2): signs of the limits at which controls are held.
     """
     intervals = len(h)
     P[intervals] = 0.0
@@ -268,8 +270,7 @@ def _backward(
                 Qux[1, 2] += W[k, 0, 2]
                 q01 += W[k, 1, 2]
                 q11 += W[k, 2, 2]
-            held_0 = abs(u[k, 0]) >= limits[0] and u[k, 0] * Qu[0] < 0.0
-            held_1 = abs(u[k, 1]) >= limits[1] and u[k, 1] * Qu[1] < 0.0
+            held_0, held_1 = held[k, 0] != 0, held[k, 1] != 0
             determinant = q00 * q11 - q01 * q01
             if held_0 or held_1:
                 i00 = 0.0 if held_0 else 1.0 / q00
@@ -281,7 +282,12 @@ def _backward(
                 definite = q00 > 1e-9 * h[k] and determinant > 1e-12 * h[k] * h[k] * turn_weight
             if not definite:
                 return False
-            step[k, 0], step[k, 1] = i00 * Qu[0] + i01 * Qu[1], i01 * Qu[0] + i11 * Qu[1]
+            # A held control goes to its limit, whatever the others do.
+            to_0, to_1 = held[k, 0] * limits[0] - u[k, 0], held[k, 1] * limits[1] - u[k, 1]
+            push_0 = Qu[0] + (q01 * to_1 if held_1 else 0.0)
+            push_1 = Qu[1] + (q01 * to_0 if held_0 else 0.0)
+            step[k, 0] = -to_0 if held_0 else i00 * push_0 + i01 * push_1
+            step[k, 1] = -to_1 if held_1 else i01 * push_0 + i11 * push_1
             for i in range(3):
                 gain[k, 0, i], gain[k, 1, i] = i00 * Qux[0, i] + i01 * Qux[1, i], i01 * Qux[0, i] + i11 * Qux[1, i]
                 end_gain[k, 0, i], end_gain[k, 1, i] = i00 * Fu[0, i] + i01 * Fu[1, i], i01 * Fu[0, i] + i11 * Fu[1, i]
@@ -354,37 +360,56 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
     G, g, nu = np.empty((3, 3)), np.empty(3), np.zeros(3)
     dq, du, multipliers = np.zeros((intervals + 1, 3)), np.empty((intervals, 2)), np.zeros((intervals + 1, 3))
     new_q, new_u = np.empty((intervals + 1, 3)), np.empty((intervals, 2))
+    held = np.zeros((intervals, 2), dtype=np.int8)
+    for k in range(intervals):
+        for j in range(2):
+            u[k, j] = min(max(u[k, j], -limits[j]), limits[j])
     cold = not np.any(costates)
     shift = 0.0
     for _ in range(max_iterations):
         _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps, W)
-        while not (
-            _backward(
-                h, u, q[intervals], goal, free, turn_weight, limits, shift, END_PENALTY / horizon, cold,
-                near, A, B, gaps, W, P, p, F, step, gain, end_gain, G, g,
-            )
-            and _end_multipliers(G, g, q[intervals], goal, free, nu)
-        ):  # fmt: skip
-            shift = max(4.0 * shift, first_shift)
-            if not shift <= largest_shift:
-                cost, gap, _, _ = _merit(h, q, u, multipliers, nu, goal, free, turn_weight, unit, field)
-                return False, cost, gap
-        largest = 0.0
-        for k in range(intervals):
-            for j in range(2):
-                du[k, j] = -step[k, j]
+        for _ in range(ACTIVE_SETS):
+            while not (
+                _backward(
+                    h, u, held, q[intervals], goal, free, turn_weight, limits, shift, END_PENALTY / horizon, cold,
+                    near, A, B, gaps, W, P, p, F, step, gain, end_gain, G, g,
+                )
+                and _end_multipliers(G, g, q[intervals], goal, free, nu)
+            ):  # fmt: skip
+                shift = max(4.0 * shift, first_shift)
+                if not shift <= largest_shift:
+                    cost, gap, _, _ = _merit(h, q, u, multipliers, nu, goal, free, turn_weight, unit, field)
+                    return False, cost, gap
+            largest = 0.0
+            for k in range(intervals):
+                for j in range(2):
+                    du[k, j] = -step[k, j]
+                    for i in range(3):
+                        du[k, j] -= gain[k, j, i] * dq[k, i] + end_gain[k, j, i] * nu[i]
+                for i in range(2):
+                    dq[k + 1, i] = dq[k, i] + A[k, i, 0] * dq[k, 2] + gaps[k, i]
+                    dq[k + 1, i] += B[k, i, 0] * du[k, 0] + B[k, i, 1] * du[k, 1]
+                dq[k + 1, 2] = dq[k, 2] + h[k] * du[k, 1] + gaps[k, 2]
+                largest = max(largest, abs(dq[k + 1, 0]), abs(dq[k + 1, 1]), abs(dq[k + 1, 2]))
+            for k in range(intervals + 1):
                 for i in range(3):
-                    du[k, j] -= gain[k, j, i] * dq[k, i] + end_gain[k, j, i] * nu[i]
-            for i in range(2):
-                dq[k + 1, i] = dq[k, i] + A[k, i, 0] * dq[k, 2] + gaps[k, i]
-                dq[k + 1, i] += B[k, i, 0] * du[k, 0] + B[k, i, 1] * du[k, 1]
-            dq[k + 1, 2] = dq[k, 2] + h[k] * du[k, 1] + gaps[k, 2]
-            largest = max(largest, abs(dq[k + 1, 0]), abs(dq[k + 1, 1]), abs(dq[k + 1, 2]))
-        for k in range(intervals + 1):
-            for i in range(3):
-                multipliers[k, i] = p[k, i]
-                for j in range(3):
-                    multipliers[k, i] += P[k, i, j] * dq[k, j] + F[k, i, j] * nu[j]
+                    multipliers[k, i] = p[k, i]
+                    for j in range(3):
+                        multipliers[k, i] += P[k, i, j] * dq[k, j] + F[k, i, j] * nu[j]
+            changed = False
+            for k in range(intervals):
+                for j in range(2):
+                    weight = h[k] if j == 0 else h[k] * turn_weight
+                    value = u[k, j] + du[k, j]
+                    if held[k, j] != 0:
+                        slope = weight * value + B[k, 0, j] * multipliers[k + 1, 0] + B[k, 1, j] * multipliers[k + 1, 1]
+                        slope += h[k] * multipliers[k + 1, 2] if j == 1 else 0.0
+                        if held[k, j] * slope > 0.0:  # inwards is cheaper
+                            held[k, j], changed = 0, True
+                    elif abs(value) > limits[j] * (1.0 + 1e-9):
+                        held[k, j], changed = (1 if value > 0.0 else -1), True
+            if not changed:
+                break
         _, _, lagrangian, squares = _merit(h, q, u, multipliers, nu, goal, free, turn_weight, unit, field)
         before = lagrangian + PENALTY / horizon * squares
         damping, descends = 1.0, False

@@ -11,7 +11,7 @@ import numpy as np
 
 from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario
-from leapnav.experts.certificate import failure
+from leapnav.experts.certificate import certify, failure
 from leapnav.experts.direct import DirectPath, discretise, optimise
 from leapnav.experts.extremal import Extremal, Status
 from leapnav.experts.lattice import Lattice
@@ -21,7 +21,7 @@ from leapnav.experts.path_class import Mode, Side, driving_modes, heading_windin
 from leapnav.experts.problem import OptimalControlProblem, Path
 
 TOLERANCE = 1e-9
-NEWTON_ITERATIONS = 40
+NEWTON_ITERATIONS = 25
 # Intervals of the refined direct path per segment of multiple shooting, and from how many refinements it is tried.
 INTERVALS_PER_SEGMENT, FEWEST_SEGMENTS = 8, 8
 REFINEMENTS = 3
@@ -37,6 +37,7 @@ SAME_PATH, SAME_COST = 0.15, 1e-6
 DIRECT_ERROR = 0.01
 # How deep (m) an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
 SLIGHT = 0.1
+MOST_FAILURES = 12  # of Newton's method, in a scenario
 CLOSED = 1e-3  # sum of the violations of a direct path's constraints
 COMPARED = np.linspace(0.0, 1.0, 65)
 
@@ -145,7 +146,9 @@ class Search:
         self.certified: list[Extremal] = []
         self.refused: list[Extremal] = []
         self._seen: list[np.ndarray] = []
-        self._stalled: list[tuple[float, Extremal]] = []
+        # Cost, problem and path of what Newton's method did not take to an extremal.
+        self._stalled: list[tuple[float, OptimalControlProblem, DirectPath]] = []
+        self._failures = 0
 
     @property
     def best(self) -> Extremal:
@@ -174,16 +177,20 @@ class Search:
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if known:
             return
-        extremal = _extremal(problem, refined)
+        # Where the limits hardly leave a way, direct paths may not close their gaps, but Newton sometimes does.
+        closed = refined.gap < CLOSED
+        trying = self._failures < MOST_FAILURES and (closed or not self.certified)
+        extremal = _extremal(problem, refined) if trying else None
+        if extremal is None:
+            self._failures += trying
+            self._stalled.append((refined.cost if closed else np.inf, problem, refined))
+            return
         if any(_same(extremal, other) for other in (*self.certified, *self.refused)):
             return
         if extremal.success:
             self.certified.append(extremal)
-        elif extremal.status in (Status.COLLISION, Status.CONJUGATE_POINT, Status.NOT_CERTIFIED):
-            self.refused.append(extremal)
         else:
-            # Whatever path these nodes make, the discretised problem knows better what one near them costs.
-            self._stalled.append((refined.cost if refined.gap < CLOSED else np.inf, extremal))
+            self.refused.append(extremal)
 
     def _known(self, direct: DirectPath) -> bool:
         shape = _shape(direct.times, direct.states)
@@ -192,12 +199,19 @@ class Search:
     def result(self) -> Optimum:
         """The best extremal with the others, or, if none is certified, the cheapest that was refused or stalled."""
         if not self.certified:
-            found = self.refused or [extremal for _, extremal in self._stalled]
-            return as_optimum(min(found, key=lambda extremal: extremal.cost))
+            if self.refused:
+                return as_optimum(min(self.refused, key=lambda extremal: extremal.cost))
+            _, problem, direct = min(self._stalled, key=lambda entry: entry[0])
+            return as_optimum(_stalled(problem, direct))
         best, *others = sorted(self.certified, key=lambda extremal: extremal.cost)
-        doubts = [extremal for extremal in self.refused if extremal.cost < best.cost and _may_be_beaten(extremal)]
-        doubts += [extremal for cost, extremal in self._stalled if cost < best.cost * (1 - SAME_COST)]
-        return replace(as_optimum(best), alternatives=tuple(map(as_optimum, others)), doubts=tuple(doubts))
+        alternatives = tuple(map(as_optimum, others))
+        return replace(as_optimum(best), alternatives=alternatives, doubts=self.doubts(best.cost))
+
+    def doubts(self, cost: float) -> tuple[Extremal, ...]:
+        """Solutions found that are cheaper than `cost` and not certified; see `Optimum`."""
+        refused = [extremal for extremal in self.refused if extremal.cost < cost and _may_be_beaten(extremal)]
+        cheaper = [entry[1:] for entry in self._stalled if entry[0] < cost * (1 - DIRECT_ERROR)]
+        return (*refused, *(_stalled(*entry) for entry in cheaper))
 
 
 def as_optimum(extremal: Extremal) -> Optimum:
@@ -205,8 +219,14 @@ def as_optimum(extremal: Extremal) -> Optimum:
     return Optimum(**{field.name: getattr(extremal, field.name) for field in fields(Extremal)})
 
 
-def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
-    """Multiple shooting from a direct path, which is refined further as long as that fails."""
+def _stalled(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
+    """What there is of a direct path that Newton's method did not take to an extremal."""
+    nodes = np.concatenate([direct.states, direct.costates], axis=1)
+    return certify(problem, direct.times, nodes, Status.STALLED)
+
+
+def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> Extremal | None:
+    """Multiple shooting from a direct path, which is refined further as long as that fails; None if it always does."""
     history, work = (), 0
     settings = Settings(TOLERANCE, NEWTON_ITERATIONS)
     for refinement in range(REFINEMENTS):
@@ -222,8 +242,8 @@ def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
         history += rows
         work += evaluations
         if status is Status.SUCCESS:
-            break
-    return confirm(problem, times, nodes, status, history, work, settings)
+            return confirm(problem, times, nodes, status, history, work, settings)
+    return None
 
 
 def _may_be_beaten(extremal: Extremal) -> bool:

@@ -40,6 +40,7 @@ class Opinion:
         source: where a better one came from: "lattice", "via points", "driving modes", "controls" or "IPOPT"; None if
             nothing better was found.
         tried: how many paths were taken to local optima.
+        doubts: how many cheaper solutions were found that are not certified, see `Optimum`.
 
     """
 
@@ -48,6 +49,7 @@ class Opinion:
     best: float
     source: str | None
     tried: int
+    doubts: int
 
     @property
     def improvement(self) -> float:
@@ -85,7 +87,7 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     search.add(paths)
     note("lattice", len(paths))
     if not paths:
-        return Opinion(scenario.name, cost, best, None, 0)
+        return Opinion(scenario.name, cost, best, None, 0, 0)
     through = Lattice(scenario, reach=VIA_REACH).random_candidates(VIA_POINTS, rng)
     detours = [Path(candidate.times, candidate.poses) for candidate in through]
     search.add(detours)
@@ -100,7 +102,7 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     if find_spec("casadi") is not None:
         count = _add_ipopt(search, scenario, [*paths[: IPOPT_GUESSES // 2], *steered[: IPOPT_GUESSES // 2]])
         note("IPOPT", count)
-    return Opinion(scenario.name, cost, best, source, tried)
+    return Opinion(scenario.name, cost, best, source, tried, len(search.doubts(best)))
 
 
 def verify_bank(bank: ScenarioBank, workers: int = 1, progress: bool = True) -> list[Opinion]:

@@ -91,10 +91,14 @@ class Show:
                 f"{opinion.name}: J = {opinion.best:.6g} instead of {opinion.cost:.6g} "
                 f"({100 * opinion.improvement:.2f} % better), from {opinion.source}"
             )
+        doubtful = [opinion for opinion in opinions if opinion.doubts]
         tried = sum(opinion.tried for opinion in opinions) / len(opinions)
         print(
             f"better by more than {100 * IMPROVEMENT:g} % in {len(better)} of {len(bank)} scenarios "
             f"({tried:.0f} paths tried in each)"
+        )
+        print(
+            f"cheaper solutions that touch or lack a certificate, which the bank's builder did not see: {len(doubtful)}"
         )
         if self.json is not None:
             self.json.write_text(json.dumps([asdict(opinion) for opinion in opinions], indent=1) + "\n")

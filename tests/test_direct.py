@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+from helpers import best_known, scenario_fields
+
+from leapnav.envs import Scenario
+from leapnav.experts import Path, find_optimum
+from leapnav.experts.direct import descend, discretise, optimise
+from leapnav.experts.lattice import Lattice
+from leapnav.experts.problem import OptimalControlProblem
+
+BEST_KNOWN = best_known()
+
+
+def first_candidate(scenario):
+    candidate = next(Lattice(scenario).candidates())
+    path = Path(candidate.times, candidate.poses)
+    return OptimalControlProblem.from_scenario(scenario).with_winding_of(path.states), path
+
+
+@pytest.mark.parametrize("scenario", [s for s, _ in BEST_KNOWN[::6]], ids=lambda s: s.name)
+def test_it_converges_to_the_extremal_with_order_two(scenario):
+    optimum = find_optimum(scenario)
+    path = Path(np.linspace(0.0, scenario.horizon, 65), optimum.evaluate(np.linspace(0.0, scenario.horizon, 65))[0])
+    direct = optimise(optimum.problem, discretise(path))
+    errors = []
+    for _ in range(4):
+        assert direct.converged
+        assert direct.gap < 1e-4
+        errors.append(abs(direct.cost - optimum.cost))
+        direct = optimise(optimum.problem, direct.refined())
+    assert errors[-1] < 1e-4 * optimum.cost
+    assert errors[1] / errors[3] > 10  # 16 with each interval a quarter as long
+    states, _, costates = optimum.evaluate(direct.times)
+    assert np.abs(direct.states - states).max() < 1e-2
+    # The multipliers are the costates.
+    assert np.abs(direct.costates - costates).max() < 0.02 * np.abs(costates).max()
+
+
+def test_every_step_of_the_path_is_an_exact_arc_and_ends_at_the_goal():
+    scenario = BEST_KNOWN[0][0]
+    problem, path = first_candidate(scenario)
+    direct = optimise(problem, discretise(path))
+    assert direct.states[0] == pytest.approx(scenario.start)
+    assert direct.states[-1] == pytest.approx(problem.goal, abs=1e-5)
+    for k, (v, omega) in enumerate(direct.controls):
+        h = direct.times[k + 1] - direct.times[k]
+        fine = np.linspace(0.0, h, 20_001)
+        heading = direct.states[k, 2] + omega * fine
+        x = direct.states[k, 0] + np.trapezoid(v * np.cos(heading), fine)
+        y = direct.states[k, 1] + np.trapezoid(v * np.sin(heading), fine)
+        assert (x, y, heading[-1]) == pytest.approx(direct.states[k + 1], abs=1e-5)
+
+
+def test_controls_stay_within_the_robot_s_limits():
+    fields = scenario_fields(obstacles=[], start=[1, 1, 0.0], goal=[8.0, 1.0, 0.0], horizon=5.5)
+    fields["robot"] |= {"max_speed": 1.3, "max_turn_rate": 0.8}
+    fields["goal"] = [6.0, 4.0, 2.0]
+    scenario = Scenario.from_dict(fields)
+    problem, path = first_candidate(scenario)
+    direct = optimise(problem, discretise(path))
+    assert direct.converged
+    assert np.abs(direct.controls[:, 0]).max() == pytest.approx(1.3)
+    assert np.abs(direct.controls[:, 1]).max() <= 0.8
+    assert direct.gap < 1e-4
+
+
+def test_a_free_goal_heading_has_no_costate_at_the_end():
+    fields = scenario_fields(goal=[8.0, 8.0, None])
+    del fields["goal"][2]
+    scenario = Scenario.from_dict({**fields, "goal": [8.0, 8.0, None]})
+    problem, path = first_candidate(scenario)
+    direct = optimise(problem, discretise(path))
+    assert direct.converged
+    assert direct.costates[-1, 2] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_weights_in_other_units_change_the_cost_and_not_the_path():
+    fields = scenario_fields()
+    one = optimise(*(lambda problem, path: (problem, discretise(path)))(*first_candidate(Scenario.from_dict(fields))))
+    fields["cost"] = {name: value * (1 if name == "proximity_scale" else 100) for name, value in fields["cost"].items()}
+    other = optimise(*(lambda problem, path: (problem, discretise(path)))(*first_candidate(Scenario.from_dict(fields))))
+    assert other.cost == pytest.approx(100 * one.cost, rel=1e-9)
+    assert other.states == pytest.approx(one.states, abs=1e-6)
+    assert other.costates == pytest.approx(100 * one.costates, abs=1e-3)
+
+
+def test_what_cannot_be_solved_is_not_called_converged():
+    """Three metres in a second at two metres a second."""
+    limits, field = np.array([2.0, 3.0]), Scenario.from_dict(scenario_fields(obstacles=[])).field
+    limits.flags.writeable = False
+    states = np.linspace([2.0, 5.0, 0.0], [5.0, 5.0, 0.0], 33)
+    controls, costates = np.full((32, 2), [2.0, 0.0]), np.zeros((33, 3))
+    converged, _, gap = descend(
+        np.full(32, 1 / 32), states, controls, costates, np.array([5.0, 5.0, 0.0]), np.zeros(3, bool), 0.5, 1.0,
+        limits, field, 1e-3, 40,
+    )  # fmt: skip
+    assert not converged or gap > 0.5
