@@ -1,7 +1,7 @@
 # `make demo` and `make test` work in a fresh clone; both set up .venv first.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-SOURCES := $(sort $(wildcard leapnav/* envs/*.py experts/*.py training/*.py))
+SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py training/*.py))
 
 .PHONY: demo test lint types bench clean
 .DELETE_ON_ERROR:
@@ -23,6 +23,7 @@ bench: .venv/installed
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]" --config-settings editable_mode=strict
 	$(BIN)/python benchmarks/environment.py
 	$(BIN)/python benchmarks/solvers.py
+	$(BIN)/python benchmarks/optima.py
 
 clean:
 	rm -rf .venv build *.egg-info

@@ -78,6 +78,8 @@ def build_bank(
         if value < least:
             raise ValueError(f"{name}: expected at least {least}, got {value!r}")
     target = Path(out)
+    if target.is_dir():
+        raise IsADirectoryError(f"{target}: is a folder")
     if target.exists():
         return _complete(target, family, count, seed)
     if not target.absolute().parent.is_dir():

@@ -205,3 +205,70 @@ def test_every_command_has_help(command):
     )
     assert done.returncode == 0
     assert "usage: leapnav" in done.stdout
+
+
+def test_solve_tells_the_alternatives_apart(tmp_path, capsys):
+    from leapnav.envs import sample_scenario
+
+    path, out, plot = tmp_path / "hard.json", tmp_path / "out.json", tmp_path / "hard.svg"
+    sample_scenario("clutter", 910_065).to_json(path)
+    assert main(["solve", str(path), "--json", str(out), "--plot", str(plot)]) == 0
+    printed = capsys.readouterr().out
+    solution = json.loads(out.read_text())
+    assert len(solution["alternatives"]) >= 5
+    for entry in (solution, *solution["alternatives"]):
+        assert f"{entry['cost']:.6f}" in printed
+        assert "".join(side[0].upper() for side in entry["path_class"]) in printed
+        assert set(entry["driving_modes"]) <= {"forward", "backward"}
+        assert isinstance(entry["heading_winding"], int)
+        assert len(entry["states"]) == len(entry["times"])
+    drawn = plot.read_text()
+    assert f"best of {1 + len(solution['alternatives'])} local optima" in drawn
+    assert "(+1.5 %), backward, forward" in drawn
+
+
+def test_a_bank_is_built_and_shown(tmp_path, capsys):
+    bank, sheet, report = tmp_path / "small.bank", tmp_path / "sheet.png", tmp_path / "report.json"
+    assert main(["bank", "build", "--family", "rooms", "--count", "4", "--seed", "9", "--out", str(bank)]) == 0
+    assert "4 of 4 scenarios drawn" in capsys.readouterr().out
+    arguments = ["bank", "show", str(bank), "--plot", str(sheet), "--count", "3", "--verify", "--json", str(report)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "4 scenarios of rooms, seed 9" in printed
+    assert "clearance (m)" in printed
+    assert "better by more than 0.1 % in 0 of 4 scenarios" in printed
+    assert sheet.read_bytes()[:4] == b"\x89PNG"
+    assert [entry["name"] for entry in json.loads(report.read_text())] == [f"rooms-9-{k}" for k in range(4)]
+
+
+def test_a_shipped_bank_is_shown_by_its_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bank", "show", "slalom-test", "--count", "6"]) == 0
+    assert "200 scenarios of slalom, seed 1" in capsys.readouterr().out
+    assert (tmp_path / "slalom-test.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["show", "none.bank"], "none.bank: no such bank"),
+        (["show", "{text}"], "no scenario bank, or damaged"),
+        (["show", "slalom-test", "--count", "-1"], "count: expected at least 0, got -1"),
+        (["show", "slalom-test", "--plot", "x.txt"], "x.txt: expected a name that ends in .png, .pdf, .svg"),
+        (["show", "slalom-test", "--count", "0", "--verify", "--workers", "0"], "workers: expected at least 1, got 0"),
+        (["build", "--family", "maze", "--out", "x.bank"], "family: expected one of open, clutter, polygons"),
+        (["build", "--count", "0", "--out", "x.bank"], "count: expected at least 1, got 0"),
+        (["build", "--out", "no/folder/x.bank"], "no/folder: no such folder"),
+        (["build", "--out", "{text}"], "no scenario bank, or damaged"),
+        (["build", "--out", "{folder}"], "is a folder"),
+    ],
+)
+def test_bad_bank_arguments_are_one_line(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = tmp_path / "text.bank"
+    text.write_text("no bank")
+    arguments = [a.format(text=text, folder=tmp_path) for a in arguments]
+    code, line = failing(["bank", *arguments], capsys)
+    assert code == 2
+    assert message in line
+    assert text.read_text() == "no bank"

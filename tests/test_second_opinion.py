@@ -1,0 +1,63 @@
+import math
+
+import numpy as np
+import pytest
+
+from leapnav.envs import Scenario, ScenarioBank, sample_scenario
+from leapnav.experts import find_optimum
+from leapnav.experts.problem import OptimalControlProblem, Path
+from leapnav.experts.second_opinion import Opinion, second_opinion, verify_bank
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return sample_scenario("clutter", 910_065)
+
+
+def test_a_reference_that_is_not_the_best_is_found_out(scenario):
+    optimum = find_optimum(scenario)
+    second = optimum.alternatives[0].cost
+    opinion = second_opinion(scenario, second)
+    assert opinion.cost == second
+    assert opinion.best <= optimum.cost * (1 + 1e-9)
+    assert opinion.improvement == pytest.approx(1 - optimum.cost / second, abs=1e-9)
+    assert opinion.source == "lattice"
+    assert opinion.tried > 200
+
+
+def test_the_optimum_stands_against_a_hundred_times_the_effort(scenario):
+    opinion = second_opinion(scenario)
+    assert opinion.cost == find_optimum(scenario).cost
+    assert opinion.improvement < 1e-6
+
+
+def test_a_scenario_without_a_path_has_none():
+    walls = [{"polygon": {"vertices": [[4.9, 0.0], [5.1, 0.0], [5.1, 10.0], [4.9, 10.0]]}}]
+    fields = {"arena": [0, 0, 10, 10], "start": [2.0, 5.0, 0.0], "goal": [8.0, 5.0, 0.0], "horizon": 9.0}
+    opinion = second_opinion(Scenario.from_dict({**fields, "obstacles": walls}))
+    assert (opinion.cost, opinion.tried, opinion.improvement) == (math.inf, 0, 0.0)
+
+
+def test_a_whole_bank_gets_opinions_in_order_whatever_the_number_of_workers(tmp_path):
+    from leapnav.experts import build_bank
+
+    bank = build_bank("open", 3, tmp_path / "x.bank", progress=False)
+    one = verify_bank(bank, workers=1, progress=False)
+    assert one == verify_bank(ScenarioBank(bank.path), workers=2, progress=False)
+    assert [opinion.name for opinion in one] == [scenario.name for scenario in bank]
+    assert all(isinstance(opinion, Opinion) and opinion.improvement < 1e-6 for opinion in one)
+
+
+def test_ipopt_finds_the_same_optimum_by_other_means(scenario):
+    pytest.importorskip("casadi")
+    from leapnav.experts.ipopt import Transcription
+
+    for other in (scenario, sample_scenario("polygons", 3)):
+        optimum = find_optimum(other)
+        times = np.linspace(0.0, other.horizon, 101)
+        rng = np.random.default_rng(0)
+        guess = Path(times, optimum.evaluate(times)[0] + 0.02 * rng.normal(size=(101, 3)))
+        problem = OptimalControlProblem.from_scenario(other).with_winding_of(guess.states)
+        solution = Transcription(other, 100).solve(problem, guess)
+        assert solution is not None
+        assert np.abs(solution.states - optimum.evaluate(times)[0]).max() < 0.05
