@@ -53,6 +53,8 @@ _TYPES = {
     "costates": "<f4",
 }
 
+_WIDTHS = {"certificates": (4,), "states": (3,), "controls": (2,), "costates": (3,)}
+
 
 class BankError(ValueError):
     """A file is no scenario bank, or one that this version cannot read. The message names the file and the fault."""
@@ -124,29 +126,28 @@ class ScenarioBank(Sequence[Scenario]):
             raise FileNotFoundError(f"{self.path}: no such bank")
         try:
             with h5py.File(self.path, "r") as file:
-                attributes = dict(file.attrs)
+                attributes: dict[str, Any] = dict(file.attrs)
                 if attributes.get("format") != FORMAT:
                     raise BankError(f"{self.path}: an HDF5 file, but no scenario bank")
                 if attributes.get("version") != VERSION:
                     raise BankError(
                         f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads {VERSION}"
                     )
-                places = {name: (file[name].shape, file[name].id.get_offset()) for name in _TYPES}
-        except (OSError, KeyError) as error:
-            raise BankError(f"{self.path}: no scenario bank, or damaged: {error}") from None
-        content = np.memmap(self.path, dtype="u1", mode="r")
-        arrays: dict[str, np.ndarray] = {}
-        for name, (shape, offset) in places.items():
-            size = math.prod(shape) * np.dtype(_TYPES[name]).itemsize
-            # A dataset without entries has no place.
-            start = 0 if offset is None else offset
-            arrays[name] = content[start : start + size].view(_TYPES[name]).reshape(shape)
+                places = {name: _place(file[name], name) for name in _TYPES}
+            self.family, self.software = str(attributes["family"]), str(attributes["software"])
+            self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
+            self.rejected: dict[str, int] = dict(json.loads(attributes["rejected"]))
+            content = np.memmap(self.path, dtype="u1", mode="r")
+            arrays = {
+                name: content[start : start + size].view(_TYPES[name]).reshape(shape)
+                for name, (start, size, shape) in places.items()
+            }
+            _check_lengths(arrays)
+        except BankError:
+            raise
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            raise BankError(f"{self.path}: no scenario bank, or damaged: {' '.join(str(error).split())}") from None
         self._arrays = arrays
-        self.family = str(attributes["family"])
-        self.seed = int(attributes["seed"])
-        self.drawn = int(attributes["drawn"])
-        self.rejected: dict[str, int] = json.loads(attributes["rejected"])
-        self.software = str(attributes["software"])
         self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
         self._scenarios: dict[int, Scenario] = {}
@@ -229,6 +230,29 @@ class ScenarioBank(Sequence[Scenario]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.path = state["path"]
         self._open()
+
+
+def _place(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
+    """Where a dataset lies in the file: first byte, number of bytes, and its shape."""
+    if (
+        dataset.dtype != np.dtype(_TYPES[name])
+        or dataset.chunks is not None
+        or dataset.shape[1:] != _WIDTHS.get(name, ())
+    ):
+        raise ValueError(f"{name}: not as the format has it")
+    # A dataset without entries has no place.
+    return dataset.id.get_offset() or 0, math.prod(dataset.shape) * dataset.dtype.itemsize, dataset.shape
+
+
+def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
+    count = len(arrays["costs"])
+    for name in ("scenario_ends", "draws", "second_costs", "certificates", "path_ends"):
+        if len(arrays[name]) != count:
+            raise ValueError(f"{name}: {len(arrays[name])} entries for {count} scenarios")
+    for ends, contents in (("scenario_ends", ("scenarios",)), ("path_ends", ("states", "controls", "costates"))):
+        last = int(arrays[ends][-1]) if count else 0
+        if (np.diff(arrays[ends], prepend=0) <= 0).any() or any(len(arrays[name]) != last for name in contents):
+            raise ValueError(f"{ends}: not the ends of {' and '.join(contents)}")
 
 
 def point_times(horizon: float) -> np.ndarray:

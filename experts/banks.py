@@ -21,6 +21,9 @@ from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.experts.extremal import Status
 from leapnav.experts.optimum import Optimum, find_optimum
 
+# A task at a time: what a process has in hand is lost if it is killed. (Declared as a string, taken as a number too.)
+ONE = cast(str, 1)
+
 
 class Rejection(Enum):
     """Why a scenario is not admitted to a bank. The value is what tables print."""
@@ -85,7 +88,7 @@ def build_bank(
     if not target.absolute().parent.is_dir():
         raise FileNotFoundError(f"{target.parent}: no such folder")
     header = {"format": VERSION, "software": leapnav.__version__, "family": family, "seed": seed}
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1, pre_dispatch=4 * workers)
+    pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="4 * n_jobs")
     with _Journal(target.with_name(f"{target.name}.journal"), header) as journal:
         # The bank holds the first scenarios that are admitted: as many as are missing are drawn, until none is.
         drawn, admitted = 0, journal.admitted(count)

@@ -365,7 +365,7 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
         for j in range(2):
             u[k, j] = min(max(u[k, j], -limits[j]), limits[j])
     cold = not np.any(costates)
-    shift = 0.0
+    shift, largest, cost, gap = 0.0, 0.0, np.inf, np.inf
     for _ in range(max_iterations):
         _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps, W)
         for _ in range(ACTIVE_SETS):

@@ -119,7 +119,7 @@ def verify_bank(bank: ScenarioBank, workers: int = 1, progress: bool = True) -> 
     """
     if workers < 1:
         raise ValueError(f"workers: expected at least 1, got {workers!r}")
-    pool = Parallel(n_jobs=workers, return_as="generator", batch_size=1)
+    pool = Parallel(n_jobs=workers, return_as="generator", pre_dispatch="4 * n_jobs")
     results = pool(delayed(_opinion)(bank, index) for index in range(len(bank)))
     bar = tqdm(results, total=len(bank), desc=f"Verifying {bank.path.stem}", unit="scenario", disable=not progress)
     return list(cast(Iterator[Opinion], bar))
