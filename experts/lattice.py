@@ -62,6 +62,15 @@ class Tree(NamedTuple):
     parent: np.ndarray
 
 
+class Found(NamedTuple):
+    """A finished search: its trees, the nodes where they meet in order of cost, and the paths yielded so far."""
+
+    ahead: Tree
+    behind: Tree
+    nodes: np.ndarray
+    paths: list[np.ndarray]
+
+
 class Lattice:
     """The search of one scenario. `candidates` yields paths in order of promise.
 
@@ -74,6 +83,8 @@ class Lattice:
 
     # Nodes this near (cells, heading steps) to a path already taken belong to it.
     SAME_CELLS, SAME_HEADINGS = 2, 3
+    # Beyond so many cells a path leads elsewhere.
+    ELSEWHERE_CELLS = 4
 
     def __init__(
         self, scenario: Scenario, refinement: int = 1, margin: float | None = None, reach: float = 1.3
@@ -99,6 +110,7 @@ class Lattice:
             phi[side] = phi[:, side] = np.inf
         self.phi = phi
         self.energy = 0.0
+        self._found: Found | None = None
 
     @property
     def slack(self) -> float:
@@ -121,11 +133,29 @@ class Lattice:
             self.energy = energy
             ahead, behind, limit = self._trees(start, goal)
             nodes = meeting_nodes(ahead.parent, behind.parent, ahead.cost, behind.cost, limit)
+        self._found = Found(ahead, behind, nodes, [])
+        yield from self._distinct(self.SAME_CELLS, self.SAME_HEADINGS)
+
+    def elsewhere(self) -> Iterator[Candidate]:
+        """Those of the paths not yet yielded by `candidates` that leave all that were by nearly a metre, somewhere.
+
+        They pass obstacles on other sides, mostly, and are dearer.
+        """
+        if self._found is not None:
+            yield from self._distinct(self.ELSEWHERE_CELLS, HEADINGS // 2)
+
+    def _distinct(self, cells: int, headings: int) -> Iterator[Candidate]:
+        """Paths through nodes that are farther than this from all paths before."""
+        assert self._found is not None
+        ahead, behind, nodes, paths = self._found
         taken = np.zeros(self.columns * self.lines * HEADINGS, dtype=bool)
+        for path in paths:
+            mark(taken, path, self.lines, cells, headings)
         for node in nodes:
             if not taken[node]:
                 path = path_through(node, ahead.parent, behind.parent)
-                mark(taken, path, self.lines, self.SAME_CELLS, self.SAME_HEADINGS)
+                mark(taken, path, self.lines, cells, headings)
+                paths.append(path)
                 yield self._candidate(path, float(ahead.cost[node] + behind.cost[node]))
 
     def random_candidates(self, count: int, rng: np.random.Generator) -> Iterator[Candidate]:

@@ -25,6 +25,7 @@ NEWTON_ITERATIONS = 25
 # Intervals of the refined direct path per segment of multiple shooting, and from how many refinements it is tried.
 INTERVALS_PER_SEGMENT, FEWEST_SEGMENTS = 8, 8
 REFINEMENTS = 3
+ELSEWHERE = 4  # paths by other ways, which cost little more time and are the more interesting alternatives
 MOST_ROUNDS = 4
 # Refinement and margin (m) of one lattice after the other, as long as nothing is certified or a better path may have
 # been missed: all candidates may lead through a gap that is too narrow or in which the optimum grazes, which a margin
@@ -128,6 +129,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
             shortest_time = min(shortest_time, *(_shortest_time(c.poses, scenario) for c in batch))
             search.add(Path(c.times, c.poses) for c in batch)
             if search.certified and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
+                search.add(Path(c.times, c.poses) for c in islice(lattice.elsewhere(), ELSEWHERE))
                 return search.result()
     if search.certified:
         return search.result()
