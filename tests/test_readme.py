@@ -7,15 +7,25 @@ import pytest
 
 from leapnav.envs import Scenario
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
-
-
-BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+BLOCKS = [
+    block
+    for page in (README, (ROOT / "docs" / "banks.md").read_text())
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+]
+BANK = r"rooms-1-7 (\d+\.\d+)\n200 \1\d* \(\d+, 3\)( \(\d+, 3\))?\n"
 
 
 @pytest.mark.parametrize(
     ("block", "output"),
-    list(zip(BLOCKS, [r"True -\d\.\d+\n", r"(6\.233154049\n){4}certified: .*\[4\.993.* 6\.258.*\]\n"], strict=True)),
+    list(
+        zip(
+            BLOCKS,
+            [r"True -\d\.\d+\n", BANK, r"(6\.233154049\n){4}certified: .*\[4\.993.* 6\.258.*\]\n", BANK],
+            strict=True,
+        )
+    ),
 )
 def test_the_readme_s_examples_run_as_printed(block, output, tmp_path):
     done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, check=False, cwd=tmp_path)
