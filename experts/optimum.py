@@ -38,7 +38,7 @@ SAME_PATH, SAME_COST = 0.15, 1e-6
 DIRECT_ERROR = 0.01
 # How deep (m) an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
 SLIGHT = 0.1
-MOST_FAILURES = 12  # of Newton's method, in a scenario
+MOST_WASTED = 1_000_000  # evaluations of the flow by Newton's method in vain, on the paths of one lattice
 CLOSED = 1e-3  # sum of the violations of a direct path's constraints
 COMPARED = np.linspace(0.0, 1.0, 65)
 
@@ -120,7 +120,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
     for refinement, margin in LATTICES:
         lattice = Lattice(scenario, refinement, margin)
         paths = lattice.candidates()
-        first = None
+        first, search.wasted = None, 0
         for _ in range(MOST_ROUNDS):
             batch = list(islice(paths, candidates))
             if not batch:
@@ -150,7 +150,9 @@ class Search:
         self._seen: list[np.ndarray] = []
         # Cost, problem and path of what Newton's method did not take to an extremal.
         self._stalled: list[tuple[float, OptimalControlProblem, DirectPath]] = []
-        self._failures = 0
+        # The same, of what cuts deep into obstacles.
+        self._deep: list[tuple[float, OptimalControlProblem, DirectPath]] = []
+        self.wasted = 0
 
     @property
     def best(self) -> Extremal:
@@ -171,7 +173,11 @@ class Search:
         best = self.best.cost if self.certified else np.inf
         if self._known(direct):
             return
-        if direct.cost > (1 + DIRECT_ERROR) * best and clearances(direct.states, self.scenario.field).min() <= 0:
+        clearance = clearances(direct.states, self.scenario.field).min()
+        if direct.cost > (1 + DIRECT_ERROR) * best and clearance <= 0:
+            return
+        if clearance < -2.0 * SLIGHT:  # neither it nor a path near it is of any use
+            self._deep.append((direct.cost, problem, direct))
             return
         # Where the cost is flat, paths to the same optimum are told from others by their refinement only.
         refined = optimise(problem, direct.refined())
@@ -181,10 +187,10 @@ class Search:
             return
         # Where the limits hardly leave a way, direct paths may not close their gaps, but Newton sometimes does.
         closed = refined.gap < CLOSED
-        trying = self._failures < MOST_FAILURES and (closed or not self.certified)
-        extremal = _extremal(problem, refined) if trying else None
+        trying = self.wasted < MOST_WASTED and (closed or not self.certified)
+        extremal, work = _extremal(problem, refined) if trying else (None, 0)
         if extremal is None:
-            self._failures += trying
+            self.wasted += work
             self._stalled.append((refined.cost if closed else np.inf, problem, refined))
             return
         if any(_same(extremal, other) for other in (*self.certified, *self.refused)):
@@ -203,8 +209,9 @@ class Search:
         if not self.certified:
             if self.refused:
                 return as_optimum(min(self.refused, key=lambda extremal: extremal.cost))
-            _, problem, direct = min(self._stalled, key=lambda entry: entry[0])
-            return as_optimum(_stalled(problem, direct))
+            _, problem, direct = min(self._deep or self._stalled, key=lambda entry: entry[0])
+            extremal = _extremal(problem, optimise(problem, direct.refined()))[0] if self._deep else None
+            return as_optimum(extremal or _stalled(problem, direct))
         best, *others = sorted(self.certified, key=lambda extremal: extremal.cost)
         alternatives = tuple(map(as_optimum, others))
         return replace(as_optimum(best), alternatives=alternatives, doubts=self.doubts(best.cost))
@@ -227,8 +234,8 @@ def _stalled(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
     return certify(problem, direct.times, nodes, Status.STALLED)
 
 
-def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> Extremal | None:
-    """Multiple shooting from a direct path, which is refined further as long as that fails; None if it always does."""
+def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> tuple[Extremal | None, int]:
+    """Multiple shooting from a direct path, which is refined further as long as that fails, and its evaluations."""
     history, work = (), 0
     settings = Settings(TOLERANCE, NEWTON_ITERATIONS)
     for refinement in range(REFINEMENTS):
@@ -244,8 +251,8 @@ def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> Extremal | 
         history += rows
         work += evaluations
         if status is Status.SUCCESS:
-            return confirm(problem, times, nodes, status, history, work, settings)
-    return None
+            return confirm(problem, times, nodes, status, history, work, settings), work
+    return None, work
 
 
 def _may_be_beaten(extremal: Extremal) -> bool:

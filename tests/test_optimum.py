@@ -3,7 +3,7 @@ import pytest
 from helpers import best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
-from leapnav.envs import Scenario, sample_scenario
+from leapnav.envs import FAMILIES, Scenario, sample_scenario
 from leapnav.experts import Status, find_optimum
 from leapnav.experts.lattice import Lattice
 
@@ -18,7 +18,7 @@ def test_the_best_known_cost_is_reached(scenario, cost):
     assert extremal.certificate.residual <= 1e-8
 
 
-@pytest.mark.parametrize("family", ["open", "clutter"])
+@pytest.mark.parametrize("family", FAMILIES)
 def test_fresh_scenarios_are_solved_and_certified(family):
     for seed in range(20):
         extremal = find_optimum(sample_scenario(family, 9000 + seed))
@@ -139,10 +139,21 @@ def test_unusual_scenarios_are_solved_too(scenario):
     [
         (changed(horizon=3.0), Status.HORIZON_TOO_SHORT),
         (changed(horizon=1e-9), Status.HORIZON_TOO_SHORT),
+        (changed(obstacles=[{"polygon": {"vertices": [[4.9, 0], [5.1, 0], [5.1, 10], [4.9, 10]]}}]), Status.NO_PATH),
+        # A gap of 0.4 m, for a robot of 0.5 m.
+        (
+            changed(
+                obstacles=[
+                    {"polygon": {"vertices": [[4.9, 0], [5.1, 0], [5.1, 4.8], [4.9, 4.8]]}},
+                    {"polygon": {"vertices": [[4.9, 5.2], [5.1, 5.2], [5.1, 10], [4.9, 10]]}},
+                ]
+            ),
+            Status.COLLISION,
+        ),
         # Without a proximity cost the way leads straight through the obstacle.
         (changed(cost={"proximity_weight": 0.0}, start=[1, 4.5, 0.0], goal=[8, 4.5, 0.0]), Status.COLLISION),
     ],
-    ids=["too fast", "no time", "collision"],
+    ids=["too fast", "no time", "wall", "gap too narrow", "collision"],
 )
 def test_what_cannot_be_solved_says_why(scenario, status):
     extremal = find_optimum(scenario)
@@ -165,3 +176,21 @@ def test_a_gap_in_which_every_first_candidate_grazes_is_left_for_another_way():
     extremal = find_optimum(sample_scenario("clutter", 40_040))
     assert extremal.success, extremal
     assert extremal.certificate.clearance > 0
+
+
+def test_a_gap_just_too_narrow_leaves_patience_for_a_way_round():
+    """Nearly all first candidates lead through a gap that lacks 0.14 m, where Newton's method mostly fails."""
+    extremal = find_optimum(sample_scenario("polygons", 2_000_188))
+    assert extremal.success, extremal
+
+
+def test_candidates_elsewhere_leave_the_first_ones():
+    lattice = Lattice(BEST_KNOWN[0][0])
+    first = [c.poses for c, _ in zip(lattice.candidates(), range(6), strict=False)]
+    others = [c.poses for c, _ in zip(lattice.elsewhere(), range(4), strict=False)]
+    assert others
+    known = np.concatenate(first)[:, :2]
+    for poses in others:
+        distances = np.linalg.norm(poses[:, None, :2] - known, axis=2).min(axis=1)
+        assert distances.max() > 0.7
+        known = np.concatenate([known, poses[:, :2]])
