@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
 from leapnav.envs.obstacles import sample_grid
 from leapnav.envs.scenario import Scenario
@@ -33,6 +34,7 @@ from leapnav.experts.shortest_paths import (
 
 # The cell (m) is small enough to manoeuvre over a short way; half of it is the resolution at which obstacles are seen.
 SMALLEST_CELL, LARGEST_CELL, CELLS_ON_THE_WAY = 0.05, 0.2, 20
+FINEST_SPACING, MOST_POINTS = 0.02, 600  # of the grid on which it is seen whether there is a way at all (m, per side)
 MOST_CELLS = 250  # per side; larger arenas get larger cells
 # How far inside an obstacle, in robot radii, a lattice point may lie: a gap that the robot just passes can lie between
 # two points, but no wall is thinner than the robot.
@@ -261,3 +263,26 @@ class Lattice:
         durations = lengths / np.sqrt(2 * (energy_of(lengths, phi, self.scenario.horizon) + phi))
         times = np.concatenate([[0.0], np.cumsum(durations)])
         return Candidate(times * (self.scenario.horizon / times[-1]), poses, cost)
+
+
+def is_connected(scenario: Scenario) -> bool:
+    """Whether a way from start to goal exists that touches nothing, as far as a fine grid can tell.
+
+    The robot is a disc that can turn on the spot, so it gets wherever its centre can.
+    """
+    x_min, y_min, x_max, y_max = scenario.arena
+    spacing = max(FINEST_SPACING, (x_max - x_min) / MOST_POINTS, (y_max - y_min) / MOST_POINTS)
+    connected = False
+    for x, y, _ in (scenario.start, scenario.goal):
+        # Each pose on the grid in turn: where two points are near, the nearest one may lie in an obstacle.
+        left, below = int((x - x_min) / spacing), int((y - y_min) / spacing)
+        columns, lines = left + int((x_max - x) / spacing) + 1, below + int((y_max - y) / spacing) + 1
+        origin = x - left * spacing, y - below * spacing
+        free = sample_grid(scenario.field, *origin, spacing, columns, lines, spacing)[1] > 0
+        other = scenario.goal if (x, y) == scenario.start[:2] else scenario.start
+        at = min(max(round((other[0] - origin[0]) / spacing), 0), columns - 1)
+        up = min(max(round((other[1] - origin[1]) / spacing), 0), lines - 1)
+        free[at, up] = True
+        regions = label(free)[0]
+        connected = connected or bool(regions[left, below] == regions[at, up])
+    return connected

@@ -14,7 +14,7 @@ from leapnav.envs.scenario import Scenario
 from leapnav.experts.certificate import certify, failure
 from leapnav.experts.direct import DirectPath, discretise, optimise
 from leapnav.experts.extremal import Extremal, Status
-from leapnav.experts.lattice import Lattice
+from leapnav.experts.lattice import Lattice, is_connected
 from leapnav.experts.multiple_shooting import confirm, polish
 from leapnav.experts.nodes import Settings
 from leapnav.experts.path_class import Mode, Side, driving_modes, heading_winding, path_sides
@@ -133,7 +133,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
                 return search.result()
     if search.certified:
         return search.result()
-    if shortest_time == np.inf:
+    if shortest_time == np.inf or not is_connected(scenario):
         return as_optimum(failure(problem, Status.NO_PATH))
     if shortest_time > scenario.horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))

@@ -148,7 +148,7 @@ def test_unusual_scenarios_are_solved_too(scenario):
                     {"polygon": {"vertices": [[4.9, 5.2], [5.1, 5.2], [5.1, 10], [4.9, 10]]}},
                 ]
             ),
-            Status.COLLISION,
+            Status.NO_PATH,
         ),
         # Without a proximity cost the way leads straight through the obstacle.
         (changed(cost={"proximity_weight": 0.0}, start=[1, 4.5, 0.0], goal=[8, 4.5, 0.0]), Status.COLLISION),
