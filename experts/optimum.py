@@ -131,9 +131,12 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
             if search.certified and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
                 search.add(Path(c.times, c.poses) for c in islice(lattice.elsewhere(), ELSEWHERE))
                 return search.result()
+        # Looked at when it is in doubt: lattice paths may lead through gaps that are a little too narrow.
+        if not search.certified and not is_connected(scenario):
+            return as_optimum(failure(problem, Status.NO_PATH))
     if search.certified:
         return search.result()
-    if shortest_time == np.inf or not is_connected(scenario):
+    if shortest_time == np.inf:
         return as_optimum(failure(problem, Status.NO_PATH))
     if shortest_time > scenario.horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
@@ -185,13 +188,19 @@ class Search:
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if known:
             return
+        # Seen at twice as many points, a path may cut through a wall after all.
+        clearance = clearances(refined.states, self.scenario.field).min()
+        if clearance < -2.0 * SLIGHT:
+            self._deep.append((direct.cost, problem, direct))
+            return
         # Where the limits hardly leave a way, direct paths may not close their gaps, but Newton sometimes does.
         closed = refined.gap < CLOSED
         trying = self.wasted < MOST_WASTED and (closed or not self.certified)
         extremal, work = _extremal(problem, refined) if trying else (None, 0)
         if extremal is None:
             self.wasted += work
-            self._stalled.append((refined.cost if closed else np.inf, problem, refined))
+            likely = closed and clearance >= -SLIGHT
+            self._stalled.append((refined.cost if likely else np.inf, problem, refined))
             return
         if any(_same(extremal, other) for other in (*self.certified, *self.refused)):
             return
