@@ -283,6 +283,7 @@ def is_connected(scenario: Scenario) -> bool:
         at = min(max(round((other[0] - origin[0]) / spacing), 0), columns - 1)
         up = min(max(round((other[1] - origin[1]) / spacing), 0), lines - 1)
         free[at, up] = True
-        regions = label(free)[0]
+        regions = np.empty(free.shape, dtype=np.int32)
+        label(free, output=regions)
         connected = connected or bool(regions[left, below] == regions[at, up])
     return connected
