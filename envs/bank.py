@@ -26,7 +26,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +115,7 @@ class ScenarioBank(Sequence[Scenario]):
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+        self.path = Path(path).absolute()  # so that other processes find it, wherever they work
         self._open()
 
     def _open(self) -> None:
@@ -184,7 +183,10 @@ class ScenarioBank(Sequence[Scenario]):
         i = self._number(index)
         if i not in self._scenarios:
             start, end = self._span("scenario_ends", i)
-            self._scenarios[i] = Scenario.from_json(self._arrays["scenarios"][start:end].tobytes().decode())
+            try:
+                self._scenarios[i] = Scenario.from_json(self._arrays["scenarios"][start:end].tobytes().decode())
+            except ValueError as error:  # of the encoding, or of the scenario
+                raise BankError(f"{self.path}: scenario {i}: damaged: {error}") from None
         return self._scenarios[i]
 
     def __iter__(self) -> Iterator[Scenario]:
@@ -212,7 +214,9 @@ class ScenarioBank(Sequence[Scenario]):
         )
 
     def _number(self, index: int) -> int:
-        i = index + len(self) if index < 0 else index
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)):
+            raise TypeError(f"index: expected an integer, got {index!r}")
+        i = int(index) + len(self) if index < 0 else int(index)
         if not 0 <= i < len(self):
             raise IndexError(f"index: {self.path.name} has {len(self)} scenarios, got {index}")
         return i
@@ -287,8 +291,7 @@ def write_bank(
         "costates": np.concatenate([np.empty((0, 3)), *(entry.costates for entry in entries)]),
     }
     target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.absolute().parent)
-    os.close(handle)
+    name = target.with_name(f".{target.name}.partial")  # always the same: what a killed process leaves is overwritten
     try:
         # Aligned, so that the mapped arrays are.
         with h5py.File(name, "w", alignment_threshold=1, alignment_interval=64) as file:
@@ -298,8 +301,7 @@ def write_bank(
             file.attrs["software"] = software
             for dataset, values in arrays.items():
                 file.create_dataset(dataset, data=np.asarray(values, dtype=_TYPES[dataset]))
-        Path(name).chmod(0o644)
-        os.replace(name, target)
+        name.replace(target)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        name.unlink(missing_ok=True)
         raise

@@ -199,10 +199,11 @@ class NavigateEnv(gym.Env[np.ndarray, np.ndarray]):
         if chosen is None and self.bank is not None:
             if index is None:
                 index = int(self.np_random.integers(len(self.bank)))
-            elif not isinstance(index, (int, np.integer)):
+            elif isinstance(index, bool) or not isinstance(index, (int, np.integer)):
                 raise ValueError(f"options: index: expected an integer, got {index!r}")
             self.scenario = self.bank[int(index)]
-            return {"index": int(index), "reference_cost": float(self.bank.costs[index])}
+            index = int(index) % len(self.bank)
+            return {"index": index, "reference_cost": float(self.bank.costs[index])}
         chosen = self.fixed_scenario if chosen is None else chosen
         self.scenario = sample_scenario(self.family, self.np_random) if chosen is None else _as_scenario(chosen)
         return {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from enum import Enum
@@ -21,6 +22,12 @@ from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.experts.extremal import Status
 from leapnav.experts.optimum import Optimum, find_optimum
 
+if sys.platform == "win32":
+    fcntl = None
+else:
+    import fcntl
+
+RECORD = {"draw", "scenario", "cost", "second_cost", "certificate", "states", "controls", "costates"}
 # A task at a time: what a process has in hand is lost if it is killed. (Declared as a string, taken as a number too.)
 ONE = cast(str, 1)
 
@@ -114,7 +121,7 @@ def build_bank(
             rejected=rejected,
             software=leapnav.__version__,
         )
-    journal.path.unlink()
+        journal.path.unlink()
     return ScenarioBank(target)
 
 
@@ -171,6 +178,8 @@ def _complete(target: Path, family: str, count: int, seed: int) -> ScenarioBank:
     for name, value in wanted.items():
         if found[name] != value:
             raise BankError(f"{target}: exists, with {name} {found[name]!r} instead of {value!r}; choose another name")
+    # What a build leaves that is killed between its last two steps.
+    target.with_name(f"{target.name}.journal").unlink(missing_ok=True)
     return bank
 
 
@@ -182,30 +191,52 @@ class _Journal:
         self.records: dict[int, dict[str, Any]] = {}
 
     def __enter__(self) -> _Journal:
-        whole = 0
-        if self.path.exists():
-            for number, line in enumerate(self.path.read_bytes().splitlines(keepends=True), start=1):
-                if not line.endswith(b"\n"):
-                    break
-                whole += len(line)
-                try:
-                    record = json.loads(line)
-                    if number > 1:
-                        self.records[record["draw"]] = record
-                        continue
-                    different = [name for name, value in self._header.items() if record[name] != value]
-                except (ValueError, KeyError, TypeError):
-                    raise BankError(f"{self.path}: line {number} is no record of a build; remove the file") from None
-                if different:
-                    raise BankError(
-                        f"{self.path}: of a build with {different[0]} {record[different[0]]!r} instead of "
-                        f"{self._header[different[0]]!r}; finish that one, or remove the file"
-                    )
-            os.truncate(self.path, whole)
         self._file = self.path.open("ab")
-        if whole == 0:
-            self._write(self._header)
+        try:
+            self._lock()
+            whole = self._read()
+            self._file.truncate(whole)
+            if whole == 0:
+                self._write(self._header)
+        except BaseException:
+            self._file.close()
+            raise
         return self
+
+    def _lock(self) -> None:
+        """Keeps other builds away from the journal until it is closed, or this process ends."""
+        if fcntl is not None:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BankError(f"{self.path}: another process is building this bank") from None
+
+    def _read(self) -> int:
+        """Reads what a build before noted; returns the length of its whole lines in bytes."""
+        whole = 0
+        for number, line in enumerate(self.path.read_bytes().splitlines(keepends=True), start=1):
+            fault = BankError(f"{self.path}: line {number} is no record of a build; remove the file")
+            if not line.endswith(b"\n"):
+                if number == 1 and not json.dumps(self._header).encode().startswith(line):
+                    raise fault
+                break
+            whole += len(line)
+            try:
+                record = json.loads(line)
+                if number > 1:
+                    if record["rejected"] is None and not record.keys() >= RECORD:
+                        raise fault
+                    self.records[record["draw"]] = record
+                    continue
+                different = [name for name, value in self._header.items() if record[name] != value]
+            except (ValueError, KeyError, TypeError, AttributeError):
+                raise fault from None
+            if different:
+                raise BankError(
+                    f"{self.path}: of a build with {different[0]} {record[different[0]]!r} instead of "
+                    f"{self._header[different[0]]!r}; finish that one, or remove the file"
+                )
+        return whole
 
     def __exit__(self, *_: object) -> None:
         self._file.close()

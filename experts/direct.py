@@ -88,9 +88,9 @@ def optimise(problem: OptimalControlProblem, guess: DirectPath) -> DirectPath:
 
     """
     arrays = problem.arrays
-    states, controls, costates = guess.states.copy(), guess.controls.copy(), guess.costates.copy()
-    states[0] = arrays.start
     speed_weight = problem.control_weight[0]
+    states, controls, costates = guess.states.copy(), guess.controls.copy(), guess.costates / speed_weight
+    states[0] = arrays.start
     scale = max(math.dist(problem.start[:2], arrays.goal[:2]) / 5.0, 0.1)
     converged, cost, gap = descend(
         np.diff(guess.times),

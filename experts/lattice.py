@@ -43,6 +43,8 @@ FELT = 12.0  # proximity scales; farther obstacles change the order of paths by 
 TURNING = 1.2  # how much longer a path is than the shortest one in the plane, at first; corrected if far off
 LARGEST_CORRECTION = 0.5  # of log E: the order of candidates hardly depends on it
 LEAST_ENERGY = 1e-4
+CHEAPEST_TURN = 0.3  # cells driven for what a radian costs
+SLOWEST = 0.3  # least E of a path, relative to what it has where Phi is small
 LATTICE_ERROR = 1.07
 SEED_ANGLE = math.radians(30)
 Pose = tuple[float, float, float | None]
@@ -130,7 +132,9 @@ class Lattice:
         if len(nodes) == 0:
             return
         lengths, phi = self._pieces(self._poses(path_through(nodes[0], ahead.parent, behind.parent)))
-        energy = energy_of(lengths, phi, self.scenario.horizon)
+        horizon = self.scenario.horizon
+        # Through a gap that is only tolerated Phi alone may drive the path, at no E: the metric would know no distance.
+        energy = max(energy_of(lengths, phi, horizon), SLOWEST * 0.5 * (float(lengths.sum()) / horizon) ** 2)
         if abs(math.log(energy / self.energy)) > LARGEST_CORRECTION:
             self.energy = energy
             ahead, behind, limit = self._trees(start, goal)
@@ -206,7 +210,9 @@ class Lattice:
 
     def _trees(self, start: Pose, goal: Pose) -> tuple[Tree, Tree, float]:
         """The trees from the start and from the goal, and the cost of the dearest path."""
-        weights = self.scenario.cost.speed_weight, self.scenario.cost.turn_weight
+        speed_weight, turn_weight = self.scenario.cost.speed_weight, self.scenario.cost.turn_weight
+        # A turn for next to nothing would make all headings of a cell one, and the search endless.
+        weights = speed_weight, max(turn_weight, speed_weight * (CHEAPEST_TURN * self.cell) ** 2)
         speed = np.sqrt(2.0 * (self.energy + self.phi))
         seeds, ends = self._seeds(*start, speed), self._seeds(*goal, speed)
         bound = self._plane_costs(seeds[0], speed)
@@ -282,8 +288,10 @@ def is_connected(scenario: Scenario) -> bool:
         other = scenario.goal if (x, y) == scenario.start[:2] else scenario.start
         at = min(max(round((other[0] - origin[0]) / spacing), 0), columns - 1)
         up = min(max(round((other[1] - origin[1]) / spacing), 0), lines - 1)
-        free[at, up] = True
+        # Half a millimetre off a wall, say, a pose may have no free neighbour on the grid.
+        for i, j in ((left, below), (at, up)):
+            free[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = True
         regions = np.empty(free.shape, dtype=np.int32)
-        label(free, output=regions)
+        label(free, structure=np.ones((3, 3)), output=regions)
         connected = connected or bool(regions[left, below] == regions[at, up])
     return connected

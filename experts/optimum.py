@@ -51,7 +51,8 @@ class Optimum(Extremal):
         alternatives: the other distinct local optima found, certified, in order of cost (theirs are empty).
         doubts: solutions found that are cheaper than this one but not certified: their status is COLLISION for those
             that cut into an obstacle by up to 0.1 m (a path that just touches may then be cheaper than this optimum),
-            or says why there is no certificate. Without any the optimum is a safe reference, as far as is known.
+            or says why there is no certificate. Extremals that cut deeper are no doubts: where the proximity cost is
+            worth its name, no path near them is both clear and cheap.
 
     """
 
@@ -128,7 +129,8 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
             first = first or batch[0]
             shortest_time = min(shortest_time, *(_shortest_time(c.poses, scenario) for c in batch))
             search.add(Path(c.times, c.poses) for c in batch)
-            if search.certified and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
+            # A margin shuts ways that may be better.
+            if search.certified and margin is None and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
                 search.add(Path(c.times, c.poses) for c in islice(lattice.elsewhere(), ELSEWHERE))
                 return search.result()
         # Looked at when it is in doubt: lattice paths may lead through gaps that are a little too narrow.

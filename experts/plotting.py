@@ -243,7 +243,7 @@ def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
     for other, color, width in entries:
         positions = other.evaluate(_dense_times(other))[0][:, :2]
         label = f"J = {other.cost:.4g}"
-        if other is not optimum:
+        if other is not optimum and optimum.cost > 0:
             label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
         label += f", {', '.join(other.driving_modes) or 'turn on the spot'}"
         if other.heading_winding:

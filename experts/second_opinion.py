@@ -54,7 +54,9 @@ class Opinion:
     @property
     def improvement(self) -> float:
         """By which share of the reference's cost the second search is better (0: not at all)."""
-        return max(0.0, 1.0 - self.best / self.cost) if math.isfinite(self.cost) else float(math.isfinite(self.best))
+        if not math.isfinite(self.cost):
+            return float(math.isfinite(self.best))
+        return max(0.0, 1.0 - self.best / self.cost) if self.cost > 0 else 0.0
 
 
 def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0) -> Opinion:

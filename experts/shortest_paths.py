@@ -166,7 +166,8 @@ def tree(
     for k in range(len(seeds)):
         node = seeds[k]
         bound = seed_costs[k] + (rest[node] if exact else rest[node // HEADINGS])
-        if seed_costs[k] < cost[node] and bound <= limit:
+        # From a seed without a way to the targets `rest` is infinite, as is the limit as long as it is not known.
+        if seed_costs[k] < cost[node] and bound <= limit and bound < np.inf:
             cost[node] = seed_costs[k]
             waiting += _enqueue(bucket, links, node, min(int((bound - first) / width), BUCKETS - 1))
     best = np.inf
@@ -191,7 +192,7 @@ def tree(
             total = key + length[k, number] * (flat[here] + 4.0 * flat[here + between] + flat[here + 2 * between])
             if total < cost[following]:
                 bound = total + (rest[following] if exact else rest[position + cells[k, number]])
-                if bound <= limit:
+                if bound <= limit and bound < np.inf:
                     cost[following] = total
                     parent[following] = node
                     # Farther ahead than the ring of buckets is long is treated as less far: early, but not wrong.

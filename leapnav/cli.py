@@ -339,7 +339,7 @@ def _print_alternatives(optimum: Optimum) -> None:
         clearance = extremal.certificate.clearance if extremal.certificate is not None else None
         table.add_row(
             f"{extremal.cost:.6f}",
-            f"{100 * (extremal.cost / optimum.cost - 1):.2f} %",
+            f"{100 * (extremal.cost / optimum.cost - 1):.2f} %" if optimum.cost > 0 else "-",
             f"{extremal.heading_winding:+d}" if extremal.heading_winding else "0",
             "-" if clearance is None else f"{clearance:.3f} m",
             ", ".join(extremal.driving_modes) or "turn on the spot",

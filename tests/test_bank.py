@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+import leapnav
 from leapnav.envs import FAMILIES, BankError, ScenarioBank, sample_scenario
 from leapnav.envs.bank import SPLITS, BankEntry, write_bank
 from leapnav.envs.obstacles import clearances
@@ -131,6 +132,29 @@ def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
     assert build(tmp_path / "killed.bank", count=40).path.read_bytes() == whole.path.read_bytes()
 
 
+def test_two_builds_of_one_bank_do_not_get_in_each_other_s_way(tmp_path):
+    from leapnav.experts.banks import _Journal
+
+    header = {"format": 1, "software": leapnav.__version__, "family": "clutter", "seed": 3}
+    with _Journal(tmp_path / "x.bank.journal", header), pytest.raises(BankError, match="another process is building"):
+        build(tmp_path / "x.bank")
+    assert len(build(tmp_path / "x.bank")) == 6
+
+
+def test_a_build_killed_between_its_last_two_steps_is_tidied_up(bank):
+    journal = bank.path.with_name("small.bank.journal")
+    journal.write_text("left")
+    assert len(build(bank.path)) == 6
+    assert not journal.exists()
+
+
+def test_a_damaged_scenario_is_told_by_file_and_number(bank, tmp_path):
+    path = tmp_path / "damaged.bank"
+    path.write_bytes(bank.path.read_bytes().replace(bank[1].to_json().encode()[:20], b"\xff" * 20))
+    with pytest.raises(BankError, match=r"damaged\.bank: scenario 1: damaged"):
+        ScenarioBank(path)[1]
+
+
 def test_what_is_complete_is_not_built_again_and_nothing_else_is_overwritten(bank):
     content, changed = bank.path.read_bytes(), bank.path.stat().st_mtime_ns
     assert len(build(bank.path)) == 6
@@ -147,10 +171,15 @@ def test_what_is_complete_is_not_built_again_and_nothing_else_is_overwritten(ban
         ('{"format": 1, "software": "0", "family": "clutter", "seed": 3}\n', "of a build with software '0' instead"),
         ("not a journal\n", "line 1 is no record of a build"),
         ('{"draw": 1}\n', "line 1 is no record of a build"),
+        ("notes without an end of line", "line 1 is no record of a build"),
+        ("HEADER" + '{"draw": 0, "rejected": null}\n', "line 2 is no record of a build"),
+        ("HEADER" + '{"draw": 0}\n', "line 2 is no record of a build"),
     ],
 )
 def test_a_foreign_journal_is_refused_and_kept(content, message, tmp_path):
     journal = tmp_path / "new.bank.journal"
+    header = {"format": 1, "software": leapnav.__version__, "family": "clutter", "seed": 3}
+    content = content.replace("HEADER", json.dumps(header) + "\n")
     journal.write_text(content)
     with pytest.raises(BankError, match=message):
         build(tmp_path / "new.bank")
@@ -321,6 +350,7 @@ def test_impossible_banks_are_told_when_the_environment_is_made(arguments, error
     [
         ({"index": 6}, IndexError, "has 6 scenarios, got 6"),
         ({"index": 1.5}, ValueError, "index: expected an integer, got 1.5"),
+        ({"index": True}, ValueError, "index: expected an integer, got True"),
         ({"number": 1}, ValueError, "expected 'scenario' or 'index', got 'number'"),
         ({"index": 1, "scenario": {}}, ValueError, "'index' needs a bank and no 'scenario'"),
     ],

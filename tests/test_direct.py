@@ -75,10 +75,14 @@ def test_a_free_goal_heading_has_no_costate_at_the_end():
 
 
 def test_weights_in_other_units_change_the_cost_and_not_the_path():
+    def refined(fields):
+        problem, path = first_candidate(Scenario.from_dict(fields))
+        return optimise(problem, optimise(problem, discretise(path)).refined())
+
     fields = scenario_fields()
-    one = optimise(*(lambda problem, path: (problem, discretise(path)))(*first_candidate(Scenario.from_dict(fields))))
+    one = refined(fields)
     fields["cost"] = {name: value * (1 if name == "proximity_scale" else 100) for name, value in fields["cost"].items()}
-    other = optimise(*(lambda problem, path: (problem, discretise(path)))(*first_candidate(Scenario.from_dict(fields))))
+    other = refined(fields)
     assert other.cost == pytest.approx(100 * one.cost, rel=1e-9)
     assert other.states == pytest.approx(one.states, abs=1e-6)
     assert other.costates == pytest.approx(100 * one.costates, abs=1e-3)

@@ -5,7 +5,7 @@ from scipy.integrate import solve_ivp
 
 from leapnav.envs import FAMILIES, Scenario, sample_scenario
 from leapnav.experts import Status, find_optimum
-from leapnav.experts.lattice import Lattice
+from leapnav.experts.lattice import Lattice, is_connected
 
 BEST_KNOWN = best_known()
 
@@ -194,3 +194,32 @@ def test_candidates_elsewhere_leave_the_first_ones():
         distances = np.linalg.norm(poses[:, None, :2] - known, axis=2).min(axis=1)
         assert distances.max() > 0.7
         known = np.concatenate([known, poses[:, :2]])
+
+
+@pytest.mark.parametrize(("seed", "cost"), [(700_000, 3.37391), (710_085, 6.06953)])
+def test_a_first_path_through_too_narrow_a_gap_does_not_spoil_the_metric(seed, cost):
+    """Such a path takes nearly the horizon even at E = 0, and at E = 0 the metric knows no distance."""
+    assert find_optimum(sample_scenario("clutter", seed)).cost <= cost
+
+
+def test_a_goal_beside_an_island_of_the_lattice_is_reached():
+    """One of the four cells around the goal is shut in: no way leads from there to the start."""
+    ring = [
+        {"circle": {"center": [7.0 + 0.16 * np.cos(a), 7.0 + 0.16 * np.sin(a)], "radius": 0.09}}
+        for a in np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
+    ]
+    fields = scenario_fields(obstacles=ring, start=[1.0, 1.0, 0.0], goal=[6.803, 6.803, 0.0])
+    fields["robot"] |= {"radius": 0.02}
+    assert find_optimum(Scenario.from_dict(fields)).success
+
+
+@pytest.mark.parametrize("gap", [1e-4, 1e-3, 1e-2])
+def test_poses_in_a_corner_have_a_way_out(gap):
+    near, far = 0.25 + gap, 9.75 - gap
+    assert is_connected(changed(obstacles=[], start=[near, near, -2.3], goal=[far, far, 2.0]))
+
+
+def test_turns_that_cost_next_to_nothing_do_not_make_the_search_endless():
+    assert find_optimum(changed(cost={"turn_weight": 1e-3})).success
+    lattice = Lattice(changed(cost={"turn_weight": 1e-7}))
+    assert next(lattice.candidates()).cost > 0
