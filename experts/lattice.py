@@ -82,6 +82,7 @@ class Lattice:
         refinement: how many times finer than usual the cells are.
         margin: smallest clearance (m) of the lattice's points; None tolerates a little depth, see TOLERATED_DEPTH.
         reach: paths this many times as dear as the first, and a metre more, are not worth a look.
+        whole: cover all of a large arena, with large cells.
 
     """
 
@@ -91,16 +92,27 @@ class Lattice:
     ELSEWHERE_CELLS = 4
 
     def __init__(
-        self, scenario: Scenario, refinement: int = 1, margin: float | None = None, reach: float = 1.3
+        self,
+        scenario: Scenario,
+        refinement: int = 1,
+        margin: float | None = None,
+        reach: float = 1.3,
+        whole: bool = False,
     ) -> None:
         self.scenario, self.reach = scenario, reach
         depth = -TOLERATED_DEPTH * scenario.robot.radius if margin is None else margin
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
         cell = min(max(distance / CELLS_ON_THE_WAY, SMALLEST_CELL), LARGEST_CELL) / refinement
+        x, y, _ = scenario.start
+        if not whole:  # far from start and goal a large arena need not be searched, and cells stay small
+            half = max(cell * MOST_CELLS / 2, 0.75 * distance)
+            middle = (x + scenario.goal[0]) / 2, (y + scenario.goal[1]) / 2
+            x_min, x_max = max(x_min, middle[0] - half), min(x_max, middle[0] + half)
+            y_min, y_max = max(y_min, middle[1] - half), min(y_max, middle[1] + half)
+        self.cropped = (x_min, y_min, x_max, y_max) != tuple(scenario.arena)
         self.cell = max(cell, (x_max - x_min) / MOST_CELLS, (y_max - y_min) / MOST_CELLS)
         # The start is a lattice point.
-        x, y, _ = scenario.start
         left, below = int((x - x_min) / self.cell) + BORDER, int((y - y_min) / self.cell) + BORDER
         right, above = int((x_max - x) / self.cell) + BORDER, int((y_max - y) / self.cell) + BORDER
         self.origin = (x - left * self.cell, y - below * self.cell)

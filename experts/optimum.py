@@ -27,10 +27,11 @@ INTERVALS_PER_SEGMENT, FEWEST_SEGMENTS = 8, 8
 REFINEMENTS = 3
 ELSEWHERE = 4  # paths by other ways, which cost little more time and are the more interesting alternatives
 MOST_ROUNDS = 4
-# Refinement and margin (m) of one lattice after the other, as long as nothing is certified or a better path may have
-# been missed: all candidates may lead through a gap that is too narrow or in which the optimum grazes, which a margin
-# shuts, and a gap or a short way may need smaller cells.
-LATTICES = ((1, None), (1, 0.05), (2, None), (2, 0.05))
+# Refinement, margin (m) and extent of one lattice after the other, as long as nothing is certified or a better path may
+# have been missed: all candidates may lead through a gap that is too narrow or in which the optimum grazes, which a
+# margin shuts, and a gap or a short way may need smaller cells. The last one covers all of an arena that is too large
+# for the others.
+LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, False), (1, None, True))
 # Two paths this near at all times (metres, and as much in radians) lead to the same extremal; two extremals are the
 # same if their costs agree as well.
 SAME_PATH, SAME_COST = 0.15, 1e-6
@@ -117,9 +118,12 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.max_speed * scenario.horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
     search = Search(scenario, problem)
-    shortest_time = np.inf
-    for refinement, margin in LATTICES:
-        lattice = Lattice(scenario, refinement, margin)
+    shortest_time, cropped = np.inf, False
+    for refinement, margin, whole in LATTICES:
+        lattice = Lattice(scenario, refinement, margin, whole=whole)
+        if whole and (search.certified or not cropped):
+            break
+        cropped = cropped or lattice.cropped
         paths = lattice.candidates()
         first, search.wasted = None, 0
         for _ in range(MOST_ROUNDS):

@@ -223,3 +223,22 @@ def test_turns_that_cost_next_to_nothing_do_not_make_the_search_endless():
     assert find_optimum(changed(cost={"turn_weight": 1e-3})).success
     lattice = Lattice(changed(cost={"turn_weight": 1e-7}))
     assert next(lattice.candidates()).cost > 0
+
+
+def test_far_walls_change_neither_the_optimum_nor_the_cells():
+    fields = sample_scenario("clutter", 2).to_dict()
+    costs = []
+    for reach in (50.0, 100_000.0):
+        fields["arena"] = [-reach, -reach, 10.0 + reach, 10.0 + reach]
+        costs.append(find_optimum(Scenario.from_dict(fields)).cost)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
+    assert Lattice(Scenario.from_dict(fields)).cell == pytest.approx(0.2)
+
+
+def test_a_way_round_beyond_the_cropped_lattice_is_found():
+    wall = [{"polygon": {"vertices": [[4.0, -99.0], [6.0, -99.0], [6.0, 32.0], [4.0, 32.0]]}}]
+    fields = scenario_fields(arena=[-100, -100, 100, 100], obstacles=wall, horizon=80.0)
+    assert Lattice(Scenario.from_dict(fields)).cropped
+    optimum = find_optimum(Scenario.from_dict(fields))
+    assert optimum.success
+    assert optimum.states[:, 1].max() > 32.0
