@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from itertools import islice
@@ -14,7 +15,7 @@ from leapnav.envs.scenario import Scenario
 from leapnav.experts.certificate import certify, failure
 from leapnav.experts.direct import DirectPath, discretise, optimise
 from leapnav.experts.extremal import Extremal, Status
-from leapnav.experts.lattice import Lattice, is_connected
+from leapnav.experts.lattice import TOLERATED_DEPTH, Lattice, is_connected
 from leapnav.experts.multiple_shooting import confirm, polish
 from leapnav.experts.nodes import Settings
 from leapnav.experts.path_class import Mode, Side, driving_modes, heading_winding, path_sides
@@ -35,10 +36,11 @@ LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, Fals
 # Two paths this near at all times (metres, and as much in radians) lead to the same extremal; two extremals are the
 # same if their costs agree as well.
 SAME_PATH, SAME_COST = 0.15, 1e-6
+SHORT = 4.0  # m between start and goal; where it is less, paths nearer to each other are distinct
 # The cost of a direct path is off by less than this share, so what is dearer by more needs no look.
 DIRECT_ERROR = 0.01
-# How deep (m) an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
-SLIGHT = 0.1
+# How deep, in robot radii, an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
+SLIGHT = TOLERATED_DEPTH
 MOST_WASTED = 1_000_000  # evaluations of the flow by Newton's method in vain, on the paths of one lattice
 CLOSED = 1e-3  # sum of the violations of a direct path's constraints
 COMPARED = np.linspace(0.0, 1.0, 65)
@@ -51,9 +53,9 @@ class Optimum(Extremal):
     Attributes:
         alternatives: the other distinct local optima found, certified, in order of cost (theirs are empty).
         doubts: solutions found that are cheaper than this one but not certified: their status is COLLISION for those
-            that cut into an obstacle by up to 0.1 m (a path that just touches may then be cheaper than this optimum),
-            or says why there is no certificate. Extremals that cut deeper are no doubts: where the proximity cost is
-            worth its name, no path near them is both clear and cheap.
+            that cut into an obstacle by up to 0.4 of the robot's radius (a path that just touches may then be cheaper
+            than this optimum), or says why there is no certificate. Extremals that cut deeper are no doubts: where the
+            proximity cost is worth its name, no path near them is both clear and cheap.
 
     """
 
@@ -103,7 +105,8 @@ def find_optimum(scenario: Scenario, candidates: int = 12) -> Optimum:
     certificate holds is returned, with the others as `alternatives`.
 
     Args:
-        candidates: how many distinct paths to try at once; more are tried only as long as none of them is certified.
+        candidates: how many distinct paths to try at once; more are tried only as long as none of them is certified, or
+            a better one may have been missed.
 
     Returns:
         An `Optimum`; if nothing is certified, a failure whose status says why.
@@ -154,6 +157,8 @@ class Search:
 
     def __init__(self, scenario: Scenario, problem: OptimalControlProblem) -> None:
         self.scenario, self.problem = scenario, problem
+        self.slight = SLIGHT * scenario.robot.radius
+        self._same_path = SAME_PATH * min(1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT)
         self.certified: list[Extremal] = []
         self.refused: list[Extremal] = []
         self._seen: list[np.ndarray] = []
@@ -185,7 +190,7 @@ class Search:
         clearance = clearances(direct.states, self.scenario.field).min()
         if direct.cost > (1 + DIRECT_ERROR) * best and clearance <= 0:
             return
-        if clearance < -2.0 * SLIGHT:  # neither it nor a path near it is of any use
+        if clearance < -2.0 * self.slight:  # neither it nor a path near it is of any use
             self._deep.append((direct.cost, problem, direct))
             return
         # Where the cost is flat, paths to the same optimum are told from others by their refinement only.
@@ -196,7 +201,7 @@ class Search:
             return
         # Seen at twice as many points, a path may cut through a wall after all.
         clearance = clearances(refined.states, self.scenario.field).min()
-        if clearance < -2.0 * SLIGHT:
+        if clearance < -2.0 * self.slight:
             self._deep.append((direct.cost, problem, direct))
             return
         # Where the limits hardly leave a way, direct paths may not close their gaps, but Newton sometimes does.
@@ -205,7 +210,7 @@ class Search:
         extremal, work = _extremal(problem, refined) if trying else (None, 0)
         if extremal is None:
             self.wasted += work
-            likely = closed and clearance >= -SLIGHT
+            likely = closed and clearance >= -self.slight
             self._stalled.append((refined.cost if likely else np.inf, problem, refined))
             return
         if any(_same(extremal, other) for other in (*self.certified, *self.refused)):
@@ -217,7 +222,7 @@ class Search:
 
     def _known(self, direct: DirectPath) -> bool:
         shape = _shape(direct.times, direct.states)
-        return any(np.abs(shape - other).max() < SAME_PATH for other in self._seen)
+        return any(np.abs(shape - other).max() < self._same_path for other in self._seen)
 
     def result(self) -> Optimum:
         """The best extremal with the others, or, if none is certified, the cheapest that was refused or stalled."""
@@ -233,9 +238,14 @@ class Search:
 
     def doubts(self, cost: float) -> tuple[Extremal, ...]:
         """Solutions found that are cheaper than `cost` and not certified; see `Optimum`."""
-        refused = [extremal for extremal in self.refused if extremal.cost < cost and _may_be_beaten(extremal)]
+        refused = [extremal for extremal in self.refused if extremal.cost < cost and self._is_slight(extremal)]
         cheaper = [entry[1:] for entry in self._stalled if entry[0] < cost * (1 - DIRECT_ERROR)]
         return (*refused, *(_stalled(*entry) for entry in cheaper))
+
+    def _is_slight(self, extremal: Extremal) -> bool:
+        """Whether a collision-free path that is about as cheap is thinkable: not where an extremal cuts deep."""
+        clearance = extremal.certificate.clearance if extremal.certificate is not None else None
+        return clearance is None or clearance >= -self.slight
 
 
 def as_optimum(extremal: Extremal) -> Optimum:
@@ -268,12 +278,6 @@ def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> tuple[Extre
         if status is Status.SUCCESS:
             return confirm(problem, times, nodes, status, history, work, settings), work
     return None, work
-
-
-def _may_be_beaten(extremal: Extremal) -> bool:
-    """Whether a collision-free path that is about as cheap is thinkable: not where an extremal cuts deep."""
-    clearance = extremal.certificate.clearance if extremal.certificate is not None else None
-    return clearance is None or clearance >= -SLIGHT
 
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:
