@@ -125,22 +125,31 @@ def _arc(h, v, omega, theta):
     return theta + a, s, 0.5 * h * s1, 0.25 * h * h * s2
 
 
-@njit(
-    types.UniTuple(float64, 4)(vector, matrix, matrix, matrix, vector, vector, flags, float64, float64, constant),
-    cache=True,
-    error_model="numpy",
-    nogil=True,
-)
-def _merit(h, q, u, multipliers, end_multipliers, goal, free, turn_weight, unit, field):
-    """(cost, sum of violations, Lagrangian, sum of the violations' squares)."""
+@njit(float64(vector, matrix, matrix, float64, float64, constant), cache=True, error_model="numpy", nogil=True)
+def _cost(h, q, u, turn_weight, unit, field):
+    """J of the discretised problem over the speed weight."""
     intervals = len(h)
-    cost, gap, lagrangian, squares = 0.0, 0.0, 0.0, 0.0
+    cost = 0.0
     for k in range(intervals + 1):
         weight = 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
         cost += unit * weight * proximity(q[k, 0], q[k, 1], field)[0]
     for k in range(intervals):
+        cost += 0.5 * h[k] * (u[k, 0] * u[k, 0] + turn_weight * u[k, 1] * u[k, 1])
+    return cost
+
+
+@njit(
+    types.UniTuple(float64, 3)(vector, matrix, matrix, matrix, vector, vector, flags),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def _violations(h, q, u, multipliers, end_multipliers, goal, free):
+    """Sums over the violations of the constraints: of their sizes, times the multipliers, and of their squares."""
+    intervals = len(h)
+    gap, weighted, squares = 0.0, 0.0, 0.0
+    for k in range(intervals):
         v, omega = u[k, 0], u[k, 1]
-        cost += 0.5 * h[k] * (v * v + turn_weight * omega * omega)
         heading, s, _, _ = _arc(h[k], v, omega, q[k, 2])
         gap_x = q[k, 0] + h[k] * v * s * math.cos(heading) - q[k + 1, 0]
         gap_y = q[k, 1] + h[k] * v * s * math.sin(heading) - q[k + 1, 1]
@@ -148,14 +157,14 @@ def _merit(h, q, u, multipliers, end_multipliers, goal, free, turn_weight, unit,
         gap += abs(gap_x) + abs(gap_y) + abs(gap_theta)
         squares += gap_x * gap_x + gap_y * gap_y + gap_theta * gap_theta
         row = multipliers[k + 1]
-        lagrangian += row[0] * gap_x + row[1] * gap_y + row[2] * gap_theta
+        weighted += row[0] * gap_x + row[1] * gap_y + row[2] * gap_theta
     for i in range(3):
         if not free[i]:
             miss = q[intervals, i] - goal[i]
             gap += abs(miss)
             squares += miss * miss
-            lagrangian += end_multipliers[i] * miss
-    return cost, gap, cost + lagrangian, squares
+            weighted += end_multipliers[i] * miss
+    return gap, weighted, squares
 
 
 @njit(
@@ -365,6 +374,7 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
         for j in range(2):
             u[k, j] = min(max(u[k, j], -limits[j]), limits[j])
     cold = not np.any(costates)
+    current = _cost(h, q, u, turn_weight, unit, field)
     shift, largest, cost, gap = 0.0, 0.0, np.inf, np.inf
     for _ in range(max_iterations):
         _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps, W)
@@ -378,8 +388,7 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
             ):  # fmt: skip
                 shift = max(4.0 * shift, first_shift)
                 if not shift <= largest_shift:
-                    cost, gap, _, _ = _merit(h, q, u, multipliers, nu, goal, free, turn_weight, unit, field)
-                    return False, cost, gap
+                    return False, current, _violations(h, q, u, multipliers, nu, goal, free)[0]
             largest = 0.0
             for k in range(intervals):
                 for j in range(2):
@@ -410,8 +419,8 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
                         held[k, j], changed = (1 if value > 0.0 else -1), True
             if not changed:
                 break
-        _, _, lagrangian, squares = _merit(h, q, u, multipliers, nu, goal, free, turn_weight, unit, field)
-        before = lagrangian + PENALTY / horizon * squares
+        _, weighted, squares = _violations(h, q, u, multipliers, nu, goal, free)
+        before = current + weighted + PENALTY / horizon * squares
         damping, descends = 1.0, False
         cost, gap = np.inf, np.inf
         for _ in range(HALVINGS):
@@ -421,10 +430,9 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
             for k in range(intervals):
                 for j in range(2):
                     new_u[k, j] = min(max(u[k, j] + damping * du[k, j], -limits[j]), limits[j])
-            cost, gap, lagrangian, squares = _merit(
-                h, new_q, new_u, multipliers, nu, goal, free, turn_weight, unit, field
-            )
-            descends = lagrangian + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
+            cost = _cost(h, new_q, new_u, turn_weight, unit, field)
+            gap, weighted, squares = _violations(h, new_q, new_u, multipliers, nu, goal, free)
+            descends = cost + weighted + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
             if descends:
                 break
             damping *= 0.5
@@ -435,6 +443,7 @@ def descend(h, q, u, costates, goal, free, turn_weight, unit, limits, field, tol
             continue
         q[:] = new_q
         u[:] = new_u
+        current = cost
         share = 1.0 if cold else damping
         for k in range(intervals + 1):
             for i in range(3):
