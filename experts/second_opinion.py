@@ -80,6 +80,7 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     def note(name: str, count: int) -> None:
         nonlocal best, source, tried
         tried += count
+        search.wasted = 0  # each source has the whole patience for Newton's failures
         if search.certified and search.best.cost < best:
             best, source = search.best.cost, name
 
