@@ -2,15 +2,22 @@
 
 from leapnav.envs.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.families import FAMILIES, sample_scenario
-from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.navigation import NavigateEnv, NavigateGoalEnv
 from leapnav.envs.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario, ScenarioError
+from leapnav.envs.settings import Disturbance, Motor
+from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 
 __all__ = [
     "FAMILIES",
     "BankError",
     "Circle",
     "Cost",
+    "Disturbance",
+    "Motor",
     "NavigateEnv",
+    "NavigateGoalEnv",
+    "NavigateGoalVectorEnv",
+    "NavigateVectorEnv",
     "Obstacle",
     "Polygon",
     "Reference",

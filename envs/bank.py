@@ -7,6 +7,9 @@ maps it into memory. With n scenarios and N_i points of the i-th optimum, evenly
 |---|---|---|
 | `scenarios` | (bytes,) uint8 | the scenarios' JSON texts, one after the other |
 | `scenario_ends` | (n,) int64 | where each text ends |
+| `tasks` | (n, 11) float64 | start (3), goal (3, heading NaN if free), horizon, limits (2), weights (2) |
+| `fields` | (sum of the lengths,) float64 | the scenarios' packed obstacle fields, see `leapnav.envs.obstacles` |
+| `field_ends` | (n,) int64 | where each field ends |
 | `draws` | (n,) int64 | number of the random draw that gave the scenario |
 | `costs` | (n,) float64 | J* |
 | `second_costs` | (n,) float64 | J of the second-best local optimum found, NaN if there is none |
@@ -16,7 +19,7 @@ maps it into memory. With n scenarios and N_i points of the i-th optimum, evenly
 | `controls` | (sum of N_i, 2) float32 | speed (m/s), turn rate (rad/s) |
 | `costates` | (sum of N_i, 3) float32 | lambda, the gradient of the cost-to-go |
 
-Attributes of the file: `format` ("leapnav-bank"), `version` (1), `family`, `seed`, `drawn` (how many scenarios were
+Attributes of the file: `format` ("leapnav-bank"), `version` (2), `family`, `seed`, `drawn` (how many scenarios were
 drawn for the n that were admitted), `rejected` (JSON: how many were not, by reason) and `software` (the leapnav version
 that built it).
 """
@@ -33,15 +36,18 @@ from typing import Any, overload
 
 import numpy as np
 
-from leapnav.envs.scenario import Scenario
+from leapnav.envs.scenario import TASK_COLUMNS, Scenario
 
-FORMAT, VERSION = "leapnav-bank", 1
+FORMAT, VERSION = "leapnav-bank", 2
 INTERVAL = 0.1  # s between points of an optimum, at most
 SPLITS = ("train", "test")
 FOLDER = Path(__file__).parent / "banks"
 _TYPES = {
     "scenarios": "u1",
     "scenario_ends": "<i8",
+    "tasks": "<f8",
+    "fields": "<f8",
+    "field_ends": "<i8",
     "draws": "<i8",
     "costs": "<f8",
     "second_costs": "<f8",
@@ -52,7 +58,7 @@ _TYPES = {
     "costates": "<f4",
 }
 
-_WIDTHS = {"certificates": (4,), "states": (3,), "controls": (2,), "costates": (3,)}
+_WIDTHS = {"tasks": (TASK_COLUMNS,), "certificates": (4,), "states": (3,), "controls": (2,), "costates": (3,)}
 
 
 class BankError(ValueError):
@@ -106,7 +112,7 @@ class ScenarioBank(Sequence[Scenario]):
         drawn: how many scenarios were drawn for those that were admitted.
         rejected: how many of them were not admitted, by reason.
         software: the version of leapnav that built the bank.
-        costs (n,), second_costs (n,), certificates (n, 4), draws (n,): see the module.
+        costs (n,), second_costs (n,), certificates (n, 4), draws (n,), tasks (n, 11): see the module.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -136,7 +142,7 @@ class ScenarioBank(Sequence[Scenario]):
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
             self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
             self.rejected: dict[str, int] = dict(json.loads(attributes["rejected"]))
-            content = np.memmap(self.path, dtype="u1", mode="r")
+            content = np.asarray(np.memmap(self.path, dtype="u1", mode="r"))
             arrays = {
                 name: content[start : start + size].view(_TYPES[name]).reshape(shape)
                 for name, (start, size, shape) in places.items()
@@ -149,6 +155,7 @@ class ScenarioBank(Sequence[Scenario]):
         self._arrays = arrays
         self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
+        self.tasks = arrays["tasks"]
         self._scenarios: dict[int, Scenario] = {}
 
     @classmethod
@@ -208,10 +215,30 @@ class ScenarioBank(Sequence[Scenario]):
             second_cost=None if math.isnan(second) else second,
             certificate=(residual, defect, drift, clearance),
             times=np.linspace(0.0, self[i].horizon, end - start),
-            states=self._arrays["states"][start:end],
+            states=self.states(i),
             controls=self._arrays["controls"][start:end],
             costates=self._arrays["costates"][start:end],
         )
+
+    def field(self, index: int) -> np.ndarray:
+        """The packed obstacle field of a scenario, without a look at the scenario itself.
+
+        Raises:
+            IndexError: there are fewer scenarios.
+
+        """
+        start, end = self._span("field_ends", self._number(index))
+        return self._arrays["fields"][start:end]
+
+    def states(self, index: int) -> np.ndarray:
+        """The states (N, 3) of a scenario's optimum alone, see `Reference`.
+
+        Raises:
+            IndexError: there are fewer scenarios.
+
+        """
+        start, end = self._span("path_ends", self._number(index))
+        return self._arrays["states"][start:end]
 
     def _number(self, index: int) -> int:
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)):
@@ -250,10 +277,11 @@ def _place(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
 
 def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
     count = len(arrays["costs"])
-    for name in ("scenario_ends", "draws", "second_costs", "certificates", "path_ends"):
+    for name in ("scenario_ends", "tasks", "field_ends", "draws", "second_costs", "certificates", "path_ends"):
         if len(arrays[name]) != count:
             raise ValueError(f"{name}: {len(arrays[name])} entries for {count} scenarios")
-    for ends, contents in (("scenario_ends", ("scenarios",)), ("path_ends", ("states", "controls", "costates"))):
+    paths = ("states", "controls", "costates")
+    for ends, contents in (("scenario_ends", ("scenarios",)), ("field_ends", ("fields",)), ("path_ends", paths)):
         last = int(arrays[ends][-1]) if count else 0
         if (np.diff(arrays[ends], prepend=0) <= 0).any() or any(len(arrays[name]) != last for name in contents):
             raise ValueError(f"{ends}: not the ends of {' and '.join(contents)}")
@@ -278,9 +306,13 @@ def write_bank(
     import h5py
 
     texts = [entry.scenario.encode() for entry in entries]
+    scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
     arrays = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
         "scenario_ends": np.cumsum([len(text) for text in texts]),
+        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(-1, TASK_COLUMNS),
+        "fields": np.concatenate([np.empty(0), *(scenario.field for scenario in scenarios)]),
+        "field_ends": np.cumsum([len(scenario.field) for scenario in scenarios]),
         "draws": [entry.draw for entry in entries],
         "costs": [entry.cost for entry in entries],
         "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],

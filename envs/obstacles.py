@@ -24,6 +24,7 @@ from numba import float64, int64, njit, types
 
 # A term whose distance exceeds 40 sigma is below 1e-17 k, the rounding error of the sum, and is skipped exactly.
 CUTOFF = 40.0
+VALUE_CUTOFF = 25.0  # where nothing is differentiated
 CIRCLES, POLYGONS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # positions in the packed field
 FEW, MOST_CELLS = 16, 32  # obstacles without a grid; columns or lines of one
 _field = types.Array(types.float64, 1, "C", readonly=True)
@@ -59,7 +60,7 @@ def blend_fields(first: np.ndarray, second: np.ndarray, share: float) -> np.ndar
         ValueError: they do not hold the same kinds of obstacles.
 
     """
-    parts = [_unpack(first), _unpack(second)]
+    parts = [unpack_field(first), unpack_field(second)]
     (circles, polygons), (other_circles, other_polygons) = parts
     if len(circles) != len(other_circles) or [len(p) for p in polygons] != [len(p) for p in other_polygons]:
         raise ValueError("obstacles: two fields can be blended only if they hold the same kinds of obstacles")
@@ -82,7 +83,7 @@ def _finish(header: list[float], circles: list[float], polygons: list[float], nu
     return field
 
 
-def _unpack(packed: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def unpack_field(packed: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Circles (count, 3) and the rows (m, 5) of each polygon."""
     at = SHAPES + 3 * int(packed[CIRCLES])
     circles = packed[SHAPES:at].reshape(-1, 3)
@@ -96,7 +97,7 @@ def _unpack(packed: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 def obstacle_centres(packed: np.ndarray) -> np.ndarray:
     """Middle of each obstacle (number, 2), a polygon's the mean of its vertices, in the scenario's order."""
-    circles, polygons = _unpack(packed)
+    circles, polygons = unpack_field(packed)
     centres = [*circles[:, :2], *(polygon[:, 3:].mean(axis=0) for polygon in polygons)]
     numbers = packed[int(packed[GRID]) - len(centres) : int(packed[GRID])].astype(int)
     ordered = np.empty((len(centres), 2))
@@ -108,7 +109,7 @@ def obstacle_centres(packed: np.ndarray) -> np.ndarray:
 def _pack_grid(packed: np.ndarray) -> np.ndarray:
     """The grid of a field; obstacles are felt up to CUTOFF scales from the robot's rim."""
     reach = packed[2] + CUTOFF * packed[1]
-    circles, polygons = _unpack(packed)
+    circles, polygons = unpack_field(packed)
     positions = [SHAPES + 3 * i for i in range(len(circles))]
     at = SHAPES + 3 * len(circles)
     for polygon in polygons:
@@ -156,7 +157,7 @@ def sinc(angle):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _polygon_distance(x, y, field, rows, edges):
+def polygon_distance(x, y, field, rows, edges):
     """Euclidean distance to a convex polygon, negative inside."""
     inside = -np.inf
     outside = np.inf
@@ -173,92 +174,117 @@ def _polygon_distance(x, y, field, rows, edges):
     return inside if inside < 0 else outside
 
 
+def _proximity_kernel(derivatives: bool, cutoff: float) -> Any:
+    """The proximity cost with or without its derivatives, of the obstacles up to `cutoff` scales away."""
+
+    @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
+    def kernel(x, y, field):
+        k, radius = field[0], field[2]
+        reach = cutoff * field[1]
+        steepness = 1.0 / field[1]  # divisions are the slow part of a term, after exp()
+        value = gx = gy = hxx = hxy = hyy = 0.0
+        for side in range(4):  # walls: one half-plane each, the inside positive
+            along_x = side % 2 == 0
+            sign = 1.0 if side < 2 else -1.0
+            distance = sign * ((x if along_x else y) - field[ARENA + side]) - radius
+            if distance < reach:
+                term = k * math.exp(-distance * steepness)
+                slope = sign * term * steepness
+                value += term
+                if along_x:
+                    gx -= slope
+                    hxx += sign * slope * steepness
+                else:
+                    gy -= slope
+                    hyy += sign * slope * steepness
+        grid = int(field[GRID])
+        columns, lines = int(field[grid + 3]), int(field[grid + 4])
+        begins = grid + 5
+        if columns * lines > 1:
+            column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
+            line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
+            begins += column * lines + line
+        lists = grid + 6 + columns * lines
+        polygons = SHAPES + 3 * int(field[CIRCLES])
+        for entry in range(lists + int(field[begins]), lists + int(field[begins + 1])):
+            at = int(field[entry])
+            if at < polygons:
+                dx, dy = x - field[at], y - field[at + 1]
+                rim = field[at + 2] + radius
+                square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
+                if square < (rim + reach) ** 2:
+                    smooth = math.sqrt(square)
+                    term = k * math.exp((rim - smooth) * steepness)
+                    value += term
+                    if not derivatives:
+                        continue
+                    inverse = 1.0 / smooth
+                    nx, ny = dx * inverse, dy * inverse
+                    slope = term * steepness
+                    curl = slope * inverse
+                    bend = slope * steepness + curl
+                    gx -= slope * nx
+                    gy -= slope * ny
+                    hxx += bend * nx * nx - curl
+                    hxy += bend * nx * ny
+                    hyy += bend * ny * ny - curl
+            else:
+                edges = int(field[at])
+                rows = at + 1
+                farthest = -np.inf
+                for j in range(edges):
+                    row = rows + 5 * j
+                    farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+                distance = farthest - radius
+                if distance < reach:
+                    total = mx = my = sxx = sxy = syy = 0.0
+                    for j in range(edges):
+                        row = rows + 5 * j
+                        nx, ny = field[row], field[row + 1]
+                        # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
+                        exponent = (nx * x + ny * y - field[row + 2] - farthest) * steepness
+                        if exponent < -cutoff:
+                            continue
+                        share = math.exp(exponent)
+                        total += share
+                        if not derivatives:
+                            continue
+                        mx += share * nx
+                        my += share * ny
+                        sxx += share * nx * nx
+                        sxy += share * nx * ny
+                        syy += share * ny * ny
+                    part = 1.0 / total
+                    term = k * math.exp(-distance * steepness) * part
+                    value += term
+                    if not derivatives:
+                        continue
+                    mx, my = mx * part, my * part
+                    slope = term * steepness
+                    bend = slope * steepness
+                    gx -= slope * mx
+                    gy -= slope * my
+                    hxx += bend * (2 * mx * mx - sxx * part)
+                    hxy += bend * (2 * mx * my - sxy * part)
+                    hyy += bend * (2 * my * my - syy * part)
+        return value, gx, gy, hxx, hxy, hyy
+
+    return kernel
+
+
+_proximity, _proximity_value = _proximity_kernel(True, CUTOFF), _proximity_kernel(False, VALUE_CUTOFF)
+
+
 @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
 def proximity(x, y, field):
     """Proximity cost at a point: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
-    k, radius = field[0], field[2]
-    reach = CUTOFF * field[1]
-    steepness = 1.0 / field[1]  # divisions are the slow part of a term, after exp()
-    value = gx = gy = hxx = hxy = hyy = 0.0
-    for side in range(4):  # walls: one half-plane each, the inside positive
-        along_x = side % 2 == 0
-        sign = 1.0 if side < 2 else -1.0
-        distance = sign * ((x if along_x else y) - field[ARENA + side]) - radius
-        if distance < reach:
-            term = k * math.exp(-distance * steepness)
-            slope = sign * term * steepness
-            value += term
-            if along_x:
-                gx -= slope
-                hxx += sign * slope * steepness
-            else:
-                gy -= slope
-                hyy += sign * slope * steepness
-    grid = int(field[GRID])
-    columns, lines = int(field[grid + 3]), int(field[grid + 4])
-    begins = grid + 5
-    if columns * lines > 1:
-        column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
-        line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
-        begins += column * lines + line
-    lists = grid + 6 + columns * lines
-    polygons = SHAPES + 3 * int(field[CIRCLES])
-    for entry in range(lists + int(field[begins]), lists + int(field[begins + 1])):
-        at = int(field[entry])
-        if at < polygons:
-            dx, dy = x - field[at], y - field[at + 1]
-            rim = field[at + 2] + radius
-            square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
-            if square < (rim + reach) ** 2:
-                smooth = math.sqrt(square)
-                inverse = 1.0 / smooth
-                term = k * math.exp((rim - smooth) * steepness)
-                nx, ny = dx * inverse, dy * inverse
-                slope = term * steepness
-                curl = slope * inverse
-                bend = slope * steepness + curl
-                value += term
-                gx -= slope * nx
-                gy -= slope * ny
-                hxx += bend * nx * nx - curl
-                hxy += bend * nx * ny
-                hyy += bend * ny * ny - curl
-        else:
-            edges = int(field[at])
-            rows = at + 1
-            farthest = -np.inf
-            for j in range(edges):
-                row = rows + 5 * j
-                farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
-            distance = farthest - radius
-            if distance < reach:
-                total = mx = my = sxx = sxy = syy = 0.0
-                for j in range(edges):
-                    row = rows + 5 * j
-                    nx, ny = field[row], field[row + 1]
-                    # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
-                    exponent = (nx * x + ny * y - field[row + 2] - farthest) * steepness
-                    if exponent < -CUTOFF:
-                        continue
-                    share = math.exp(exponent)
-                    total += share
-                    mx += share * nx
-                    my += share * ny
-                    sxx += share * nx * nx
-                    sxy += share * nx * ny
-                    syy += share * ny * ny
-                part = 1.0 / total
-                term = k * math.exp(-distance * steepness) * part
-                mx, my = mx * part, my * part
-                slope = term * steepness
-                bend = slope * steepness
-                value += term
-                gx -= slope * mx
-                gy -= slope * my
-                hxx += bend * (2 * mx * mx - sxx * part)
-                hxy += bend * (2 * mx * my - sxy * part)
-                hyy += bend * (2 * my * my - syy * part)
-    return value, gx, gy, hxx, hxy, hyy
+    return _proximity(x, y, field)
+
+
+@njit(float64(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
+def proximity_value(x, y, field):
+    """Proximity cost at a point, without derivatives, to 1e-11 of the weight for each obstacle."""
+    return _proximity_value(x, y, field)[0]
 
 
 @njit(types.Tuple((float64, int64))(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
@@ -277,16 +303,24 @@ def clearance(x, y, field):
     nearest = circles + polygons
     at = SHAPES
     for i in range(circles):
-        distance = math.hypot(x - field[at], y - field[at + 1]) - field[at + 2]
+        dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2]
         at += 3
-        if distance < best:
-            best, nearest = distance, int(field[numbers + i])
+        if dx * dx + dy * dy < max(best + rim, 0.0) ** 2:  # a root only for the few that are nearer
+            distance = math.sqrt(dx * dx + dy * dy) - rim
+            if distance < best:
+                best, nearest = distance, int(field[numbers + i])
     for i in range(polygons):
         edges = int(field[at])
-        distance = _polygon_distance(x, y, field, at + 1, edges)
-        at += 1 + 5 * edges
-        if distance < best:
-            best, nearest = distance, int(field[numbers + circles + i])
+        rows = at + 1
+        at = rows + 5 * edges
+        farthest = -np.inf  # of the half-planes: never more than the distance
+        for j in range(edges):
+            row = rows + 5 * j
+            farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+        if farthest < best:
+            distance = polygon_distance(x, y, field, rows, edges)
+            if distance < best:
+                best, nearest = distance, int(field[numbers + circles + i])
     return best - radius, nearest
 
 
@@ -361,29 +395,62 @@ def sample_grid(field, x0, y0, spacing, columns, lines, band):
                         row = rows + 5 * k
                         total += math.exp((field[row] * x + field[row + 1] * y - field[row + 2] - farthest) * steepness)
                     phi[i, j] += weight * math.exp((radius - farthest) * steepness) / total
-                    closest[i, j] = min(closest[i, j], _polygon_distance(x, y, field, rows, edges) - radius)
+                    closest[i, j] = min(closest[i, j], polygon_distance(x, y, field, rows, edges) - radius)
         at += 3 if edges == 0 else 1 + 5 * edges
     return phi, closest
 
 
-@njit(float64(float64, float64, float64, float64, float64, _field), cache=True, error_model="numpy", nogil=True)
-def arc_clearance(x, y, heading, distance, turn, field):
-    """Smallest clearance (m) along a circular arc, exact to a millimetre.
+@njit(
+    float64(float64, float64, float64, float64, float64, float64, _field),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def _arc_clearance_at(x, y, heading, distance, turn, share, field):
+    chord = distance * share * sinc(turn * share / 2)
+    middle = heading + turn * share / 2
+    return clearance(x + chord * math.cos(middle), y + chord * math.sin(middle), field)[0]
 
-    The arc starts at a pose, is `distance` metres long (negative: backwards) and turns by `turn` radians. Clearance
-    changes by no more than the way driven, so the walk skips what cannot hold a smaller value. It ends at the first
-    touch: how deep the arc goes from there does not matter.
+
+@njit(
+    types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, float64, _field),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def follow_arc(x, y, heading, distance, turn, before, field):
+    """Walks along a circular arc: (smallest clearance in m, share until the first touch, clearance at the end).
+
+    The arc starts at a pose whose clearance is `before`, is `distance` metres long (negative: backwards) and turns by
+    `turn` radians. Its smallest clearance is exact to a millimetre, or to 2 % where that is more. A share below 1 means
+    a touch: the walk ends there, at a clearance of 0 to 0.01 mm, and the smallest clearance is then not positive.
     """
     total = abs(distance)
-    lowest, _ = clearance(x, y, field)
-    driven = 0.0
-    while driven < total and lowest > 0.0:
-        part = driven / total
-        chord = distance * part * sinc(turn * part / 2)
-        middle = heading + turn * part / 2
-        here, _ = clearance(x + chord * math.cos(middle), y + chord * math.sin(middle), field)
-        lowest = min(lowest, here)
-        driven += max(here - lowest + 1e-3, 1e-3)
-    chord = distance * sinc(turn / 2)
-    here, _ = clearance(x + chord * math.cos(heading + turn / 2), y + chord * math.sin(heading + turn / 2), field)
-    return min(lowest, here)
+    if before <= 0.0:
+        return before, 0.0, before
+    # Clearance changes by no more than the way driven, so two ends bound all between them.
+    at, here = 0.0, before
+    end, there = total, _arc_clearance_at(x, y, heading, distance, turn, 1.0, field)
+    last = there
+    lowest = min(before, there)
+    while at < total and lowest > 0.0:
+        if (here + there - (end - at)) / 2 >= lowest - max(1e-3, 0.02 * lowest):
+            at, here = end, there
+            end, there = total, last
+        else:
+            end = (at + end) / 2
+            there = _arc_clearance_at(x, y, heading, distance, turn, end / total, field)
+            lowest = min(lowest, there)
+    if lowest > 0.0:
+        return lowest, 1.0, last
+    # From a free point, the way to the first touch is at least the clearance; all of it could end on the other side.
+    for _ in range(200):
+        step = 0.999 * here
+        following = _arc_clearance_at(x, y, heading, distance, turn, min((at + step) / total, 1.0), field)
+        if following <= 0.0:
+            break
+        at += step
+        here = following
+        if here < 1e-5:
+            break
+    return min(lowest, 0.0), min(at / total, 1.0 - 1e-15), here

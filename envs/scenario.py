@@ -21,6 +21,8 @@ from leapnav.envs.obstacles import clearance, pack_field
 
 # Squares of larger numbers, in metres or seconds, would leave nothing of a double's precision for the robot.
 LARGEST = 1e6
+# Columns of a packed task: start (x, y, heading), goal (its heading NaN if free), then these.
+START, GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, TURN_WEIGHT, TASK_COLUMNS = 0, 3, 6, 7, 8, 9, 10, 11
 Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST, allow_inf_nan=False)]
 Point = tuple[Finite, Finite]
@@ -160,6 +162,16 @@ class Scenario(_Frozen):
         shapes = [obstacle.shape for obstacle in self.obstacles]
         return pack_field(shapes, self.arena, self.robot.radius, cost.proximity_weight, cost.proximity_scale)
 
+    @cached_property
+    def task(self) -> np.ndarray:
+        """What the environments' kernels need beside the field: TASK_COLUMNS numbers (read-only)."""
+        goal, robot, cost = self.goal, self.robot, self.cost
+        heading = math.nan if goal[2] is None else goal[2]
+        limits, weights = (robot.max_speed, robot.max_turn_rate), (cost.speed_weight, cost.turn_weight)
+        task = np.array([*self.start, goal[0], goal[1], heading, self.horizon, *limits, *weights])
+        task.flags.writeable = False
+        return task
+
     def __eq__(self, other: object) -> bool:
         # By field: pydantic would compare the cached arrays too.
         return isinstance(other, Scenario) and self._key() == other._key()
@@ -177,8 +189,8 @@ class Scenario(_Frozen):
 
     def __getstate__(self) -> dict[Any, Any]:
         state = super().__getstate__()
-        # The packed field is made again where the scenario arrives: pickled arrays come out writeable.
-        return {**state, "__dict__": {k: v for k, v in state["__dict__"].items() if k != "field"}}
+        # The packed arrays are made again where the scenario arrives: pickled ones come out writeable.
+        return {**state, "__dict__": {k: v for k, v in state["__dict__"].items() if k not in ("field", "task")}}
 
     def to_json(self, path: str | Path | None = None) -> str:
         """The scenario as JSON text; also written to `path` if one is given."""

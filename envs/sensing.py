@@ -1,92 +1,256 @@
-"""What the robot senses: lidar ranges and the goal, as compiled kernels."""
+"""What the robot senses, as compiled kernels: the goal, its own motion, lidar ranges or a map of what is near."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import float32, float64, njit, types
+from numba import float32, float64, int64, njit, types
 
-from leapnav.envs.obstacles import ARENA, CIRCLES, POLYGONS, SHAPES
+from leapnav.envs.obstacles import ARENA, CIRCLES, POLYGONS, SHAPES, polygon_distance
+from leapnav.envs.settings import (
+    GOAL_CONDITIONED,
+    LIDAR_RANGE,
+    MOTORS,
+    OBSERVATION,
+    OBSTACLES,
+    PERIOD,
+    SENSING_NOISE,
+    VERTICES,
+)
 
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
-# Entries of the observation before the lidar ranges; the environment's docstring says what they mean.
-POSE_ENTRIES = 9
+# Entries of the parts of an observation; the environments' docstrings say what they mean.
+GOAL_ENTRIES, MOTION_ENTRIES, WALL_ENTRIES, POSE_ENTRIES = 9, 3, 6, 4
+FASTEST = 20.0  # m/s and rad/s; velocities beyond are clipped
 
 
-@njit(float64(float64, float64, float64, float64, _field, float64), cache=True, error_model="numpy", nogil=True)
-def cast_ray(x, y, dx, dy, field, reach):
-    """Distance (m) from (x, y) along the unit vector (dx, dy) to the first obstacle or wall, at most `reach`."""
-    nearest = reach
-    if dx > 0:
-        nearest = min(nearest, (field[ARENA + 2] - x) / dx)
-    elif dx < 0:
-        nearest = min(nearest, (field[ARENA] - x) / dx)
-    if dy > 0:
-        nearest = min(nearest, (field[ARENA + 3] - y) / dy)
-    elif dy < 0:
-        nearest = min(nearest, (field[ARENA + 1] - y) / dy)
+@njit(
+    types.none(float64, float64, float64, float64, _field, float64, float64[:, ::1], float64[:, ::1]),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def scan(x, y, cos, sin, field, reach, beams, scratch):
+    """Lidar ranges (m), at most `reach`, into `scratch[2]`.
+
+    Args:
+        x, y, cos, sin: where the lidar is and looks.
+        field: the packed field of the scenario.
+        reach: m.
+        beams (2, n): cosines and sines of the beams' angles in the lidar's frame.
+        scratch (5, n): the last rows are used.
+
+    Every obstacle is cast at all beams at once, without branches: compilers turn that into vector instructions.
+
+    """
+    count = beams.shape[1]
+    dxs, dys, nearest, enter, leave = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    to_right, to_top = field[ARENA + 2] - x, field[ARENA + 3] - y
+    to_left, to_bottom = field[ARENA] - x, field[ARENA + 1] - y
+    for k in range(count):
+        dx = cos * beams[0, k] - sin * beams[1, k]
+        dy = sin * beams[0, k] + cos * beams[1, k]
+        dxs[k], dys[k] = dx, dy
+        # A division by zero gives infinity, or from the very wall not a number, which is then no hit.
+        across = (to_right if dx > 0.0 else to_left) / dx
+        along = (to_top if dy > 0.0 else to_bottom) / dy
+        first = across if across < along else along
+        nearest[k] = first if first < reach else reach
     at = SHAPES
     for _ in range(int(field[CIRCLES])):
         cx, cy, r = field[at] - x, field[at + 1] - y, field[at + 2]
         at += 3
-        along = cx * dx + cy * dy
-        beside = cx * dy - cy * dx
-        square = r * r - beside * beside
-        if square > 0:
-            half = math.sqrt(square)
-            if along + half > 0:
-                nearest = min(nearest, along - half)
+        if cx * cx + cy * cy >= (r + reach) ** 2:
+            continue
+        for k in range(count):
+            along = cx * dxs[k] + cy * dys[k]
+            beside = cx * dys[k] - cy * dxs[k]
+            square = r * r - beside * beside
+            half = math.sqrt(square if square > 0.0 else 0.0)
+            hit = along - half if square > 0.0 and along + half > 0.0 else reach
+            nearest[k] = hit if hit < nearest[k] else nearest[k]
     for _ in range(int(field[POLYGONS])):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges
-        # The part of the ray inside the polygon is the part behind all of its edges.
-        enter, leave = -np.inf, np.inf
+        farthest = -np.inf
         for j in range(edges):
             row = rows + 5 * j
-            rate = field[row] * dx + field[row + 1] * dy
-            height = field[row] * x + field[row + 1] * y - field[row + 2]
-            if rate < 0:
-                enter = max(enter, -height / rate)
-            elif rate > 0:
-                leave = min(leave, -height / rate)
-            elif height > 0:
-                leave = -np.inf
-        if enter <= leave and leave > 0:
-            nearest = min(nearest, enter)
-    return max(nearest, 0.0)
+            farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+        if farthest >= reach:
+            continue
+        # The part of a ray inside the polygon is the part behind all of its edges.
+        for k in range(count):
+            enter[k], leave[k] = -np.inf, np.inf
+        for j in range(edges):
+            row = rows + 5 * j
+            nx, ny = field[row], field[row + 1]
+            height = nx * x + ny * y - field[row + 2]
+            for k in range(count):
+                rate = nx * dxs[k] + ny * dys[k]
+                # A ray along an edge is inside or outside of it all the way.
+                crossing = -height / rate if rate != 0.0 else (-np.inf if height > 0.0 else np.inf)
+                enter[k] = crossing if rate < 0.0 and crossing > enter[k] else enter[k]
+                leave[k] = crossing if rate >= 0.0 and crossing < leave[k] else leave[k]
+        for k in range(count):
+            hit = enter[k] if enter[k] <= leave[k] and leave[k] > 0.0 else reach
+            nearest[k] = hit if hit < nearest[k] else nearest[k]
+    for k in range(count):
+        nearest[k] = nearest[k] if nearest[k] > 0.0 else 0.0
+
+
+@njit(int64(_field), cache=True, error_model="numpy", nogil=True)
+def most_vertices(field):
+    """Vertices of the polygon that has most, 0 without polygons."""
+    at = SHAPES + 3 * int(field[CIRCLES])
+    most = 0
+    for _ in range(int(field[POLYGONS])):
+        most = max(most, int(field[at]))
+        at += 1 + 5 * int(field[at])
+    return most
+
+
+@njit(
+    types.none(float64, float64, float64, float64, _field, int64, int64, float64[::1]),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def survey(x, y, cos, sin, field, obstacles, vertices, out):
+    """The walls and the nearest obstacles in the robot's frame, nearest first.
+
+    `out` takes WALL_ENTRIES + obstacles (2 + 2 vertices) numbers. An obstacle is a polygon rounded by a radius: 1, the
+    radius, and the vertices; a disc has one vertex, a polygon no radius. Vertices are repeated to fill the row; rows
+    without an obstacle are zeros.
+    """
+    out[0], out[1] = x - field[ARENA], y - field[ARENA + 1]
+    out[2], out[3] = field[ARENA + 2] - x, field[ARENA + 3] - y
+    out[4], out[5] = cos, sin
+    width = 2 + 2 * vertices
+    out[WALL_ENTRIES : WALL_ENTRIES + obstacles * width] = 0.0
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    # Insertion into a short list, nearest first.
+    distances = np.full(obstacles, np.inf)
+    places = np.zeros(obstacles, np.int64)
+    at = SHAPES
+    for i in range(circles + polygons):
+        if i < circles:
+            distance = math.sqrt((field[at] - x) ** 2 + (field[at + 1] - y) ** 2) - field[at + 2]
+            size = 3
+        else:
+            edges = int(field[at])
+            distance = polygon_distance(x, y, field, at + 1, edges)
+            size = 1 + 5 * edges
+        place = obstacles
+        while place > 0 and distance < distances[place - 1]:
+            place -= 1
+        if place < obstacles:
+            for k in range(obstacles - 1, place, -1):
+                distances[k], places[k] = distances[k - 1], places[k - 1]
+            distances[place], places[place] = distance, (at if i < circles else -at)
+        at += size
+    for k in range(obstacles):
+        if distances[k] == np.inf:
+            break
+        row = WALL_ENTRIES + k * width
+        at = abs(places[k])
+        disc = places[k] > 0
+        out[row] = 1.0
+        out[row + 1] = field[at + 2] if disc else 0.0
+        edges = 1 if disc else int(field[at])
+        for j in range(vertices):
+            vertex = at if disc else at + 1 + 5 * (j % edges) + 3
+            dx, dy = field[vertex] - x, field[vertex + 1] - y
+            out[row + 2 + 2 * j] = cos * dx + sin * dy
+            out[row + 3 + 2 * j] = cos * dy - sin * dx
 
 
 @njit(
     types.none(
-        float64, float64, float64, float64, float64, float64, float64, float64, float64, _field, float64, float32[::1]
+        float64[::1],
+        float64[::1],
+        float64[::1],
+        float64,
+        _field,
+        float64[::1],
+        float64[::1],
+        float64[:, ::1],
+        float64[:, ::1],
+        float64[::1],
+        float64[::1],
+        float32[:, ::1],
+        float32[::1],
     ),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
-def observe(x, y, heading, goal_x, goal_y, goal_heading, time_left, shortest_time, limit, field, reach, out):
-    """Fills `out` with the observation that `Navigate`'s docstring describes; a NaN goal heading is a free one.
+def observe(pose, velocity, goal, time_left, field, noise, settings, beams, scratch, survey_row, row, bounds, out):
+    """Fills `out` with the observation that `NavigateEnv` describes; a NaN goal heading is a free one.
 
-    Velocities needed are distances over the time left, at least `shortest_time`, and no larger than `limit`.
+    Args:
+        pose, velocity, goal: (x, y, heading), their rates, and where to be.
+        time_left: s.
+        field: the packed field of the scenario.
+        noise: standard normal, for the pose (3) and each lidar range; unread if the settings have no sensing noise.
+        settings: see `leapnav.envs.settings`.
+        beams, scratch: see `scan`.
+        survey_row: room for `survey`.
+        row: room for the observation before it is rounded.
+        bounds (2, n): the lowest and highest values.
+
     """
+    x, y, heading = pose[0], pose[1], pose[2]
+    deviation = settings[SENSING_NOISE]
+    if deviation != 0.0:
+        x, y, heading = x + deviation * noise[0], y + deviation * noise[1], heading + deviation * noise[2]
     cos, sin = math.cos(heading), math.sin(heading)
-    dx, dy = goal_x - x, goal_y - y
-    ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-    turn = 0.0 if math.isnan(goal_heading) else (goal_heading - heading + math.pi) % (2 * math.pi) - math.pi
-    time = max(time_left, shortest_time)
-    out[0] = ahead
-    out[1] = left
-    out[2] = 0.0 if math.isnan(goal_heading) else math.cos(turn)
-    out[3] = 0.0 if math.isnan(goal_heading) else math.sin(turn)
-    out[4] = time_left
-    out[5] = min(max(ahead / time, -limit), limit)
-    out[6] = min(max(left / time, -limit), limit)
-    out[7] = min(math.hypot(dx, dy) / time, limit)
-    out[8] = min(max(turn / time, -limit), limit)
-    beams = len(out) - POSE_ENTRIES
-    for k in range(beams):
-        angle = heading + 2 * math.pi * k / beams
-        out[POSE_ENTRIES + k] = cast_ray(x, y, math.cos(angle), math.sin(angle), field, reach)
+    free = math.isnan(goal[2])
+    at = 0
+    if settings[GOAL_CONDITIONED] == 0.0:
+        dx, dy = goal[0] - x, goal[1] - y
+        ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
+        turn = 0.0 if free else (goal[2] - heading + math.pi) % (2 * math.pi) - math.pi
+        time = max(time_left, settings[PERIOD])
+        row[0] = ahead
+        row[1] = left
+        row[2] = 0.0 if free else math.cos(turn)
+        row[3] = 0.0 if free else math.sin(turn)
+        row[4] = time_left
+        row[5] = ahead / time
+        row[6] = left / time
+        row[7] = math.sqrt(dx * dx + dy * dy) / time
+        row[8] = turn / time
+        at = GOAL_ENTRIES
+    else:
+        row[0], row[1], row[2], row[3] = x, y, cos, sin
+        row[4], row[5] = goal[0], goal[1]
+        row[6] = 0.0 if free else math.cos(goal[2])
+        row[7] = 0.0 if free else math.sin(goal[2])
+        row[8] = time_left
+        at = 2 * POSE_ENTRIES + 1
+    if settings[MOTORS] != 0.0:
+        row[at] = cos * velocity[0] + sin * velocity[1]
+        row[at + 1] = cos * velocity[1] - sin * velocity[0]
+        row[at + 2] = velocity[2]
+        at += MOTION_ENTRIES
+    if settings[OBSERVATION] == 0.0:
+        reach = settings[LIDAR_RANGE]
+        count = beams.shape[1]
+        if count > 0:
+            scan(x, y, cos, sin, field, reach, beams, scratch)
+            for k in range(count):
+                row[at + k] = scratch[2, k]
+            if deviation != 0.0:
+                for k in range(count):
+                    row[at + k] += deviation * noise[3 + k]
+    elif settings[OBSERVATION] == 2.0:
+        survey(x, y, cos, sin, field, int(settings[OBSTACLES]), int(settings[VERTICES]), survey_row)
+        for k in range(len(survey_row)):
+            row[at + k] = survey_row[k]
+    for k in range(len(out)):
+        value = np.float32(row[k])
+        value = bounds[0, k] if value < bounds[0, k] else value
+        out[k] = bounds[1, k] if value > bounds[1, k] else value

@@ -139,7 +139,7 @@ def _demonstrations_of_seed(family: str, seed: int, recoveries: int) -> list[Dem
     extremal = find_optimum(scenario)
     if not extremal.success:
         return []
-    env = NavigateEnv(family)
+    env = NavigateEnv(family, split="fresh")
     found = [demonstrate(env, scenario, extremal)]
     # A stream of its own: recoveries change nothing in the scenarios.
     rng = np.random.default_rng([seed, 1])

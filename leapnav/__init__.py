@@ -16,6 +16,13 @@ __all__ = ["__version__"]
 __path__ = extend_path(__path__, __name__)
 __version__ = version("leapnav")
 
-_ENVIRONMENT = "leapnav/Navigate-v0"
-if _ENVIRONMENT not in gymnasium.registry:  # subprocess workers import again
-    gymnasium.register(_ENVIRONMENT, entry_point="leapnav.envs.navigation:NavigateEnv")
+# Gymnasium's wrappers would hide `compute_reward`; what they check, the environment checks itself.
+_BARE = {"order_enforce": False, "disable_env_checker": True}
+for _name, _options in (("Navigate", {}), ("NavigateGoal", _BARE)):
+    if f"leapnav/{_name}-v0" not in gymnasium.registry:  # subprocess workers import again
+        gymnasium.register(
+            f"leapnav/{_name}-v0",
+            entry_point=f"leapnav.envs.navigation:{_name}Env",
+            vector_entry_point=f"leapnav.envs.vector:{_name}VectorEnv",
+            **_options,
+        )

@@ -1,4 +1,4 @@
-"""The command line: `leapnav solve | bank | rollout | train | evaluate | demo`."""
+"""The command line: `leapnav solve | bank | rollout | train | evaluate | watch | demo`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import tyro
 from leapnav.bank_commands import Build, Show
 from leapnav.outputs import check_outputs
 from leapnav.training.config import CloningConfig
+from leapnav.watch import Watch
 
 if TYPE_CHECKING:
     from leapnav.envs.scenario import Scenario
@@ -248,6 +249,7 @@ COMMANDS = {
     "rollout": Rollout,
     "train": Train,
     "evaluate": Evaluate,
+    "watch": Watch,
     "demo": Demo,
 }
 

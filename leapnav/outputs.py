@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-PICTURES = (".png", ".pdf", ".svg")
+PICTURES, VIDEOS = (".png", ".pdf", ".svg"), (".mp4",)
 
 
-def check_outputs(json: Path | None, plot: Path | None) -> None:
-    """Checks the files of --json and --plot: a place that cannot be written to is told before the work, not after.
+def check_outputs(json: Path | None = None, plot: Path | None = None, video: Path | None = None) -> None:
+    """Checks the files of --json, --plot and --video: what cannot be written is told before the work, not after.
 
     Raises:
         FileNotFoundError, IsADirectoryError: there is no such folder, or it is one.
-        ValueError: the picture's name ends in no format that can be drawn.
+        ValueError: the name ends in no format that can be written.
 
     """
-    for path in (json, plot):
+    for path in (json, plot, video):
         if path is not None and not path.parent.is_dir():
             raise FileNotFoundError(f"{path}: its folder does not exist")
         if path is not None and path.is_dir():
             raise IsADirectoryError(f"{path}: is a folder")
-    if plot is not None and plot.suffix not in PICTURES:
-        raise ValueError(f"{plot}: expected a name that ends in {', '.join(PICTURES)}")
+    for path, formats in ((plot, PICTURES), (video, VIDEOS)):
+        if path is not None and path.suffix not in formats:
+            raise ValueError(f"{path}: expected a name that ends in {', '.join(formats)}")

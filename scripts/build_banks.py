@@ -16,7 +16,7 @@ from leapnav.experts import build_bank
 
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "banks"
 # Number of scenarios and seed. Draws of different seeds are independent, so no test scenario is in a training bank.
-SPLITS = {"train": (100, 0), "test": (200, 1)}
+SPLITS = {"train": (400, 0), "test": (200, 1)}
 
 
 def build(folder: Path, workers: int) -> None:

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 import leapnav  # noqa: F401 (registers)
 from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
 from leapnav.envs.obstacles import clearance, clearances
-from leapnav.envs.sensing import POSE_ENTRIES, cast_ray
+from leapnav.envs.sensing import GOAL_ENTRIES
 
 ID = "leapnav/Navigate-v0"
 EMPTY = {"start": [5.0, 5.0, 0.3], "goal": [6.0, 5.0, 0.0], "obstacles": []}
@@ -71,9 +71,10 @@ def test_an_episode_does_not_depend_on_those_before_it():
 
 
 def test_unseeded_resets_differ():
-    env = gym.make(ID)
-    tasks = {env.reset()[1]["scenario"].start for _ in range(5)} | {gym.make(ID).reset()[1]["scenario"].start}
+    env, other = gym.make(ID, split="fresh"), gym.make(ID, split="fresh")
+    tasks = {env.reset()[1]["scenario"].start for _ in range(5)} | {other.reset()[1]["scenario"].start}
     assert len(tasks) == 6
+    assert len({gym.make(ID).reset()[1]["index"] for _ in range(20)}) > 10
 
 
 def test_the_global_generator_is_neither_read_nor_changed():
@@ -215,23 +216,23 @@ def test_lidar_ranges_agree_with_a_fine_walk():
     for task, _ in best_known()[::4]:
         x, y, heading = task.start
         # The robot's radius is taken off in `clearances`, not in a ray.
+        ranges = NavigateEnv(scenario=task).reset()[0][GOAL_ENTRIES:]
         steps = np.arange(0, 10, 2e-3)
         for k in range(0, 32, 3):
             angle = heading + 2 * math.pi * k / 32
             ray = np.stack([x + steps * math.cos(angle), y + steps * math.sin(angle)], axis=1)
             free = clearances(ray, task.field) + task.robot.radius > 0
             walked = steps[np.argmin(free)] if not free.all() else 10.0
-            found = cast_ray(x, y, math.cos(angle), math.sin(angle), task.field, 10.0)
-            assert found == pytest.approx(walked, abs=3e-3)
+            assert ranges[k] == pytest.approx(walked, abs=3e-3)
 
 
 def test_the_observation_says_what_the_docstring_promises():
     task = scenario(start=[2.0, 3.0, math.pi / 2], goal=[1.0, 6.0, math.pi], horizon=4.0)
     observation, _ = NavigateEnv(scenario=task).reset()
-    assert observation[:POSE_ENTRIES] == pytest.approx(
+    assert observation[:GOAL_ENTRIES] == pytest.approx(
         [3.0, 1.0, 0.0, 1.0, 4.0, 0.75, 0.25, math.sqrt(10) / 4, math.pi / 8], abs=1e-6
     )
-    ahead, left, behind, right = observation[POSE_ENTRIES::8]
+    ahead, left, behind, right = observation[GOAL_ENTRIES::8]
     assert (ahead, left, behind, right) == pytest.approx((7.0, 2.0, 3.0, 8.0), abs=1e-5)
 
 
@@ -300,7 +301,7 @@ def test_frames_show_the_robot_where_it_is():
     )
     env.reset()
     frame = env.render()
-    assert frame.shape == (600, 600, 3)
+    assert frame.shape == (640, 600, 3)
     assert frame.dtype == np.uint8
     robot = np.abs(frame.astype(int) - (38, 98, 171)).sum(axis=2) < 20
     rows, columns = np.nonzero(robot)

@@ -5,7 +5,7 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Scenario
-from leapnav.envs.obstacles import arc_clearance, clearance, clearances, proximity
+from leapnav.envs.obstacles import clearance, clearances, follow_arc, proximity
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
 
@@ -112,15 +112,24 @@ def test_the_clearance_of_an_arc_is_the_smallest_of_its_points(scenario):
         middle = heading + turn * share / 2
         arc = np.stack([x + chord * np.cos(middle), y + chord * np.sin(middle)], axis=1)
         lowest = clearances(arc, scenario.field).min()
-        found = arc_clearance(x, y, heading, distance, turn, scenario.field)
-        if lowest > 0:
-            assert found == pytest.approx(lowest, abs=2e-3)
+        before = clearance(x, y, scenario.field)[0]
+        found, driven, after = follow_arc(x, y, heading, distance, turn, before, scenario.field)
+        free = clearances(arc, scenario.field) > 0
+        if driven == 1.0:
+            assert free.mean() > 0.99  # what is not free is grazed by less than a millimetre
+            assert lowest - 1e-9 <= found <= max(lowest, 0.0) * 1.03 + 2e-3
+            assert after == pytest.approx(clearance(*arc[-1], scenario.field)[0])
         else:
-            assert found <= 2e-3  # it ends at the first touch
+            assert found <= 0
+            assert lowest <= 1e-9
+            assert driven == pytest.approx(share[np.argmin(free)], abs=2e-3)  # the first touch
+            assert before <= 0 or 0 <= after < 1e-3
 
 
 def test_an_arc_far_beyond_a_wall_is_no_endless_walk():
-    assert arc_clearance(5.0, 5.0, 0.3, 1e9, 0.0, SCENARIOS[0].field) < 0
+    lowest, driven, _ = follow_arc(5.0, 5.0, 0.3, 1e9, 0.0, 1.0, SCENARIOS[0].field)
+    assert lowest <= 0
+    assert driven < 1e-8
 
 
 def test_an_arc_does_not_jump_a_thin_obstacle():
@@ -133,7 +142,9 @@ def test_an_arc_does_not_jump_a_thin_obstacle():
         horizon=1.0,
         obstacles=({"polygon": {"vertices": ((5.0, 0.0), (5.01, 0.0), (5.01, 10.0), (5.0, 10.0))}},),
     )
-    assert arc_clearance(1.0, 5.0, 0.0, 8.0, 0.0, scenario.field) < 0
+    lowest, driven, _ = follow_arc(1.0, 5.0, 0.0, 8.0, 0.0, 0.75, scenario.field)
+    assert lowest <= 0
+    assert 8.0 * driven == pytest.approx(4.0 - 0.25, abs=1e-4)
 
 
 def many_obstacles(count, size, seed=0):

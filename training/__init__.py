@@ -17,12 +17,14 @@ if TYPE_CHECKING:
         score,
     )
     from leapnav.training.policies import NavigationFeatures, load_policy, make_policy, save_policy
+    from leapnav.training.vec_env import NavigateVecEnv, make_vec_env
 
 __all__ = [
     "CloningConfig",
     "Episode",
     "EpochLoss",
     "Interval",
+    "NavigateVecEnv",
     "NavigationFeatures",
     "Policy",
     "RandomPolicy",
@@ -31,6 +33,7 @@ __all__ = [
     "evaluate",
     "load_policy",
     "make_policy",
+    "make_vec_env",
     "run_episodes",
     "save_policy",
     "score",
@@ -42,6 +45,7 @@ _MODULES = {
     "config": ("CloningConfig",),
     "evaluation": ("Episode", "Interval", "Policy", "RandomPolicy", "Score", "evaluate", "run_episodes", "score"),
     "policies": ("NavigationFeatures", "load_policy", "make_policy", "save_policy"),
+    "vec_env": ("NavigateVecEnv", "make_vec_env"),
 }
 
 

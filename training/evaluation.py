@@ -199,7 +199,7 @@ def evaluate(
     """
     env = gym.make(ENVIRONMENT)
     # All are loaded before the first is played: a broken file is told at once.
-    policies = {name: _entrant(name, env, references, seed) for name in entrants}
+    policies = {name: load_entrant(name, env, references, seed=seed) for name in entrants}
     episodes = {
         name: run_episodes(policy, env, references, label=f"Evaluating {Path(name).name}", progress=progress)
         for name, policy in policies.items()
@@ -207,7 +207,19 @@ def evaluate(
     return [score(name, played, seed) for name, played in episodes.items()], episodes
 
 
-def _entrant(name: str, env: gym.Env, references: Sequence[Demonstration], seed: int) -> Policy:
+def load_entrant(name: str, env: gym.Env, references: Sequence[Demonstration] = (), *, seed: int = 0) -> Policy:
+    """A policy by its name: a folder that `save_policy` wrote, or "expert", or "random".
+
+    Args:
+        name: the name.
+        env: the environment that it is to drive.
+        references: demonstrations that the expert drives; it solves other scenarios itself.
+        seed: of the random policy.
+
+    Raises:
+        FileNotFoundError, ValueError: see `load_policy`.
+
+    """
     if name == "expert":
         return ExpertPolicy(env, {reference.scenario: reference.actions for reference in references})
     if name == "random":

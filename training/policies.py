@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 import leapnav
-from leapnav.envs.sensing import POSE_ENTRIES
+from leapnav.envs.sensing import GOAL_ENTRIES
 
 FORMAT = 1
 HIDDEN = (256, 256, 256)
@@ -33,7 +33,7 @@ class NavigationFeatures(BaseFeaturesExtractor):
     POSE_FEATURES, BEAM_FEATURES = 23, 3
 
     def __init__(self, observation_space: spaces.Box) -> None:
-        beams = observation_space.shape[0] - POSE_ENTRIES
+        beams = observation_space.shape[0] - GOAL_ENTRIES
         super().__init__(observation_space, self.POSE_FEATURES + self.BEAM_FEATURES * beams)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -44,7 +44,7 @@ class NavigationFeatures(BaseFeaturesExtractor):
         error = th.atan2(observations[:, 3:4], observations[:, 2:3])
         bearing = th.atan2(goal[:, 1:2], goal[:, 0:1])
         needed, needed_turn = observations[:, 5:8], observations[:, 8:9]
-        ranges = observations[:, POSE_ENTRIES:]
+        ranges = observations[:, GOAL_ENTRIES:]
         return th.cat(
             [
                 goal / 5,
@@ -79,7 +79,7 @@ def make_policy(observation_space: spaces.Space, action_space: spaces.Space, see
         ValueError: the spaces are not the environment's.
 
     """
-    box = isinstance(observation_space, spaces.Box) and observation_space.shape[0] > POSE_ENTRIES
+    box = isinstance(observation_space, spaces.Box) and observation_space.shape[0] > GOAL_ENTRIES
     if not box or not isinstance(action_space, spaces.Box):
         raise ValueError(f"observation_space: expected one of leapnav/Navigate-v0, got {observation_space}")
     with th.random.fork_rng(devices=[]):  # the caller's generator stays as it is

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch as th
 
-from leapnav.envs.sensing import POSE_ENTRIES
+from leapnav.envs.sensing import GOAL_ENTRIES
 
 # Signs of the observation's first entries (see the environment's docstring) under each symmetry.
 _MIRROR = th.tensor([1.0, -1, 1, -1, 1, 1, -1, 1, -1])
@@ -17,15 +17,15 @@ _TURN = th.tensor([-1.0, -1, 1, 1, 1, -1, -1, 1, 1])
 
 def mirror(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Left and right exchanged: observations (B, d), actions (B, 2)."""
-    ranges = observations[:, POSE_ENTRIES:]
+    ranges = observations[:, GOAL_ENTRIES:]
     ranges = th.cat([ranges[:, :1], ranges[:, 1:].flip(1)], dim=1)
-    return th.cat([observations[:, :POSE_ENTRIES] * _MIRROR, ranges], dim=1), actions * th.tensor([1.0, -1.0])
+    return th.cat([observations[:, :GOAL_ENTRIES] * _MIRROR, ranges], dim=1), actions * th.tensor([1.0, -1.0])
 
 
 def turn_round(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Front and back exchanged; the number of lidar beams must be even."""
-    ranges = observations[:, POSE_ENTRIES:]
+    ranges = observations[:, GOAL_ENTRIES:]
     if ranges.shape[1] % 2:
         raise ValueError(f"turning round needs an even number of lidar beams, got {ranges.shape[1]}")
     ranges = ranges.roll(ranges.shape[1] // 2, dims=1)
-    return th.cat([observations[:, :POSE_ENTRIES] * _TURN, ranges], dim=1), actions * th.tensor([-1.0, 1.0])
+    return th.cat([observations[:, :GOAL_ENTRIES] * _TURN, ranges], dim=1), actions * th.tensor([-1.0, 1.0])
