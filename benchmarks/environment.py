@@ -1,43 +1,88 @@
-"""Steps per second of leapnav/Navigate-v0 with lidar, beside Gymnasium's Pendulum-v1, in the same process.
+"""Steps per second of the environment, beside Gymnasium's Pendulum-v1 in one process, and replays of the optima in it.
 
-The two take turns, so that what else the machine does hits both; the figures are medians.
+Rates are those of Gymnasium's own benchmarks: random actions, resets and the sampling of the actions included. The two
+environments take turns, so that what else the machine does hits both; the figures are medians.
 """
 
 import statistics
-import time
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils.performance import benchmark_step, benchmark_vector_step
+from tqdm.auto import tqdm
 
 import leapnav  # noqa: F401
+from leapnav.envs import FAMILIES, NavigateVectorEnv, ScenarioBank
+from leapnav.experts import find_optimum
+from leapnav.experts.policy import plan_actions
 
-ROUNDS, STEPS = 15, 3000
+ID, ROUNDS, SECONDS, ROBOTS = "leapnav/Navigate-v0", 7, 1.0, 1024
+RATES = [
+    # What is measured, robots (None: the single environment), arguments, the bar in times Pendulum's rate.
+    ("vector, state", ROBOTS, {"observation": "state"}, 25.0),
+    ("vector, 32 lidar beams", ROBOTS, {}, 10.0),
+    ("vector, map", ROBOTS, {"observation": "map"}, None),
+    ("vector, state, shaped reward", ROBOTS, {"observation": "state", "reward": "shaped"}, None),
+    ("vector, state, motors", ROBOTS, {"observation": "state", "actuation": "motor"}, None),
+    ("vector, 32 lidar beams, disturbed", ROBOTS, {"disturbance": 0.1}, None),
+    ("vector of 16, 32 lidar beams", 16, {}, None),
+    ("single, 32 lidar beams", None, {}, 0.7),
+    ("single, 32 lidar beams, motors", None, {"actuation": "motor"}, 0.3),
+]
 
 
-def rate(env: gym.Env, seed: int) -> float:
-    """Steps per second over STEPS steps, resets left out."""
-    actions = 0.1 * np.random.default_rng(seed).normal(size=(STEPS, *env.action_space.shape)).astype(np.float32)
-    env.reset(seed=seed)
-    spent = 0.0
-    for action in actions:
-        start = time.perf_counter()
-        _, _, terminated, truncated, _ = env.step(action)
-        spent += time.perf_counter() - start
-        if terminated or truncated:
-            env.reset()
-    return STEPS / spent
+def rate(robots: int | None, arguments: dict, seed: int) -> float:
+    """Robot-steps per second."""
+    if robots is None:
+        return benchmark_step(gym.make(ID, family="clutter", **arguments), SECONDS, seed)
+    venv = gym.make_vec(ID, num_envs=robots, vectorization_mode="vector_entry_point", family="clutter", **arguments)
+    return benchmark_vector_step(venv, SECONDS, seed)
 
 
-def main() -> None:
-    ours, peer = gym.make("leapnav/Navigate-v0", family="clutter"), gym.make("Pendulum-v1")
-    rate(ours, 0), rate(peer, 0)  # compiled, cached, warm
-    rates = [(rate(ours, seed), rate(peer, seed)) for seed in range(ROUNDS)]
-    navigate, pendulum = (statistics.median(column) for column in zip(*rates, strict=True))
-    ratio = statistics.median(a / b for a, b in rates)
-    print(f"leapnav/Navigate-v0, 32 lidar beams   {navigate:10,.0f} steps/s")
-    print(f"Pendulum-v1                           {pendulum:10,.0f} steps/s")
-    print(f"ratio                                 {ratio:10.2f}")
+def measure_rates() -> None:
+    peer = gym.make("Pendulum-v1")
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name, *_ in RATES}
+    for seed in tqdm(range(ROUNDS + 1), desc="Steps per second", unit="round"):
+        for name, robots, arguments, _ in RATES:
+            pair = rate(robots, arguments, seed), benchmark_step(peer, SECONDS, seed)
+            if seed > 0:  # the first round loads and warms
+                rows[name].append(pair)
+    print(f"{'':36}{'steps/s':>12}{'Pendulum-v1':>14}{'ratio':>8}{'bar':>8}")
+    for name, _, _, bar in RATES:
+        ours, theirs = (statistics.median(column) for column in zip(*rows[name], strict=True))
+        ratio = statistics.median(a / b for a, b in rows[name])
+        print(f"{name:36}{ours:12,.0f}{theirs:14,.0f}{ratio:8.2f}{'' if bar is None else f'{bar:8.1f}'}")
+
+
+def replay(bank: ScenarioBank, plans: list[np.ndarray], **arguments: object) -> tuple[float, float]:
+    """The share of successes when the optima are driven open-loop, and the median cost over the optimal one."""
+    venv = NavigateVectorEnv(len(bank), bank=bank, observation="state", autoreset_mode="SameStep", **arguments)
+    venv.reset(seed=0, options={"index": list(range(len(bank)))})
+    actions = np.zeros((max(map(len, plans)), len(bank), 2), np.float32)
+    for i, plan in enumerate(plans):
+        actions[: len(plan), i] = plan
+    ended, success, cost = np.zeros(len(bank), bool), np.zeros(len(bank), bool), np.zeros(len(bank))
+    for now in actions:
+        _, _, terminated, _, infos = venv.step(now)
+        for i in np.flatnonzero(terminated & ~ended):
+            success[i], cost[i] = infos["final_info"]["is_success"][i], infos["final_info"]["cost"][i]
+        ended |= terminated
+    assert ended.all()
+    ratio = float(np.median((cost / bank.costs)[success])) if success.any() else float("nan")
+    return float(success.mean()), ratio
+
+
+def measure_replays() -> None:
+    print(f"\n{'optima driven open-loop':28}{'velocity':>20}{'disturbed 0.1':>20}{'motor':>20}")
+    print(f"{'':28}{'success, J/J*':>20}{'success, J/J*':>20}{'success, J/J*':>20}")
+    for family in FAMILIES:
+        bank = ScenarioBank.shipped(family, "test")
+        plans = [plan_actions(find_optimum(s), s, 0.05) for s in tqdm(bank, desc=f"Solving {family}", leave=False)]
+        cells = [replay(bank, plans, **arguments) for arguments in ({}, {"disturbance": 0.1}, {"actuation": "motor"})]
+        row = "".join(f"{f'{100 * success:.1f} %, {ratio:.4f}':>20}" for success, ratio in cells)
+        print(f"{family:28}{row}")
 
 
 if __name__ == "__main__":
-    main()
+    measure_rates()
+    measure_replays()

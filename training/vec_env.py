@@ -39,14 +39,15 @@ def make_vec_env(
         ValueError: an argument is impossible, or the environment is none of leapnav's.
 
     """
+    if not str(gym.spec(env_id).vector_entry_point).startswith("leapnav."):
+        raise ValueError(f"env_id: expected one of leapnav's environments, got {env_id!r}")
     venv = gym.make_vec(
         env_id,
         num_envs=n_envs,
         vectorization_mode="vector_entry_point",
         **{**(env_kwargs or {}), **arguments, "autoreset_mode": AutoresetMode.SAME_STEP},
     )
-    if not isinstance(venv, NavigateVectorEnv):
-        raise ValueError(f"env_id: expected one of leapnav's environments, got {env_id!r}")
+    assert isinstance(venv, NavigateVectorEnv)  # as its specification says
     wrapped = NavigateVecEnv(venv, step_infos=step_infos)
     if seed is not None:
         wrapped.seed(seed)
