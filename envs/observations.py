@@ -87,7 +87,9 @@ class Layout:
         low, high = self.bounds
         if self._slices is None:
             return spaces.Box(low, high, dtype=np.float32)
-        boxes = {name: spaces.Box(low[part], high[part], dtype=np.float32) for name, part in self._slices.items()}
+        boxes: dict[str, spaces.Space[Any]] = {}
+        for name, part in self._slices.items():
+            boxes[name] = spaces.Box(low[part], high[part], dtype=np.float32)
         return spaces.Dict(boxes)
 
     def divide(self, flat: np.ndarray) -> Any:

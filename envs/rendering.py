@@ -64,17 +64,19 @@ def scene_of(
     trail: list[tuple[float, float, float]],
 ) -> Scene:
     """What a frame of one robot's episode shows."""
-    known = isinstance(choice, int) and bank is not None
+    optimum, reference_cost = None, None
+    if bank is not None and isinstance(choice, int):
+        optimum, reference_cost = bank.states(choice), float(bank.costs[choice])
     row = fleet.state[robot]
     return Scene(
         scenario=scenario_of(choice, bank),
         pose=tuple(fleet.poses[robot].tolist()),
         trail=trail,
-        optimum=bank.states(choice) if known else None,
+        optimum=optimum,
         ranges=fleet.ranges(robot).tolist(),
         lidar_range=fleet.settings.lidar_range,
         cost=float(row[driving.COST]),
-        reference_cost=float(bank.costs[choice]) if known else None,
+        reference_cost=reference_cost,
         time=float(row[driving.TIME]),
         collided=bool(row[driving.COLLIDED]),
     )

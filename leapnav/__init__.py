@@ -16,13 +16,14 @@ __all__ = ["__version__"]
 __path__ = extend_path(__path__, __name__)
 __version__ = version("leapnav")
 
-# Gymnasium's wrappers would hide `compute_reward`; what they check, the environment checks itself.
-_BARE = {"order_enforce": False, "disable_env_checker": True}
-for _name, _options in (("Navigate", {}), ("NavigateGoal", _BARE)):
+for _name in ("Navigate", "NavigateGoal"):
     if f"leapnav/{_name}-v0" not in gymnasium.registry:  # subprocess workers import again
+        # Gymnasium's wrappers hide `compute_reward`; what they check, the environment checks itself.
+        _wrapped = _name == "Navigate"
         gymnasium.register(
             f"leapnav/{_name}-v0",
             entry_point=f"leapnav.envs.navigation:{_name}Env",
             vector_entry_point=f"leapnav.envs.vector:{_name}VectorEnv",
-            **_options,
+            order_enforce=_wrapped,
+            disable_env_checker=not _wrapped,
         )
