@@ -9,7 +9,7 @@ depend, in the last bits, on what else is in it and on what was; a robot's episo
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pymunk
@@ -22,7 +22,6 @@ WALL_THICKNESS = 1.0  # m, outside the arena
 SKIN = 1e-3  # m by which the rim is felt farther out, so that a robot that slides along something stays in contact
 DEEPEST = 1e-6  # m that a robot in contact may overlap what it touches
 _field = types.Array(types.float64, 1, "C", readonly=True)
-_Place = tuple[float, float, float]  # x, y, clearance
 
 _KINEMATICS = (
     pymunk.batch.BodyFields.POSITION
@@ -145,7 +144,8 @@ class ContactWorld:
         for _ in range(pieces):
             before = body.position
             self._space.step(duration / pieces)
-            x, y, depth = cast(_Place, push_out(*body.position, *before, self._field))
+            place: Any = push_out(*body.position, *before, self._field)
+            x, y, depth = place
             if depth < 0.0:
                 body.position = x, y
             lowest = min(lowest, depth)

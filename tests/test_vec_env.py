@@ -86,7 +86,7 @@ def test_attributes_and_methods_reach_the_environment():
     assert venv.env_is_wrapped(VecMonitor) == [False] * 3
     with pytest.raises(AttributeError):
         venv.get_attr("gravity")
-    with pytest.raises(ValueError, match="indices: .*'gravity'"):
+    with pytest.raises(ValueError, match=r"indices: .*'gravity'"):
         venv.set_attr("gravity", 9.81, indices=[0])
     venv.set_attr("gravity", 9.81)
     assert venv.get_attr("gravity") == [9.81] * 3
