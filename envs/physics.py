@@ -22,6 +22,7 @@ WALL_THICKNESS = 1.0  # m, outside the arena
 SKIN = 1e-3  # m by which the rim is felt farther out, so that a robot that slides along something stays in contact
 DEEPEST = 1e-6  # m that a robot in contact may overlap what it touches
 _field = types.Array(types.float64, 1, "C", readonly=True)
+_options = {"cache": True, "error_model": "numpy", "nogil": True}
 
 _KINEMATICS = (
     pymunk.batch.BodyFields.POSITION
@@ -144,8 +145,7 @@ class ContactWorld:
         for _ in range(pieces):
             before = body.position
             self._space.step(duration / pieces)
-            place: Any = push_out(*body.position, *before, self._field)
-            x, y, depth = place
+            x, y, depth = push_out(*body.position, *before, self._field)
             if depth < 0.0:
                 body.position = x, y
             lowest = min(lowest, depth)
@@ -154,12 +154,7 @@ class ContactWorld:
         return lowest
 
 
-@njit(
-    types.UniTuple(float64, 3)(float64, float64, float64, float64, _field),
-    cache=True,
-    error_model="numpy",
-    nogil=True,
-)
+@njit(types.UniTuple(float64, 3)(float64, float64, float64, float64, _field), **_options)
 def push_out(x, y, safe_x, safe_y, field):
     """The nearest free place to (x, y), or (safe_x, safe_y) if none is found: x, y and the clearance before.
 
