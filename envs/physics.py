@@ -143,15 +143,20 @@ class ContactWorld:
         body.velocity, body.angular_velocity = (velocity[0], velocity[1]), velocity[2]
         lowest = math.inf
         for _ in range(pieces):
-            before = body.position
+            safe_x, safe_y, _ = _pose(body)
             self._space.step(duration / pieces)
-            x, y, depth = push_out(*body.position, *before, self._field)
+            x, y, _ = _pose(body)
+            x, y, depth = push_out(x, y, safe_x, safe_y, self._field)
             if depth < 0.0:
                 body.position = x, y
             lowest = min(lowest, depth)
-        row[:3] = *body.position, body.angle
+        row[:3] = _pose(body)
         velocity[:] = *body.velocity, body.angular_velocity
         return lowest
+
+
+def _pose(body: pymunk.Body) -> tuple[float, float, float]:
+    return body.position.x, body.position.y, body.angle
 
 
 @njit(types.UniTuple(float64, 3)(float64, float64, float64, float64, _field), **_options)

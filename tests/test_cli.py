@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ from helpers import best_known, scenario_fields
 
 from leapnav.cli import main
 from leapnav.demo import DemoSettings, run_demo
+from leapnav.envs import ScenarioBank
 from leapnav.training.config import CloningConfig
 
 
@@ -198,7 +200,7 @@ def test_the_demo_runs_and_a_second_run_uses_what_is_there(tmp_path, capsys):
         run_demo(tmp_path, DemoSettings())
 
 
-@pytest.mark.parametrize("command", [[], ["solve"], ["rollout"], ["train"], ["evaluate"], ["demo"]])
+@pytest.mark.parametrize("command", [[], ["solve"], ["rollout"], ["train"], ["evaluate"], ["watch"], ["demo"]])
 def test_every_command_has_help(command):
     done = subprocess.run(
         [sys.executable, "-m", "leapnav", *command, "--help"], capture_output=True, text=True, check=False
@@ -272,3 +274,76 @@ def test_bad_bank_arguments_are_one_line(arguments, message, tmp_path, capsys, m
     assert code == 2
     assert message in line
     assert text.read_text() == "no bank"
+
+
+def test_watch_films_the_policy(tmp_path, capsys, monkeypatch):
+    import imageio.v3 as iio
+
+    video = tmp_path / "rooms.mp4"
+    arguments = ["watch", "--family", "rooms", "--index", "3", "--episodes", "2", "--video", str(video)]
+    assert main(arguments) == 0
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"rooms-1-3: success after [\d.]+ s, cost [\d.]+, optimum [\d.]+", first)
+    assert second.startswith("rooms-1-4: success")
+    assert last == f"wrote {video}"
+    frames = iio.imread(video)
+    bank = ScenarioBank.shipped("rooms", "test")
+    assert len(frames) == pytest.approx(20 * (bank[3].horizon + bank[4].horizon), abs=5)
+    assert frames.shape[1:] == (640, 600, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["rooms.mp4"]
+
+
+def test_watch_opens_a_window(capsys, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("pygame.time.Clock", FastClock)
+    arguments = ["watch", "--family", "open", "--policy", "random", "--episodes", "1", "--actuation", "motor"]
+    assert main([*arguments, "--disturbance", "0.1"]) == 0
+    assert re.match(r"open-1-\d+: (missed the goal|collision) after", capsys.readouterr().out)
+
+
+class FastClock:
+    def tick(self, fps):
+        assert fps == 20
+
+
+def test_closing_the_window_ends_the_watching(capsys, monkeypatch):
+    import pygame
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("pygame.time.Clock", FastClock)
+    monkeypatch.setattr("pygame.event.get", lambda: [pygame.event.Event(pygame.QUIT)])
+    assert main(["watch", "--policy", "random"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--video", "film.gif"], "film.gif: expected a name that ends in .mp4"),
+        (["--video", "nowhere/film.mp4"], "nowhere/film.mp4: its folder does not exist"),
+        (["--video", "film.mp4", "--index", "199"], "index: the bank has scenarios 0 to 199, got 199 to 201"),
+        (["--video", "film.mp4", "--index", "3", "--split", "fresh"], "index: a newly drawn scenario has no number"),
+        (["--video", "film.mp4", "--episodes", "0"], "episodes: expected at least 1, got 0"),
+        (["--video", "film.mp4", "--family", "maze"], "family: expected one of open, .*got 'maze'"),
+        (["--video", "film.mp4", "--policy", "nowhere"], "nowhere/policy.json: No such file"),
+        (["--video", "film.mp4", "--disturbance", "-1"], "disturbance: expected a number >= 0, got -1.0"),
+    ],
+)
+def test_bad_arguments_of_watch_are_one_line(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["watch", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert re.match(f"leapnav: {message}", error)
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_display_or_moviepy_watch_says_what_to_do(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    monkeypatch.setattr("pygame.display.init", lambda: None)
+    monkeypatch.setattr("pygame.display.get_driver", lambda: "offscreen")
+    assert main(["watch"]) == 2
+    assert "--video FILE.mp4 writes a video instead" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "moviepy", None)
+    assert main(["watch", "--video", str(tmp_path / "film.mp4")]) == 2
+    assert 'pip install "leapnav[video]"' in capsys.readouterr().err

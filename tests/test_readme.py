@@ -22,7 +22,14 @@ BANK = r"rooms-1-7 (\d+\.\d+)\n200 \1\d* \(\d+, 3\)( \(\d+, 3\))?\n"
     list(
         zip(
             BLOCKS,
-            [r"True -\d\.\d+\n", BANK, r"(6\.233154049\n){4}certified: .*\[4\.993.* 6\.258.*\]\n", BANK],
+            [
+                r"True -\d\.\d+\n",
+                r"\(1024, 41\) \(1024,\)\n",
+                r"True\n",
+                BANK,
+                r"(6\.233154049\n){4}certified: .*\[4\.993.* 6\.258.*\]\n",
+                BANK,
+            ],
             strict=True,
         )
     ),
