@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import boolean, float64, int64, njit, types
 
-from leapnav.envs.obstacles import clearance, follow_arc, proximity_value, sinc
+from leapnav.envs.obstacles import arc_point, clearance, follow_arc, proximity_value, proximity_values, sinc
 from leapnav.envs.scenario import GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, START, TURN_WEIGHT
 from leapnav.envs.settings import (
     ACTUATION_NOISE,
@@ -67,35 +67,35 @@ _options = {"cache": True, "error_model": "numpy", "nogil": True}
 @njit(float64(float64, float64, float64, float64, float64, _field), **_options)
 def arc_proximity(x, y, heading, distance, turn, field):
     """Mean of Phi along an arc, by the three-point Gauss rule."""
-    total = 0.0
-    for share, weight in ((0.1127016653792583, 5 / 18), (0.5, 8 / 18), (0.8872983346207417, 5 / 18)):
-        chord = distance * share * sinc(turn * share / 2)
-        middle = heading + turn * share / 2
-        total += weight * proximity_value(x + chord * math.cos(middle), y + chord * math.sin(middle), field)
-    return total
+    offset = 0.5 * math.sqrt(0.6)
+    xa, ya = arc_point(x, y, heading, distance, turn, 0.5 - offset)
+    xb, yb = arc_point(x, y, heading, distance, turn, 0.5)
+    xc, yc = arc_point(x, y, heading, distance, turn, 0.5 + offset)
+    first, second, third = proximity_values(xa, ya, xb, yb, xc, yc, field)
+    return (5.0 * first + 8.0 * second + 5.0 * third) / 18.0
 
 
-@njit(types.none(float64[::1], float64[::1], float64, float64, float64), **_options)
-def charge(row, task, speed_squared, turn_rate_squared, duration):
-    """Adds the effort of a motion."""
-    row[EFFORT] += 0.5 * (task[SPEED_WEIGHT] * speed_squared + task[TURN_WEIGHT] * turn_rate_squared) * duration
+@njit(float64(float64[:, ::1], int64, float64, float64), **_options)
+def effort(tasks, i, speed_squared, turn_rate_squared):
+    """The running cost of robot i's motion, without the proximity cost."""
+    return 0.5 * (tasks[i, SPEED_WEIGHT] * speed_squared + tasks[i, TURN_WEIGHT] * turn_rate_squared)
 
 
-@njit(float64(float64[::1], float64[::1], float64[::1], float64[:, ::1], float64[::1]), **_options)
-def potential(body, state, task, guides, settings):
-    """Minus a cheap estimate of the cost-to-go: the way along the reference at an even pace, at most a miss.
+@njit(float64(int64, float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[::1]), **_options)
+def potential(i, bodies, state, tasks, guides, settings):
+    """Minus a cheap estimate of robot i's cost-to-go: the way along the reference at an even pace, at most a miss.
 
     Any function of the state would leave the optimal policy as it is (Ng, Harada and Russell, 1999); a good estimate
-    makes it quick to find. `guides` (GUIDES, 3) are points with the way (m) from there to the goal.
+    makes it quick to find. `guides` (robots, GUIDES, 3) are points with the way (m) from there to the goal.
     """
     way = np.inf
-    for k in range(len(guides)):
-        dx, dy = guides[k, 0] - body[0], guides[k, 1] - body[1]
-        way = min(way, math.sqrt(dx * dx + dy * dy) + guides[k, 2])
-    heading = task[GOAL + 2]
-    turn = 0.0 if math.isnan(heading) else (heading - body[2] + math.pi) % (2 * math.pi) - math.pi
-    time = max(task[HORIZON] - state[TIME], settings[PERIOD])
-    estimate = 0.5 * (task[SPEED_WEIGHT] * way * way + task[TURN_WEIGHT] * turn * turn) / time
+    for k in range(guides.shape[1]):
+        dx, dy = guides[i, k, 0] - bodies[i, 0], guides[i, k, 1] - bodies[i, 1]
+        way = min(way, math.sqrt(dx * dx + dy * dy) + guides[i, k, 2])
+    heading = tasks[i, GOAL + 2]
+    turn = 0.0 if math.isnan(heading) else (heading - bodies[i, 2] + math.pi) % (2 * math.pi) - math.pi
+    time = max(tasks[i, HORIZON] - state[i, TIME], settings[PERIOD])
+    estimate = effort(tasks, i, way * way, turn * turn) / time
     return -min(estimate, settings[MISS_PENALTY])
 
 
@@ -122,7 +122,7 @@ def start_episodes(robots, bodies, state, tasks, fields, guides, settings):
         state[i, HERE] = clearance(bodies[i, 0], bodies[i, 1], fields[i])[0]
         state[i, CLEARANCE] = state[i, HERE]
         if settings[SHAPED] != 0.0:
-            state[i, POTENTIAL] = potential(bodies[i], state[i], tasks[i], guides[i], settings)
+            state[i, POTENTIAL] = potential(i, bodies, state, tasks, guides, settings)
 
 
 @njit(
@@ -141,10 +141,11 @@ def command(actions, active, state, tasks, noise, noise_rows, settings):
             return i
     disturbed = settings[ACTUATION_NOISE] != 0.0 or settings[SLIP] != 0.0
     for i in range(len(state)):
-        row = state[i]
-        row[TOUCHED] = row[EFFORT] = row[PROXIMITY] = row[COLLISION] = row[MISS] = row[SHAPING] = 0.0
-        row[REMAINING] = row[REWARD] = row[SPEED] = row[TURN_RATE] = row[DURATION] = 0.0
-        row[CLEARANCE] = row[HERE]
+        for column in (TOUCHED, REMAINING, SPEED, TURN_RATE, DURATION):
+            state[i, column] = 0.0
+        for column in (EFFORT, PROXIMITY, COLLISION, MISS, SHAPING, REWARD):
+            state[i, column] = 0.0
+        state[i, CLEARANCE] = state[i, HERE]
         if not active[i]:
             continue
         speed = min(max(actions[i, 0], -1.0), 1.0) * tasks[i, MAX_SPEED]
@@ -157,8 +158,8 @@ def command(actions, active, state, tasks, noise, noise_rows, settings):
             right = (speed + half * turn_rate) * (1.0 - min(settings[SLIP] * abs(drawn[2]), 1.0))
             left = (speed - half * turn_rate) * (1.0 - min(settings[SLIP] * abs(drawn[3]), 1.0))
             speed, turn_rate = (right + left) / 2, (right - left) / (2 * half)
-        row[SPEED], row[TURN_RATE] = speed, turn_rate
-        row[DURATION] = max(min(settings[PERIOD], tasks[i, HORIZON] - row[TIME]), 0.0)
+        state[i, SPEED], state[i, TURN_RATE] = speed, turn_rate
+        state[i, DURATION] = max(min(settings[PERIOD], tasks[i, HORIZON] - state[i, TIME]), 0.0)
     return -1
 
 
@@ -173,24 +174,24 @@ def drive_arcs(bodies, state, tasks, fields, settings):
     chord as its velocity ends where the arc ends, because Chipmunk moves bodies by an Euler step.
     """
     for i in range(len(state)):
-        row, body = state[i], bodies[i]
-        body[3] = body[4] = body[5] = 0.0
-        if row[DURATION] == 0.0:
+        bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
+        if state[i, DURATION] == 0.0:
             continue
-        distance, turn = row[SPEED] * row[DURATION], row[TURN_RATE] * row[DURATION]
-        lowest, share, after = follow_arc(body[0], body[1], body[2], distance, turn, row[HERE], fields[i])
-        row[CLEARANCE], row[HERE] = lowest, after
+        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], fields[i]
+        distance, turn = state[i, SPEED] * state[i, DURATION], state[i, TURN_RATE] * state[i, DURATION]
+        lowest, share, after = follow_arc(x, y, heading, distance, turn, state[i, HERE], field)
+        state[i, CLEARANCE], state[i, HERE] = lowest, after
         if share < 1.0:
-            row[TOUCHED] = 1.0
-            row[REMAINING] = row[DURATION] * (1.0 - share)
+            state[i, TOUCHED] = 1.0
+            state[i, REMAINING] = state[i, DURATION] * (1.0 - share)
             distance *= share
             turn *= share
-        charge(row, tasks[i], row[SPEED] ** 2, row[TURN_RATE] ** 2, row[DURATION] * share)
-        if row[DURATION] * share > 0.0:
-            near = arc_proximity(body[0], body[1], body[2], distance, turn, fields[i])
-            row[PROXIMITY] += near * row[DURATION] * share
-        chord, middle = distance * sinc(turn / 2), body[2] + turn / 2
-        body[3], body[4], body[5] = chord * math.cos(middle), chord * math.sin(middle), turn
+        driven = state[i, DURATION] * share
+        state[i, EFFORT] += effort(tasks, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
+        if driven > 0.0:
+            state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, field) * driven
+        chord, middle = distance * sinc(turn / 2), heading + turn / 2
+        bodies[i, 3], bodies[i, 4], bodies[i, 5] = chord * math.cos(middle), chord * math.sin(middle), turn
 
 
 @njit(
@@ -223,48 +224,48 @@ def wheel_forces(vx, vy, heading, spin, speed, turn_rate, duration, settings):
 def drive_motors(bodies, state, tasks, fields, settings, piece, pieces):
     """Gives each free body velocity and force for one of a period's pieces, up to a touch, and charges for it."""
     for i in range(len(state)):
-        row, body = state[i], bodies[i]
-        body[3:9] = 0.0
-        step = row[DURATION] / pieces
-        if step == 0.0 or row[TOUCHED] != 0.0:
+        bodies[i, 3:9] = 0.0
+        step = state[i, DURATION] / pieces
+        if step == 0.0 or state[i, TOUCHED] != 0.0:
             continue
-        dx, dy, turn = row[VX] * step, row[VY] * step, row[SPIN] * step
-        distance = math.sqrt(dx * dx + dy * dy)
-        course = math.atan2(dy, dx)
-        lowest, share, after = follow_arc(body[0], body[1], course, distance, 0.0, row[HERE], fields[i])
-        row[CLEARANCE], row[HERE] = min(row[CLEARANCE], lowest), after
-        charge(row, tasks[i], row[VX] ** 2 + row[VY] ** 2, row[SPIN] ** 2, step * share)
-        near = proximity_value(body[0] + dx * share / 2, body[1] + dy * share / 2, fields[i])
-        row[PROXIMITY] += near * step * share
-        body[3], body[4], body[5] = dx * share, dy * share, turn * share
+        dx, dy, turn = state[i, VX] * step, state[i, VY] * step, state[i, SPIN] * step
+        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], fields[i]
+        distance, course = math.sqrt(dx * dx + dy * dy), math.atan2(dy, dx)
+        lowest, share, after = follow_arc(x, y, course, distance, 0.0, state[i, HERE], field)
+        state[i, CLEARANCE], state[i, HERE] = min(state[i, CLEARANCE], lowest), after
+        speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
+        state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * share
+        near = proximity_value(x + dx * share / 2, y + dy * share / 2, field)
+        state[i, PROXIMITY] += near * step * share
+        bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * share, dy * share, turn * share
         if share < 1.0:
-            row[TOUCHED] = 1.0
-            row[REMAINING] = row[DURATION] - step * (piece + share)
+            state[i, TOUCHED] = 1.0
+            state[i, REMAINING] = state[i, DURATION] - step * (piece + share)
             continue
-        fx, fy, torque = wheel_forces(row[VX], row[VY], body[2], row[SPIN], row[SPEED], row[TURN_RATE], step, settings)
-        body[6], body[7], body[8] = fx * step * step, fy * step * step, torque * step * step
+        wheels = state[i, SPEED], state[i, TURN_RATE]
+        fx, fy, torque = wheel_forces(state[i, VX], state[i, VY], heading, state[i, SPIN], *wheels, step, settings)
+        bodies[i, 6], bodies[i, 7], bodies[i, 8] = fx * step * step, fy * step * step, torque * step * step
 
 
 @njit(types.none(float64[:, ::1], float64[:, ::1], int64), **_options)
 def read_velocities(bodies, state, pieces):
     """Takes the velocities after one of a period's pieces; a robot that touches keeps those that it had."""
     for i in range(len(state)):
-        row = state[i]
-        step = row[DURATION] / pieces
-        if step > 0.0 and row[TOUCHED] == 0.0:
-            row[VX], row[VY], row[SPIN] = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
+        step = state[i, DURATION] / pieces
+        if step > 0.0 and state[i, TOUCHED] == 0.0:
+            state[i, VX], state[i, VY], state[i, SPIN] = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
 
 
-@njit(boolean(float64[::1], float64[::1], float64[::1]), **_options)
-def at_goal(pose, task, settings):
-    """Whether a pose is the goal's, within the tolerances."""
-    dx, dy = pose[0] - task[GOAL], pose[1] - task[GOAL + 1]
+@njit(boolean(int64, float64[:, ::1], float64[:, ::1], float64[::1]), **_options)
+def at_goal(i, bodies, tasks, settings):
+    """Whether robot i's pose is its goal's, within the tolerances."""
+    dx, dy = bodies[i, 0] - tasks[i, GOAL], bodies[i, 1] - tasks[i, GOAL + 1]
     if math.hypot(dx, dy) > settings[POSITION_TOLERANCE]:
         return False
-    heading = task[GOAL + 2]
+    heading = tasks[i, GOAL + 2]
     if math.isnan(heading):
         return True
-    turn = (pose[2] - heading + math.pi) % (2 * math.pi) - math.pi
+    turn = (bodies[i, 2] - heading + math.pi) % (2 * math.pi) - math.pi
     return abs(turn) <= settings[HEADING_TOLERANCE]
 
 
@@ -284,24 +285,23 @@ def end_periods(bodies, active, state, tasks, guides, settings):
     for i in range(len(state)):
         if not active[i]:
             continue
-        row, body, task = state[i], bodies[i], tasks[i]
-        row[STEPS] += 1.0
-        row[TIME] = min(row[STEPS] * settings[PERIOD], task[HORIZON])
-        row[COST] += row[EFFORT] + row[PROXIMITY]
-        if row[TOUCHED] != 0.0 and row[COLLIDED] == 0.0:
-            row[COLLISION] = settings[COLLISION_PENALTY]
-            row[COLLIDED] = 1.0
-        last = row[STEPS] >= row[LAST_STEP]
-        reached = at_goal(body, task, settings)
-        row[SUCCESS] = 1.0 if last and reached and row[COLLIDED] == 0.0 else 0.0
-        ended = last or (row[COLLIDED] != 0.0 and settings[ENDS_ON_TOUCH] != 0.0)
-        row[TERMINATED] = 1.0 if ended else 0.0
+        state[i, STEPS] += 1.0
+        state[i, TIME] = min(state[i, STEPS] * settings[PERIOD], tasks[i, HORIZON])
+        state[i, COST] += state[i, EFFORT] + state[i, PROXIMITY]
+        if state[i, TOUCHED] != 0.0 and state[i, COLLIDED] == 0.0:
+            state[i, COLLISION] = settings[COLLISION_PENALTY]
+            state[i, COLLIDED] = 1.0
+        last = state[i, STEPS] >= state[i, LAST_STEP]
+        reached = at_goal(i, bodies, tasks, settings)
+        state[i, SUCCESS] = 1.0 if last and reached and state[i, COLLIDED] == 0.0 else 0.0
+        ended = last or (state[i, COLLIDED] != 0.0 and settings[ENDS_ON_TOUCH] != 0.0)
+        state[i, TERMINATED] = 1.0 if ended else 0.0
         if ended and not (last and reached):
-            row[MISS] = settings[MISS_PENALTY]
-        reward = -row[EFFORT] - row[PROXIMITY] - row[COLLISION] - row[MISS]
+            state[i, MISS] = settings[MISS_PENALTY]
+        reward = -state[i, EFFORT] - state[i, PROXIMITY] - state[i, COLLISION] - state[i, MISS]
         if settings[SHAPED] != 0.0:
-            after = 0.0 if ended else potential(body, row, task, guides[i], settings)
-            row[SHAPING] = settings[DISCOUNT] * after - row[POTENTIAL]
-            row[POTENTIAL] = after
-            reward += row[SHAPING]
-        row[REWARD] = reward
+            after = 0.0 if ended else potential(i, bodies, state, tasks, guides, settings)
+            state[i, SHAPING] = settings[DISCOUNT] * after - state[i, POTENTIAL]
+            state[i, POTENTIAL] = after
+            reward += state[i, SHAPING]
+        state[i, REWARD] = reward

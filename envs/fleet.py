@@ -13,6 +13,7 @@ from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.driving import (
     CLEARANCE,
     COLUMNS,
+    EFFORT,
     GUIDES,
     HERE,
     LAST_STEP,
@@ -57,7 +58,7 @@ class Fleet:
         self.layout = Layout(settings)
         self.state = np.zeros((count, COLUMNS))
         self.tasks = np.zeros((count, TASK_COLUMNS))
-        self.fields = np.zeros((count, 256))
+        self.fields = np.zeros((count, 0))
         self._packed = settings.packed()
         self._disturbed, self._motors = settings.disturbed, settings.motors
         self._pieces = math.ceil(settings.control_period / LONGEST_PIECE - 1e-9)
@@ -102,7 +103,8 @@ class Fleet:
                 self._check_map(field)
         longest = max(map(len, fields))
         if longest > self.fields.shape[1]:
-            wider = np.zeros((len(self.fields), longest))
+            # Whole cache lines, and an odd number of them: rows at powers of two would compete for the same places.
+            wider = np.zeros((len(self.fields), 16 * math.ceil(longest / 16) + 8))
             wider[:, : self.fields.shape[1]] = self.fields
             self.fields = wider
         for i, choice, field in zip(numbers.tolist(), choices, fields, strict=True):
@@ -213,10 +215,11 @@ class Fleet:
         # In "velocity" the wheels turn as commanded, whatever the body does; in "motor" the body's motion counts.
         if self._motors:
             mean = (row[VX : SPIN + 1] + velocity) / 2
-            driving.charge(row, self.tasks[i], float(mean[0] ** 2 + mean[1] ** 2), float(mean[2] ** 2), duration)
+            rate = driving.effort(self.tasks, i, mean[0] ** 2 + mean[1] ** 2, mean[2] ** 2)
             row[VX : SPIN + 1] = velocity
         else:
-            driving.charge(row, self.tasks[i], speed**2, turn_rate**2, duration)
+            rate = driving.effort(self.tasks, i, speed**2, turn_rate**2)
+        row[EFFORT] += rate * duration
         near = (proximity_value(before[0], before[1], field) + proximity_value(body[0], body[1], field)) / 2
         row[PROXIMITY] += near * duration
         row[HERE] = clearance(body[0], body[1], field)[0]
@@ -235,7 +238,7 @@ class Fleet:
 
     def at_goal(self, i: int) -> bool:
         """Whether a robot's pose is its goal's, within the tolerances."""
-        return bool(driving.at_goal(self._free.rows[i], self.tasks[i], self._packed))
+        return bool(driving.at_goal(i, self._free.rows, self.tasks, self._packed))
 
     def at_horizon(self, i: int) -> bool:
         """Whether a robot's time is up."""

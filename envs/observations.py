@@ -10,13 +10,27 @@ import numpy as np
 from gymnasium import spaces
 from numba import float32, float64, int64, njit, types
 
-from leapnav.envs.driving import SPIN, TIME, VX
+from leapnav.envs.driving import SPIN, TIME, VX, VY
 from leapnav.envs.scenario import GOAL, HORIZON
-from leapnav.envs.sensing import FASTEST, MOTION_ENTRIES, WALL_ENTRIES, observe, scan
-from leapnav.envs.settings import Settings
+from leapnav.envs.sensing import WALL_ENTRIES, scan, survey
+from leapnav.envs.settings import (
+    GOAL_CONDITIONED,
+    LIDAR_RANGE,
+    MOTORS,
+    OBSERVATION,
+    OBSERVATIONS,
+    OBSTACLES,
+    PERIOD,
+    SENSING_NOISE,
+    VERTICES,
+    Settings,
+)
 
+# Entries of the parts; the environments' docstrings say what they mean.
+GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 3, 4
 # Bounds that no scenario of a sensible size reaches; values beyond are clipped.
-FARTHEST, LONGEST = 1000.0, 10_000.0
+FARTHEST, LONGEST, FASTEST = 1000.0, 10_000.0, 20.0
+LIDAR, MAP = OBSERVATIONS.index("lidar"), OBSERVATIONS.index("map")
 FIRST_SENSED = 4  # column of the noise, after what disturbs the wheels
 
 
@@ -153,24 +167,71 @@ class Layout:
     nogil=True,
 )
 def observe_robots(
-    robots, bodies, state, tasks, fields, noise, noise_rows, settings, beams, scratch, survey, row, bounds, out
+    robots, bodies, state, tasks, fields, noise, noise_rows, settings, beams, scratch, surveyed, row, bounds, out
 ):
-    """`observe` for robots, given by number."""
+    """Fills the rows of `out` of robots, given by number, with what the environments' docstrings describe.
+
+    Args:
+        robots: numbers.
+        bodies, state, tasks, fields: see `Fleet`.
+        noise, noise_rows: standard normal, and which row of it is each robot's; unread without sensing noise.
+        settings: see `leapnav.envs.settings`.
+        beams, scratch: see `scan`.
+        surveyed, row: room for `survey`, and for an observation before it is rounded.
+        bounds (2, n): the lowest and highest values.
+
+    """
+    deviation = settings[SENSING_NOISE]
+    goal_conditioned, motors = settings[GOAL_CONDITIONED] != 0.0, settings[MOTORS] != 0.0
+    has_lidar, has_map = settings[OBSERVATION] == LIDAR, settings[OBSERVATION] == MAP
+    count = beams.shape[1]
     for i in robots:
-        left = tasks[i, HORIZON] - state[i, TIME]
-        drawn = noise[i, noise_rows[i], FIRST_SENSED:] if noise.shape[2] > 0 else noise[i, 0]
-        observe(
-            bodies[i, 0:3],
-            state[i, VX : SPIN + 1],
-            tasks[i, GOAL : GOAL + 3],
-            left,
-            fields[i],
-            drawn,
-            settings,
-            beams,
-            scratch,
-            survey,
-            row,
-            bounds,
-            out[i],
-        )
+        x, y, heading = bodies[i, 0], bodies[i, 1], bodies[i, 2]
+        if deviation != 0.0:
+            drawn = noise[i, noise_rows[i]]
+            x += deviation * drawn[FIRST_SENSED]
+            y += deviation * drawn[FIRST_SENSED + 1]
+            heading += deviation * drawn[FIRST_SENSED + 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        goal_x, goal_y, goal_heading = tasks[i, GOAL], tasks[i, GOAL + 1], tasks[i, GOAL + 2]
+        free = math.isnan(goal_heading)
+        time_left = tasks[i, HORIZON] - state[i, TIME]
+        if goal_conditioned:
+            row[0], row[1], row[2], row[3] = x, y, cos, sin
+            row[4], row[5] = goal_x, goal_y
+            row[6] = 0.0 if free else math.cos(goal_heading)
+            row[7] = 0.0 if free else math.sin(goal_heading)
+            row[8] = time_left
+            at = 2 * POSE_ENTRIES + 1
+        else:
+            dx, dy = goal_x - x, goal_y - y
+            ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
+            turn = 0.0 if free else (goal_heading - heading + math.pi) % (2 * math.pi) - math.pi
+            time = max(time_left, settings[PERIOD])
+            row[0], row[1] = ahead, left
+            row[2] = 0.0 if free else math.cos(turn)
+            row[3] = 0.0 if free else math.sin(turn)
+            row[4] = time_left
+            row[5], row[6] = ahead / time, left / time
+            row[7] = math.sqrt(dx * dx + dy * dy) / time
+            row[8] = turn / time
+            at = GOAL_ENTRIES
+        if motors:
+            row[at] = cos * state[i, VX] + sin * state[i, VY]
+            row[at + 1] = cos * state[i, VY] - sin * state[i, VX]
+            row[at + 2] = state[i, SPIN]
+            at += MOTION_ENTRIES
+        if has_lidar and count > 0:
+            scan(x, y, cos, sin, fields[i], settings[LIDAR_RANGE], beams, scratch)
+            for k in range(count):
+                row[at + k] = scratch[2, k]
+            if deviation != 0.0:
+                for k in range(count):
+                    row[at + k] += deviation * drawn[FIRST_SENSED + 3 + k]
+        elif has_map:
+            survey(x, y, cos, sin, fields[i], int(settings[OBSTACLES]), int(settings[VERTICES]), surveyed)
+            row[at:] = surveyed
+        for k in range(len(row)):
+            value = np.float32(row[k])
+            value = bounds[0, k] if value < bounds[0, k] else value
+            out[i, k] = bounds[1, k] if value > bounds[1, k] else value

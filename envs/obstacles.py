@@ -287,6 +287,66 @@ def proximity_value(x, y, field):
     return _proximity_value(x, y, field)[0]
 
 
+@njit(
+    types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, float64, _field),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def proximity_values(xa, ya, xb, yb, xc, yc, field):
+    """`proximity_value` at three points near each other, the second between the others.
+
+    One look at an obstacle serves all three, which takes half the time of three calls.
+    """
+    grid = int(field[GRID])
+    if field[grid + 3] * field[grid + 4] > 1.0:  # the grid knows better what to look at
+        first, second = proximity_value(xa, ya, field), proximity_value(xb, yb, field)
+        return first, second, proximity_value(xc, yc, field)
+    radius, steepness = field[2], 1.0 / field[1]
+    apart = max(abs(xa - xb) + abs(ya - yb), abs(xc - xb) + abs(yc - yb))
+    reach = VALUE_CUTOFF * field[1] + apart
+    first = second = third = 0.0
+    for side in range(4):
+        sign = 1.0 if side < 2 else -1.0
+        wall = field[ARENA + side]
+        a, b, c = (xa, xb, xc) if side % 2 == 0 else (ya, yb, yc)
+        if sign * (b - wall) - radius < reach:
+            first += math.exp((radius - sign * (a - wall)) * steepness)
+            second += math.exp((radius - sign * (b - wall)) * steepness)
+            third += math.exp((radius - sign * (c - wall)) * steepness)
+    at = SHAPES
+    for _ in range(int(field[CIRCLES])):
+        x, y, rim = field[at], field[at + 1], field[at + 2] + radius
+        at += 3
+        square = (xb - x) ** 2 + (yb - y) ** 2 + 1e-6
+        if square < (rim + reach) ** 2:
+            first += math.exp((rim - math.sqrt((xa - x) ** 2 + (ya - y) ** 2 + 1e-6)) * steepness)
+            second += math.exp((rim - math.sqrt(square)) * steepness)
+            third += math.exp((rim - math.sqrt((xc - x) ** 2 + (yc - y) ** 2 + 1e-6)) * steepness)
+    for _ in range(int(field[POLYGONS])):
+        edges = int(field[at])
+        rows = at + 1
+        at = rows + 5 * edges
+        farthest_a = farthest_b = farthest_c = -np.inf
+        for j in range(edges):
+            nx, ny, offset = field[rows + 5 * j], field[rows + 5 * j + 1], field[rows + 5 * j + 2]
+            farthest_a = max(farthest_a, nx * xa + ny * ya - offset)
+            farthest_b = max(farthest_b, nx * xb + ny * yb - offset)
+            farthest_c = max(farthest_c, nx * xc + ny * yc - offset)
+        if farthest_b - radius < reach:
+            total_a = total_b = total_c = 0.0
+            for j in range(edges):
+                nx, ny, offset = field[rows + 5 * j], field[rows + 5 * j + 1], field[rows + 5 * j + 2]
+                total_a += math.exp((nx * xa + ny * ya - offset - farthest_a) * steepness)
+                total_b += math.exp((nx * xb + ny * yb - offset - farthest_b) * steepness)
+                total_c += math.exp((nx * xc + ny * yc - offset - farthest_c) * steepness)
+            first += math.exp((radius - farthest_a) * steepness) / total_a
+            second += math.exp((radius - farthest_b) * steepness) / total_b
+            third += math.exp((radius - farthest_c) * steepness) / total_c
+    weight = field[0]
+    return weight * first, weight * second, weight * third
+
+
 @njit(types.Tuple((float64, int64))(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
 def clearance(x, y, field):
     """Signed distance (m) from the robot's rim to the nearest obstacle or wall, and that obstacle's number.
@@ -401,15 +461,27 @@ def sample_grid(field, x0, y0, spacing, columns, lines, band):
 
 
 @njit(
+    types.UniTuple(float64, 2)(float64, float64, float64, float64, float64, float64),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def arc_point(x, y, heading, distance, turn, share):
+    """(x, y) at a share of a circular arc: the end of a chord at the mean heading."""
+    chord = distance * share * sinc(turn * share / 2)
+    middle = heading + turn * share / 2
+    return x + chord * math.cos(middle), y + chord * math.sin(middle)
+
+
+@njit(
     float64(float64, float64, float64, float64, float64, float64, _field),
     cache=True,
     error_model="numpy",
     nogil=True,
 )
 def _arc_clearance_at(x, y, heading, distance, turn, share, field):
-    chord = distance * share * sinc(turn * share / 2)
-    middle = heading + turn * share / 2
-    return clearance(x + chord * math.cos(middle), y + chord * math.sin(middle), field)[0]
+    x, y = arc_point(x, y, heading, distance, turn, share)
+    return clearance(x, y, field)[0]
 
 
 @njit(

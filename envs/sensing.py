@@ -1,29 +1,17 @@
-"""What the robot senses, as compiled kernels: the goal, its own motion, lidar ranges or a map of what is near."""
+"""What the robot senses of its surroundings, as compiled kernels: lidar ranges, or a map of what is near."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import float32, float64, int64, njit, types
+from numba import float64, int64, njit, types
 
 from leapnav.envs.obstacles import ARENA, CIRCLES, POLYGONS, SHAPES, polygon_distance
-from leapnav.envs.settings import (
-    GOAL_CONDITIONED,
-    LIDAR_RANGE,
-    MOTORS,
-    OBSERVATION,
-    OBSTACLES,
-    PERIOD,
-    SENSING_NOISE,
-    VERTICES,
-)
 
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
-# Entries of the parts of an observation; the environments' docstrings say what they mean.
-GOAL_ENTRIES, MOTION_ENTRIES, WALL_ENTRIES, POSE_ENTRIES = 9, 3, 6, 4
-FASTEST = 20.0  # m/s and rad/s; velocities beyond are clipped
+WALL_ENTRIES = 6  # of a survey, before the obstacles
 
 
 @njit(
@@ -165,92 +153,3 @@ def survey(x, y, cos, sin, field, obstacles, vertices, out):
             dx, dy = field[vertex] - x, field[vertex + 1] - y
             out[row + 2 + 2 * j] = cos * dx + sin * dy
             out[row + 3 + 2 * j] = cos * dy - sin * dx
-
-
-@njit(
-    types.none(
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        float64,
-        _field,
-        float64[::1],
-        float64[::1],
-        float64[:, ::1],
-        float64[:, ::1],
-        float64[::1],
-        float64[::1],
-        float32[:, ::1],
-        float32[::1],
-    ),
-    cache=True,
-    error_model="numpy",
-    nogil=True,
-)
-def observe(pose, velocity, goal, time_left, field, noise, settings, beams, scratch, survey_row, row, bounds, out):
-    """Fills `out` with the observation that `NavigateEnv` describes; a NaN goal heading is a free one.
-
-    Args:
-        pose, velocity, goal: (x, y, heading), their rates, and where to be.
-        time_left: s.
-        field: the packed field of the scenario.
-        noise: standard normal, for the pose (3) and each lidar range; unread if the settings have no sensing noise.
-        settings: see `leapnav.envs.settings`.
-        beams, scratch: see `scan`.
-        survey_row: room for `survey`.
-        row: room for the observation before it is rounded.
-        bounds (2, n): the lowest and highest values.
-
-    """
-    x, y, heading = pose[0], pose[1], pose[2]
-    deviation = settings[SENSING_NOISE]
-    if deviation != 0.0:
-        x, y, heading = x + deviation * noise[0], y + deviation * noise[1], heading + deviation * noise[2]
-    cos, sin = math.cos(heading), math.sin(heading)
-    free = math.isnan(goal[2])
-    at = 0
-    if settings[GOAL_CONDITIONED] == 0.0:
-        dx, dy = goal[0] - x, goal[1] - y
-        ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-        turn = 0.0 if free else (goal[2] - heading + math.pi) % (2 * math.pi) - math.pi
-        time = max(time_left, settings[PERIOD])
-        row[0] = ahead
-        row[1] = left
-        row[2] = 0.0 if free else math.cos(turn)
-        row[3] = 0.0 if free else math.sin(turn)
-        row[4] = time_left
-        row[5] = ahead / time
-        row[6] = left / time
-        row[7] = math.sqrt(dx * dx + dy * dy) / time
-        row[8] = turn / time
-        at = GOAL_ENTRIES
-    else:
-        row[0], row[1], row[2], row[3] = x, y, cos, sin
-        row[4], row[5] = goal[0], goal[1]
-        row[6] = 0.0 if free else math.cos(goal[2])
-        row[7] = 0.0 if free else math.sin(goal[2])
-        row[8] = time_left
-        at = 2 * POSE_ENTRIES + 1
-    if settings[MOTORS] != 0.0:
-        row[at] = cos * velocity[0] + sin * velocity[1]
-        row[at + 1] = cos * velocity[1] - sin * velocity[0]
-        row[at + 2] = velocity[2]
-        at += MOTION_ENTRIES
-    if settings[OBSERVATION] == 0.0:
-        reach = settings[LIDAR_RANGE]
-        count = beams.shape[1]
-        if count > 0:
-            scan(x, y, cos, sin, field, reach, beams, scratch)
-            for k in range(count):
-                row[at + k] = scratch[2, k]
-            if deviation != 0.0:
-                for k in range(count):
-                    row[at + k] += deviation * noise[3 + k]
-    elif settings[OBSERVATION] == 2.0:
-        survey(x, y, cos, sin, field, int(settings[OBSTACLES]), int(settings[VERTICES]), survey_row)
-        for k in range(len(survey_row)):
-            row[at + k] = survey_row[k]
-    for k in range(len(out)):
-        value = np.float32(row[k])
-        value = bounds[0, k] if value < bounds[0, k] else value
-        out[k] = bounds[1, k] if value > bounds[1, k] else value

@@ -11,8 +11,8 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import leapnav  # noqa: F401 (registers)
 from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
+from leapnav.envs.observations import GOAL_ENTRIES
 from leapnav.envs.obstacles import clearance, clearances
-from leapnav.envs.sensing import GOAL_ENTRIES
 
 ID = "leapnav/Navigate-v0"
 EMPTY = {"start": [5.0, 5.0, 0.3], "goal": [6.0, 5.0, 0.0], "obstacles": []}

@@ -5,7 +5,14 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Scenario
-from leapnav.envs.obstacles import clearance, clearances, follow_arc, proximity
+from leapnav.envs.obstacles import (
+    clearance,
+    clearances,
+    follow_arc,
+    proximity,
+    proximity_value,
+    proximity_values,
+)
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
 
@@ -91,6 +98,18 @@ def test_clearance_is_the_distance_to_the_nearest_rim(scenario):
         walls = min(x - x_min, x_max - x, y - y_min, y_max - y)
         nearest = min(walls, *(np.hypot(*(rim - (x, y)).T).min() for rim in rims)) - scenario.robot.radius
         assert distance == pytest.approx(nearest, abs=2e-3)  # the rim's points stand 2 mm apart
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+def test_values_alone_and_by_three_are_those_with_derivatives(scenario):
+    rng = np.random.default_rng(5)
+    for x, y in points(scenario, 200, seed=2):
+        dx, dy = rng.normal(0, 0.2, 2)
+        three = (x - dx, y - dy), (x, y), (x + dx, y + dy)
+        expected = [proximity(*point, scenario.field)[0] for point in three]
+        assert [proximity_value(*point, scenario.field) for point in three] == pytest.approx(expected, abs=1e-9)
+        found = proximity_values(*three[0], *three[1], *three[2], scenario.field)
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_clearance_names_the_nearest_obstacle():

@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 import leapnav
-from leapnav.envs.sensing import GOAL_ENTRIES
+from leapnav.envs.observations import GOAL_ENTRIES
 
 FORMAT = 1
 HIDDEN = (256, 256, 256)

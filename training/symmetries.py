@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch as th
 
-from leapnav.envs.sensing import GOAL_ENTRIES
+from leapnav.envs.observations import GOAL_ENTRIES
 
 # Signs of the observation's first entries (see the environment's docstring) under each symmetry.
 _MIRROR = th.tensor([1.0, -1, 1, -1, 1, 1, -1, 1, -1])
