@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from leapnav.envs import NavigateEnv, Scenario, sample_scenario
+from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank, sample_scenario
 from leapnav.experts import ExpertPolicy, NoOptimumError, find_optimum
 from leapnav.experts.demonstrations import dataset_id, demonstrate, load_demonstrations, open_dataset, rollout
 from leapnav.experts.policy import plan_actions
@@ -25,6 +25,25 @@ def test_replaying_the_optimum_succeeds_at_its_cost():
         assert demonstration.is_success
         assert -demonstration.rewards.sum() == pytest.approx(extremal.cost, rel=1e-3)
         assert demonstration.running_cost.sum() == pytest.approx(extremal.cost, rel=1e-3)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_replaying_the_optimum_succeeds_in_the_vector_form_too(family):
+    bank = ScenarioBank.shipped(family, "test")
+    robots = 12
+    plans = [plan_actions(find_optimum(bank[i]), bank[i], 0.05) for i in range(robots)]
+    venv = NavigateVectorEnv(robots, bank=bank, observation="state")
+    venv.reset(options={"index": list(range(robots))})
+    ended = np.zeros(robots, dtype=bool)
+    for step in range(max(map(len, plans))):
+        now = np.array([plan[min(step, len(plan) - 1)] for plan in plans])
+        _, _, terminated, _, infos = venv.step(now)
+        for i in np.flatnonzero(terminated & ~ended):
+            assert step == len(plans[i]) - 1
+            assert infos["is_success"][i]
+            assert infos["cost"][i] == pytest.approx(bank.costs[i], rel=1e-3)
+        ended |= terminated
+    assert ended.all()
 
 
 def test_the_error_of_a_replay_falls_with_the_square_of_the_control_period():

@@ -267,6 +267,20 @@ def test_robots_that_go_on_after_a_touch_stay_out_of_obstacles():
             assert deepest > -1e-3
 
 
+def test_gymnasium_s_recorders_film_single_and_vector(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        options = {"step_trigger": lambda step: step == 0, "video_length": 5, "disable_logger": True}
+        env = gym.wrappers.RecordVideo(gym.make(ID, render_mode="rgb_array"), str(tmp_path / "one"), **options)
+        venv = gym.wrappers.vector.RecordVideo(make(3, render_mode="rgb_array"), str(tmp_path / "many"), **options)
+        for recorded in (env, venv):
+            recorded.reset(seed=0)
+            for _ in range(8):
+                recorded.step(recorded.action_space.sample())
+            recorded.close()
+    assert len(list(tmp_path.glob("one/*.mp4"))) == len(list(tmp_path.glob("many/*.mp4"))) == 1
+
+
 def test_frames_are_of_each_robot():
     env = make(2, render_mode="rgb_array")
     with pytest.raises(gym.error.ResetNeeded):
