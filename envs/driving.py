@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numba import boolean, float64, int64, njit, types
 
-from leapnav.envs.obstacles import arc_point, clearance, follow_arc, proximity_value, proximity_values, sinc
+from leapnav.envs.arcs import arc_proximity, follow_arc
+from leapnav.envs.obstacles import clearance, sinc
 from leapnav.envs.scenario import GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, START, TURN_WEIGHT
 from leapnav.envs.settings import (
     ACTUATION_NOISE,
@@ -59,20 +60,14 @@ from leapnav.envs.settings import (
     COLUMNS,
 ) = range(25)
 
+# What infos tell: numbers, flags, and the parts of the reward that are paid.
+INFOS = {"cost": COST, "clearance": CLEARANCE, "time": TIME}
+FLAGS = {"collision": COLLIDED, "is_success": SUCCESS}
+PARTS = {"effort": EFFORT, "proximity": PROXIMITY, "collision": COLLISION, "miss": MISS}
+
 GUIDES = 17  # points of the way along the reference, for the potential
 _field = types.Array(types.float64, 1, "C", readonly=True)
 _options = {"cache": True, "error_model": "numpy", "nogil": True}
-
-
-@njit(float64(float64, float64, float64, float64, float64, _field), **_options)
-def arc_proximity(x, y, heading, distance, turn, field):
-    """Mean of Phi along an arc, by the three-point Gauss rule."""
-    offset = 0.5 * math.sqrt(0.6)
-    xa, ya = arc_point(x, y, heading, distance, turn, 0.5 - offset)
-    xb, yb = arc_point(x, y, heading, distance, turn, 0.5)
-    xc, yc = arc_point(x, y, heading, distance, turn, 0.5 + offset)
-    first, second, third = proximity_values(xa, ya, xb, yb, xc, yc, field)
-    return (5.0 * first + 8.0 * second + 5.0 * third) / 18.0
 
 
 @njit(float64(float64[:, ::1], int64, float64, float64), **_options)
@@ -235,8 +230,7 @@ def drive_motors(bodies, state, tasks, fields, settings, piece, pieces):
         state[i, CLEARANCE], state[i, HERE] = min(state[i, CLEARANCE], lowest), after
         speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
         state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * share
-        near = proximity_value(x + dx * share / 2, y + dy * share / 2, field)
-        state[i, PROXIMITY] += near * step * share
+        state[i, PROXIMITY] += arc_proximity(x, y, course, distance * share, 0.0, field) * step * share
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * share, dy * share, turn * share
         if share < 1.0:
             state[i, TOUCHED] = 1.0

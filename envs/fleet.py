@@ -26,7 +26,7 @@ from leapnav.envs.driving import (
     VX,
 )
 from leapnav.envs.observations import Layout
-from leapnav.envs.obstacles import clearance, proximity_value, sinc
+from leapnav.envs.obstacles import clearance, sinc
 from leapnav.envs.physics import ContactWorld, FreeBodies
 from leapnav.envs.scenario import GOAL, TASK_COLUMNS, Scenario
 from leapnav.envs.sensing import most_vertices
@@ -61,6 +61,7 @@ class Fleet:
         self.fields = np.zeros((count, 0))
         self._packed = settings.packed()
         self._disturbed, self._motors = settings.disturbed, settings.motors
+        self._maps = settings.observation == "map"
         self._pieces = math.ceil(settings.control_period / LONGEST_PIECE - 1e-9)
         self._lengths = np.zeros(count, dtype=int)
         self._guides = np.zeros((count, GUIDES, 3))
@@ -97,10 +98,9 @@ class Fleet:
 
         """
         numbers = np.asarray(robots, dtype=np.int64)
-        fields = [choice.field if isinstance(choice, Scenario) else _of(bank).field(choice) for choice in choices]
-        if self.settings.observation == "map":
-            for field in fields:
-                self._check_map(field)
+        fields = [_field_of(choice, bank) for choice in choices]
+        for field in fields:
+            self._check_fits(field)
         longest = max(map(len, fields))
         if longest > self.fields.shape[1]:
             # Whole cache lines, and an odd number of them: rows at powers of two would compete for the same places.
@@ -125,7 +125,22 @@ class Fleet:
                 self._generators[i] = generator
                 self._draw_noise(i)
 
-    def _check_map(self, field: np.ndarray) -> None:
+    def check(self, choice: Scenario | int | None, bank: ScenarioBank | None) -> None:
+        """Checks that a scenario can be observed; with None, that all of the bank can.
+
+        Raises:
+            ValueError: it cannot.
+
+        """
+        if choice is not None:
+            self._check_fits(_field_of(choice, bank))
+        elif bank is not None:
+            for number in range(len(bank)):
+                self._check_fits(bank.field(number))
+
+    def _check_fits(self, field: np.ndarray) -> None:
+        if not self._maps:
+            return
         vertices = most_vertices(field)
         if vertices > self.settings.map_vertices:
             raise ValueError(
@@ -197,7 +212,6 @@ class Fleet:
         step = duration / pieces
         speed, turn_rate = float(row[SPEED]), float(row[TURN_RATE])
         velocity = row[VX : SPIN + 1].copy()
-        before = body[:3].copy()
         if self._motors:
 
             def control(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
@@ -211,17 +225,11 @@ class Fleet:
                 return along * math.cos(middle), along * math.sin(middle), turn_rate
 
             velocity[:] = control(0.0, 0.0, float(body[2]), 0.0)
-        lowest = self._contacts[i].drive(body, velocity, control, duration, pieces)
-        # In "velocity" the wheels turn as commanded, whatever the body does; in "motor" the body's motion counts.
+        lowest, speeds, turns, near = self._contacts[i].drive(body, velocity, control, duration, pieces)
         if self._motors:
-            mean = (row[VX : SPIN + 1] + velocity) / 2
-            rate = driving.effort(self.tasks, i, mean[0] ** 2 + mean[1] ** 2, mean[2] ** 2)
             row[VX : SPIN + 1] = velocity
-        else:
-            rate = driving.effort(self.tasks, i, speed**2, turn_rate**2)
-        row[EFFORT] += rate * duration
-        near = (proximity_value(before[0], before[1], field) + proximity_value(body[0], body[1], field)) / 2
-        row[PROXIMITY] += near * duration
+        row[EFFORT] += driving.effort(self.tasks, i, speeds, turns)
+        row[PROXIMITY] += near
         row[HERE] = clearance(body[0], body[1], field)[0]
         row[CLEARANCE] = min(row[CLEARANCE], lowest)
 
@@ -256,3 +264,7 @@ class Fleet:
 def _of(bank: ScenarioBank | None) -> ScenarioBank:
     assert bank is not None  # numbers of scenarios come with their bank
     return bank
+
+
+def _field_of(choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray:
+    return choice.field if isinstance(choice, Scenario) else _of(bank).field(choice)

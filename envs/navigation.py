@@ -86,11 +86,11 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     `reward="shaped"` adds the last: potential-based shaping, which leaves the optimal policy as it is (Ng, Harada and
     Russell, 1999) if `discount` is the learner's. The potential is minus the cost of driving at an even pace along the
     reference path (without a reference, straight) to the goal, at least `-miss_penalty`, and 0 once the episode is over.
-    v and omega are those driven: in `"motor"` and under a disturbance not quite those commanded.
+    v and omega are those driven: in `"motor"`, in contact and under a disturbance not quite those commanded.
 
     ## Starting state
     The scenario's start, at rest in `"motor"`. The scenario is `options["scenario"]` (a `Scenario`, a dict in the
-    layout of its file, or its JSON text), else the argument `scenario`; else number `options["index"]` of the bank, or
+    layout of its file, its JSON text, or the file), else the argument `scenario`; else number `options["index"]` of the bank, or
     one that the environment's own generator draws from it; with `split="fresh"` that generator makes a new one.
 
     ## Episode end
@@ -193,7 +193,9 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self._fleet = Fleet(1, self.settings)
         self.observation_space = self._fleet.layout.space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self._fleet.check(self._tasks.scenario, self.bank)
         self._choice: Scenario | int | None = None
+        self._playing = np.zeros(1, dtype=bool)
         self._noise_generator: np.random.Generator | None = None
         self._trail: list[tuple[float, float, float]] = []
         self._window: Window | None = None
@@ -207,15 +209,20 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
             ValueError: an unknown or impossible option.
 
         """
-        super().reset(seed=seed)
         options = options or {}
         check_options(options, "scenario", "index")
-        choice = self._tasks.choose(self.np_random, options.get("scenario"), options.get("index"))
+        choice = self._tasks.given(options.get("scenario"), options.get("index"))
+        if choice is not None:
+            self._fleet.check(choice, self.bank)
+        super().reset(seed=seed)  # nothing can fail from here on
+        if choice is None:
+            choice = self._tasks.draw(self.np_random)
         if self.settings.disturbed and (seed is not None or self._noise_generator is None):
             self._noise_generator = disturbance_generator(self.np_random_seed)
         generators = [] if self._noise_generator is None else [self._noise_generator]
         self._fleet.begin([0], [choice], self.bank, generators)
         self._choice = choice
+        self._playing[0] = True
         self._trail = [self.pose]
         info = self._info()
         info["scenario"] = self.scenario
@@ -227,7 +234,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Holds an action for one control period.
+        """Holds an action for one control period; after the end of an episode nothing moves and nothing is paid.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -236,12 +243,13 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         """
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        self._fleet.step(check_actions(action, (2,)).reshape(1, 2))
+        self._fleet.step(check_actions(action, (2,)).reshape(1, 2), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)
         row = self._fleet.state[0]
         observation, info = self._observe(), self._info()
         terminated = bool(row[driving.TERMINATED])
+        self._playing[0] = not terminated
         if self.render_mode == "human":
             self.render()
         return observation, float(row[driving.REWARD]), terminated, False, info
@@ -324,23 +332,14 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
 
     def _info(self) -> dict[str, Any]:
         row = self._fleet.state[0].tolist()
-        parts = {
-            "effort": -row[driving.EFFORT],
-            "proximity": -row[driving.PROXIMITY],
-            "collision": -row[driving.COLLISION],
-            "miss": -row[driving.MISS],
-        }
+        parts = {name: -row[column] for name, column in driving.PARTS.items()}
         if self.settings.reward == "shaped":
             parts["shaping"] = row[driving.SHAPING]
-        return {
-            "cost": row[driving.COST],
-            "clearance": row[driving.CLEARANCE],
-            "collision": row[driving.COLLIDED] != 0.0,
-            "is_success": row[driving.SUCCESS] != 0.0,
-            "time": row[driving.TIME],
-            "pose": self.pose,
-            "reward_parts": parts,
-        }
+        info: dict[str, Any] = {name: row[column] for name, column in driving.INFOS.items()}
+        for name, column in driving.FLAGS.items():
+            info[name] = row[column] != 0.0
+        info["pose"], info["reward_parts"] = self.pose, parts
+        return info
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_window": None}  # a window stays where it is
@@ -367,7 +366,8 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
     | `"sparse"` (the default) | 1 in each step that ends at the goal, within the tolerances, else 0 |
     | `"cost"` | as in `NavigateEnv`; `compute_reward` then needs the infos of the steps |
 
-    `info` has `terminated` and `at_horizon` in addition. Everything else is as in `NavigateEnv`.
+    The sensing of a `Disturbance` blurs the lidar, not the goals, which decide the reward. The `info` of a step has
+    `terminated` and `at_horizon` in addition. Everything else is as in `NavigateEnv`.
     """
 
     _goal_conditioned = True
@@ -377,9 +377,11 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """As `NavigateEnv.step`, with the reward of `compute_reward`."""
+        playing = bool(self._playing[0])
         observation, _, terminated, truncated, info = super().step(action)
         info["terminated"], info["at_horizon"] = terminated, self._fleet.at_horizon(0)
         reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
+        reward = float(reward) if playing else 0.0
         return observation, reward, terminated, truncated, info
 
 
@@ -405,14 +407,14 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
 
     """
     try:
-        values = np.asarray(actions, dtype=np.float64)
-    except (TypeError, ValueError):
-        values = None
-    if values is None or values.shape != shape:
+        values = np.asarray(actions)
+    except (TypeError, ValueError):  # rows of different lengths
+        values = np.empty(0, dtype=object)
+    if values.shape != shape or values.dtype.kind not in "fiu":
         wanted = "two finite numbers" if len(shape) == 1 else f"finite numbers of shape {shape}"
-        got = repr(actions) if values is None or values.ndim < 2 else f"shape {values.shape}"
-        raise ValueError(f"action: expected {wanted}, got {got}")
-    return np.ascontiguousarray(values)
+        many = values.ndim > 1 and values.dtype.kind in "fiu"
+        raise ValueError(f"action: expected {wanted}, got {f'shape {values.shape}' if many else repr(actions)}")
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def disturbance_generator(seed: int | None) -> np.random.Generator:

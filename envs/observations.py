@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numba import float32, float64, int64, njit, types
 
 from leapnav.envs.driving import SPIN, TIME, VX, VY
-from leapnav.envs.scenario import GOAL, HORIZON
+from leapnav.envs.scenario import GOAL, HORIZON, LARGEST
 from leapnav.envs.sensing import WALL_ENTRIES, scan, survey
 from leapnav.envs.settings import (
     GOAL_CONDITIONED,
@@ -46,7 +46,8 @@ class Part:
 def _parts(settings: Settings) -> list[Part]:
     parts = []
     if settings.goal_conditioned:
-        pose = (-FARTHEST, -FARTHEST, -1.0, -1.0), (FARTHEST, FARTHEST, 1.0, 1.0)
+        # Places, unlike ways to go, must not be clipped: clipped goals would look achieved.
+        pose = (-LARGEST, -LARGEST, -1.0, -1.0), (LARGEST, LARGEST, 1.0, 1.0)
         parts += [Part("achieved_goal", *pose), Part("desired_goal", *pose), Part("time", (0.0,), (LONGEST,))]
     else:
         low = (-FARTHEST, -FARTHEST, -1.0, -1.0, 0.0, -FASTEST, -FASTEST, 0.0, -FASTEST)
@@ -187,12 +188,16 @@ def observe_robots(
     count = beams.shape[1]
     for i in robots:
         x, y, heading = bodies[i, 0], bodies[i, 1], bodies[i, 2]
-        if deviation != 0.0:
+        cos, sin = math.cos(heading), math.sin(heading)
+        if has_lidar and count > 0:  # from where the robot is, not where it thinks that it is
+            scan(x, y, cos, sin, fields[i], settings[LIDAR_RANGE], beams, scratch)
+        # Goals that are achieved are not disturbed: they decide the reward.
+        if deviation != 0.0 and not goal_conditioned:
             drawn = noise[i, noise_rows[i]]
             x += deviation * drawn[FIRST_SENSED]
             y += deviation * drawn[FIRST_SENSED + 1]
             heading += deviation * drawn[FIRST_SENSED + 2]
-        cos, sin = math.cos(heading), math.sin(heading)
+            cos, sin = math.cos(heading), math.sin(heading)
         goal_x, goal_y, goal_heading = tasks[i, GOAL], tasks[i, GOAL + 1], tasks[i, GOAL + 2]
         free = math.isnan(goal_heading)
         time_left = tasks[i, HORIZON] - state[i, TIME]
@@ -222,12 +227,11 @@ def observe_robots(
             row[at + 2] = state[i, SPIN]
             at += MOTION_ENTRIES
         if has_lidar and count > 0:
-            scan(x, y, cos, sin, fields[i], settings[LIDAR_RANGE], beams, scratch)
             for k in range(count):
                 row[at + k] = scratch[2, k]
             if deviation != 0.0:
                 for k in range(count):
-                    row[at + k] += deviation * drawn[FIRST_SENSED + 3 + k]
+                    row[at + k] += deviation * noise[i, noise_rows[i], FIRST_SENSED + 3 + k]
         elif has_map:
             survey(x, y, cos, sin, fields[i], int(settings[OBSTACLES]), int(settings[VERTICES]), surveyed)
             row[at:] = surveyed

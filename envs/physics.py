@@ -9,6 +9,7 @@ depend, in the last bits, on what else is in it and on what was; a robot's episo
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,13 @@ import pymunk
 import pymunk.batch
 from numba import float64, njit, types
 
-from leapnav.envs.obstacles import ARENA, clearance, unpack_field
+from leapnav.envs.arcs import follow_arc
+from leapnav.envs.obstacles import ARENA, clearance, proximity_value, unpack_field
 
 WALL_THICKNESS = 1.0  # m, outside the arena
 SKIN = 1e-3  # m by which the rim is felt farther out, so that a robot that slides along something stays in contact
 DEEPEST = 1e-6  # m that a robot in contact may overlap what it touches
+SHORT = 0.5  # of the robot's radius: a way after which it is still on the same side of what it touches
 _field = types.Array(types.float64, 1, "C", readonly=True)
 _options = {"cache": True, "error_model": "numpy", "nogil": True}
 
@@ -81,8 +84,11 @@ class FreeBodies:
         self._build(state["rows"])
 
 
+Velocity = tuple[float, float, float]  # x, y, angular
+
+
 class ContactWorld:
-    """One robot and the obstacles of its arena, for the rest of an episode in which it touched something.
+    """One robot and the obstacles of its arena, for the periods of an episode in which it touches something.
 
     Args:
         field: the packed field of the scenario.
@@ -93,6 +99,7 @@ class ContactWorld:
 
     def __init__(self, field: np.ndarray, mass: float, moment: float, friction: float) -> None:
         self._field = field
+        self._robot = mass, moment, friction
         self._space = pymunk.Space()
         self._space.collision_slop = SKIN  # metres, not Chipmunk's customary pixels
         static = self._space.static_body
@@ -111,21 +118,16 @@ class ContactWorld:
         for shape in shapes:
             shape.friction = 1.0  # Chipmunk multiplies the two
         self._space.add(*shapes)
-        self._body = pymunk.Body(mass, moment)
-        self._rim = pymunk.Circle(self._body, field[2] + SKIN)
-        self._rim.friction = friction
-        self._space.add(self._body, self._rim)
-        self._drive: Any = None
-        self._body.velocity_func = self._apply
 
-    def _apply(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
-        # Chipmunk calls this before it solves for the contacts, which then take away what leads into an obstacle.
-        vx, vy, turn_rate = self._drive(*body.velocity, body.angle, body.angular_velocity)
-        body.velocity = vx, vy
-        body.angular_velocity = turn_rate
-
-    def drive(self, row: np.ndarray, velocity: np.ndarray, control: Any, duration: float, pieces: int) -> float:
-        """Drives for `duration` seconds and returns the smallest clearance (m).
+    def drive(
+        self,
+        row: np.ndarray,
+        velocity: np.ndarray,
+        control: Callable[[float, float, float, float], Velocity],
+        duration: float,
+        pieces: int,
+    ) -> tuple[float, float, float, float]:
+        """Drives for `duration` seconds.
 
         Args:
             row: x, y, angle, overwritten.
@@ -133,50 +135,74 @@ class ContactWorld:
             control: from velocity (2), angle and angular velocity to the velocities wanted next, contacts left out.
             pieces: steps to take.
 
+        Returns:
+            The smallest clearance (m), and the integrals of the squared speed and turn rate driven and of Phi.
+
         """
-        # The robot's shape is new to the Space, so that contacts of earlier periods are forgotten.
-        self._space.remove(self._rim)
-        self._space.add(self._rim)
-        body = self._body
-        self._drive = control
-        body.position, body.angle = (row[0], row[1]), row[2]
+
+        def apply(body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
+            # Chipmunk calls this before it solves for the contacts, which then take away what leads into an obstacle.
+            vx, vy, turn_rate = control(*body.velocity, body.angle, body.angular_velocity)
+            body.velocity = vx, vy
+            body.angular_velocity = turn_rate
+
+        # The robot is new to the Space: what a body or a contact remembers must not reach from one period to the next.
+        mass, moment, friction = self._robot
+        body = pymunk.Body(mass, moment)
+        rim = pymunk.Circle(body, self._field[2] + SKIN)
+        rim.friction = friction
+        x, y, angle = row[:3].tolist()
+        body.position, body.angle = (x, y), angle
         body.velocity, body.angular_velocity = (velocity[0], velocity[1]), velocity[2]
-        lowest = math.inf
+        body.velocity_func = apply
+        self._space.add(body, rim)
+        step = duration / pieces
+        lowest, speeds, turns = math.inf, 0.0, 0.0
+        phi = proximity_value(x, y, self._field)
+        near = phi / 2
         for _ in range(pieces):
-            safe_x, safe_y, _ = _pose(body)
-            self._space.step(duration / pieces)
-            x, y, _ = _pose(body)
-            x, y, depth = push_out(x, y, safe_x, safe_y, self._field)
-            if depth < 0.0:
-                body.position = x, y
+            self._space.step(step)
+            (to_x, to_y), to_angle = body.position, body.angle
+            to_x, to_y, depth = settle(x, y, to_x, to_y, self._field)
+            body.position = to_x, to_y
             lowest = min(lowest, depth)
-        row[:3] = _pose(body)
+            speeds += ((to_x - x) ** 2 + (to_y - y) ** 2) / step
+            turns += (to_angle - angle) ** 2 / step
+            x, y, angle = to_x, to_y, to_angle
+            phi = proximity_value(x, y, self._field)
+            near += phi
+        row[:3] = x, y, angle
         velocity[:] = *body.velocity, body.angular_velocity
-        return lowest
-
-
-def _pose(body: pymunk.Body) -> tuple[float, float, float]:
-    return body.position.x, body.position.y, body.angle
+        self._space.remove(body, rim)
+        return lowest, speeds, turns, (near - phi / 2) * step
 
 
 @njit(types.UniTuple(float64, 3)(float64, float64, float64, float64, _field), **_options)
-def push_out(x, y, safe_x, safe_y, field):
-    """The nearest free place to (x, y), or (safe_x, safe_y) if none is found: x, y and the clearance before.
+def settle(x, y, to_x, to_y, field):
+    """Where a robot that Chipmunk moved from a free place to (to_x, to_y) comes to stand: x, y, clearance before.
 
-    Chipmunk notices a contact when bodies overlap already, by up to the way of a step.
+    Chipmunk notices a contact when bodies overlap already, by up to the way of a step. After a short way the robot is
+    pushed out to the nearest free place. After one so long that this might be on the other side, it stands where it
+    first touches.
     """
-    before = clearance(x, y, field)[0]
+    way = math.hypot(to_x - x, to_y - y)
+    before = clearance(to_x, to_y, field)[0]
+    if way > SHORT * field[2]:
+        here = max(clearance(x, y, field)[0], DEEPEST)
+        _, share, _ = follow_arc(x, y, math.atan2(to_y - y, to_x - x), way, 0.0, here, field)
+        return x + share * (to_x - x), y + share * (to_y - y), before
     depth = before
+    new_x, new_y = to_x, to_y
     h = 1e-6
     for _ in range(50):
         if depth >= -DEEPEST:
-            return x, y, before
-        nx = clearance(x + h, y, field)[0] - clearance(x - h, y, field)[0]
-        ny = clearance(x, y + h, field)[0] - clearance(x, y - h, field)[0]
+            return new_x, new_y, before
+        nx = clearance(new_x + h, new_y, field)[0] - clearance(new_x - h, new_y, field)[0]
+        ny = clearance(new_x, new_y + h, field)[0] - clearance(new_x, new_y - h, field)[0]
         size = math.hypot(nx, ny)
         if size == 0.0:
             break
-        x -= depth * nx / size
-        y -= depth * ny / size
-        depth = clearance(x, y, field)[0]
-    return safe_x, safe_y, before
+        new_x -= depth * nx / size
+        new_y -= depth * ny / size
+        depth = clearance(new_x, new_y, field)[0]
+    return x, y, before

@@ -41,9 +41,8 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         dx = cos * beams[0, k] - sin * beams[1, k]
         dy = sin * beams[0, k] + cos * beams[1, k]
         dxs[k], dys[k] = dx, dy
-        # A division by zero gives infinity, or from the very wall not a number, which is then no hit.
-        across = (to_right if dx > 0.0 else to_left) / dx
-        along = (to_top if dy > 0.0 else to_bottom) / dy
+        across = (to_right if dx > 0.0 else to_left) / dx if dx != 0.0 else np.inf
+        along = (to_top if dy > 0.0 else to_bottom) / dy if dy != 0.0 else np.inf
         first = across if across < along else along
         nearest[k] = first if first < reach else reach
     at = SHAPES

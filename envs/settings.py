@@ -12,6 +12,7 @@ import numpy as np
 OBSERVATIONS, REWARDS, ACTUATIONS = ("lidar", "state", "map"), ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS = ("sparse", "cost")
 SHORTEST_PERIOD = 1e-4  # s
+MOST = 10_000  # beams, obstacles or vertices
 
 # Positions in the array that the kernels read.
 (
@@ -90,7 +91,8 @@ class Disturbance:
     Attributes:
         actuation: standard deviation of the driven speed and turn rate, relative to the commanded ones.
         slip: each wheel loses the share `slip * |n|` of its way, n standard normal.
-        sensing: standard deviation of the sensed position (m), heading (rad) and lidar ranges (m).
+        sensing: standard deviation of the sensed position (m) and heading (rad), from which the goal and the map are
+            seen, and of the lidar's ranges (m), which it takes from where the robot is.
 
     """
 
@@ -146,8 +148,8 @@ class Settings:
             raise ValueError(f"discount: expected a number in (0, 1], got {self.discount!r}")
         for name, least in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= MOST:
+                raise ValueError(f"{name}: expected an integer from {least} to {MOST}, got {value!r}")
         for name in ("terminate_on_collision", "dict_observation"):
             if not isinstance(getattr(self, name), (bool, np.bool_)):
                 raise ValueError(f"{name}: expected True or False, got {getattr(self, name)!r}")
@@ -182,9 +184,10 @@ class Settings:
 
 
 def _as_disturbance(value: Any) -> Disturbance:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
         _check_number("disturbance", value)
-        return Disturbance(actuation=value, slip=value, sensing=value / 10)
+        size = float(value)
+        return Disturbance(actuation=size, slip=size, sensing=size / 10)
     return _as_part("disturbance", Disturbance, value)
 
 

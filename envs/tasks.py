@@ -32,7 +32,7 @@ class Tasks:
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
     ) -> None:
-        if family not in FAMILIES:
+        if not isinstance(family, str) or family not in FAMILIES:
             raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
         arguments = (("scenario", scenario), ("split", split), ("bank", bank))
         given = [name for name, value in arguments if value is not None]
@@ -44,31 +44,35 @@ class Tasks:
         self.scenario = None if scenario is None else as_scenario(scenario)
         self.bank: ScenarioBank | None = None
         if bank is not None:
+            if not isinstance(bank, (ScenarioBank, str, os.PathLike)):
+                raise ValueError(f"bank: expected a ScenarioBank or its file, got {bank!r}")
             self.bank = bank if isinstance(bank, ScenarioBank) else ScenarioBank(bank)
             if len(self.bank) == 0:
                 raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
         elif scenario is None and split != "fresh":
             self.bank = ScenarioBank.shipped(family, split or "train")
 
-    def choose(self, rng: np.random.Generator, scenario: Any = None, index: Any = None) -> Scenario | int:
-        """An episode's scenario, or its number in the bank.
+    def given(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:
+        """The scenario that the options of a reset ask for, or its number in the bank; None if they ask for none.
 
-        Args:
-            rng: draws what is not given.
-            scenario, index: the options of `reset`.
+        Raises:
+            ValueError, ScenarioError, IndexError: there is no such scenario.
 
         """
         if index is not None and (scenario is not None or self.bank is None):
             raise ValueError(f"options: 'index' needs a bank and no 'scenario', got {index!r}")
         if scenario is not None:
             return as_scenario(scenario)
-        if index is not None:
-            assert self.bank is not None  # checked
-            if isinstance(index, bool) or not isinstance(index, (int, np.integer)):
-                raise ValueError(f"options: index: expected an integer, got {index!r}")
-            if not -len(self.bank) <= index < len(self.bank):
-                raise IndexError(f"options: index: {self.bank.path.name} has {len(self.bank)} scenarios, got {index}")
-            return int(index) % len(self.bank)
+        if index is None or self.bank is None:
+            return None
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)):
+            raise ValueError(f"options: index: expected an integer, got {index!r}")
+        if not -len(self.bank) <= index < len(self.bank):
+            raise IndexError(f"options: index: {self.bank.path.name} has {len(self.bank)} scenarios, got {index}")
+        return int(index) % len(self.bank)
+
+    def draw(self, rng: np.random.Generator) -> Scenario | int:
+        """An episode's scenario, or its number in the bank, where the options ask for none."""
         if self.bank is not None:
             return int(rng.integers(len(self.bank)))
         return sample_scenario(self.family, rng) if self.scenario is None else self.scenario

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import gymnasium as gym
@@ -38,7 +39,11 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         render_mode: None or "rgb_array"; `render` returns a frame of each robot.
         settings: the other arguments of `NavigateEnv`.
 
+    Infos are arrays with masks, as Gymnasium has them; `pose` is (num_envs, 3). Of a bank's scenarios a reset tells
+    `index` and `reference_cost`; `scenarios` has the scenarios themselves.
+
     Raises:
+        TypeError: there is no such argument.
         ValueError, ScenarioError, FileNotFoundError, BankError: as for `NavigateEnv`.
 
     """
@@ -60,6 +65,9 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise ValueError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
+        for name in settings:
+            if name not in KNOWN:
+                raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
         self._tasks = Tasks(family, scenario, split, bank)
         self.settings = Settings(**settings, goal_conditioned=self._goal_conditioned)
         try:
@@ -69,14 +77,17 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"autoreset_mode: expected one of {modes}, got {autoreset_mode!r}") from None
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.num_envs = int(num_envs)
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        fps = max(1, round(1 / self.settings.control_period))
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": fps}
         self.render_mode = render_mode
         self._fleet = Fleet(self.num_envs, self.settings)
         self.single_observation_space = self._fleet.layout.space
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._fleet.check(self._tasks.scenario, self.bank)
         self._choices: list[Scenario | int | None] = [None] * self.num_envs
+        self._seeds: list[int] = [-1] * self.num_envs
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._noise_generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._ended = np.zeros(self.num_envs, dtype=bool)
@@ -103,14 +114,18 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             choice is None for choice, chosen in zip(self._choices, mask, strict=True) if not chosen
         ):
             raise gym.error.ResetNeeded("reset_mask: reset all robots before some")
-        seeds = self._seeds(seed)
+        seeds = self._seeds_of(seed)
         robots = np.flatnonzero(mask)
-        for i in robots.tolist():
-            if seeds[i] is not None or self._generators[i] is None:
-                self._generators[i], used = seeding.np_random(seeds[i])
-                self._noise_generators[i] = disturbance_generator(used) if self.settings.disturbed else None
         scenarios, indices = (self._each(name, options.get(name)) for name in ("scenario", "index"))
-        self._begin(robots, scenarios, indices)
+        given = [self._tasks.given(scenarios[i], indices[i]) for i in robots.tolist()]
+        for choice in given:
+            if choice is not None:
+                self._fleet.check(choice, self.bank)
+        for i in robots.tolist():  # nothing can fail from here on
+            if seeds[i] is not None or self._generators[i] is None:
+                self._generators[i], self._seeds[i] = seeding.np_random(seeds[i])
+                self._noise_generators[i] = disturbance_generator(self._seeds[i]) if self.settings.disturbed else None
+        self._begin(robots, given)
         return self._fleet.layout.divide(self._flat_observations()), self._infos(mask, mask)
 
     def _mask(self, mask: Any) -> np.ndarray:
@@ -124,14 +139,20 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             )
         return mask
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed: expected one for each of {self.num_envs} robots, got {len(seed)}")
-        return [None if value is None else int(value) for value in seed]
+    def _seeds_of(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """A seed for each robot."""
+        if seed is None or (isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)):
+            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        elif isinstance(seed, (list, tuple, np.ndarray)):
+            seeds = list(seed)
+        else:
+            raise ValueError(f"seed: expected an integer or a list of them, got {seed!r}")
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: expected one for each of {self.num_envs} robots, got {len(seeds)}")
+        for value in seeds:
+            if value is not None and (isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0):
+                raise ValueError(f"seed: expected integers >= 0, got {value!r}")
+        return [None if value is None else int(value) for value in seeds]
 
     def _each(self, name: str, value: Any) -> list[Any]:
         if isinstance(value, (list, tuple, np.ndarray)):
@@ -140,16 +161,15 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             return list(value)
         return [value] * self.num_envs
 
-    def _begin(self, robots: np.ndarray, scenarios: list[Any] | None = None, indices: list[Any] | None = None) -> None:
-        """Starts episodes of robots, given by number."""
+    def _begin(self, robots: np.ndarray, given: Sequence[Scenario | int | None] | None = None) -> None:
+        """Starts episodes of robots, given by number, with the scenarios given or drawn."""
         numbers = robots.tolist()
-        choose = self._tasks.choose
         choices = []
-        for i in numbers:
+        for k, i in enumerate(numbers):
             generator = self._generators[i]
             assert generator is not None  # seeded at the first reset
-            scenario = None if scenarios is None else scenarios[i]
-            choices.append(choose(generator, scenario, None if indices is None else indices[i]))
+            choice = None if given is None else given[k]
+            choices.append(self._tasks.draw(generator) if choice is None else choice)
         noise = [self._noise_generators[i] for i in numbers] if self.settings.disturbed else []
         self._fleet.begin(robots, choices, self.bank, noise)
         for i, choice in zip(numbers, choices, strict=True):
@@ -243,9 +263,19 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._fleet.state[:, driving.TIME].copy()
 
     @property
+    def poses(self) -> np.ndarray:
+        """x, y (m) and unwrapped heading (rad) of each robot, (num_envs, 3)."""
+        return self._fleet.poses.copy()
+
+    @property
     def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override] (as Gymnasium's own)
         """The generator that draws each robot's scenarios."""
         return tuple(self._generators)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seed of each robot's generator, -1 before the first reset."""
+        return tuple(self._seeds)
 
     def _flat_observations(self) -> np.ndarray:
         flat = np.empty((self.num_envs, self._fleet.layout.size), np.float32)
@@ -258,20 +288,11 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _infos(self, told: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
         """The infos of the robots in the mask `told`, and of those in `restarted` what a reset says."""
         state = self._fleet.state
-        values: dict[str, Any] = {
-            "cost": state[:, driving.COST].copy(),
-            "clearance": state[:, driving.CLEARANCE].copy(),
-            "collision": state[:, driving.COLLIDED] != 0.0,
-            "is_success": state[:, driving.SUCCESS] != 0.0,
-            "time": state[:, driving.TIME].copy(),
-            "pose": self._fleet.poses.copy(),
-        }
-        parts: dict[str, Any] = {
-            "effort": -state[:, driving.EFFORT],
-            "proximity": -state[:, driving.PROXIMITY],
-            "collision": -state[:, driving.COLLISION],
-            "miss": -state[:, driving.MISS],
-        }
+        values: dict[str, Any] = {name: state[:, column].copy() for name, column in driving.INFOS.items()}
+        for name, column in driving.FLAGS.items():
+            values[name] = state[:, column] != 0.0
+        values["pose"] = self._fleet.poses.copy()
+        parts = {name: -state[:, column] for name, column in driving.PARTS.items()}
         if self.settings.reward == "shaped":
             parts["shaping"] = state[:, driving.SHAPING].copy()
         values["reward_parts"] = _masked(parts, told)
@@ -314,7 +335,8 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
         observation = self._fleet.layout.divide(flat)
         infos: Any = None
         if self.settings.reward == "cost":
-            infos = rows_of(self._infos(_everybody(self.num_envs)), self.num_envs)
+            told = self._infos(_everybody(self.num_envs))
+            infos = [row_of(told, i) for i in range(self.num_envs)]
         rewards = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], infos)
         return np.where(restarted, 0.0, rewards)
 
@@ -324,9 +346,13 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
             "terminated": state[:, driving.TERMINATED] > 0,
             "at_horizon": state[:, driving.STEPS] >= state[:, driving.LAST_STEP],
         }
-        return {**super()._infos(told, restarted), **_masked(ends, told)}
+        stepped = told if restarted is None else told & ~restarted
+        infos = super()._infos(told, restarted)
+        return {**infos, **_masked(ends, stepped)} if stepped.any() else infos
 
 
+# Arguments that go through to the settings.
+KNOWN = frozenset(field.name for field in fields(Settings)) - {"goal_conditioned"}
 _NOBODY = np.zeros(1, dtype=bool)  # broadcasts
 
 
@@ -344,20 +370,15 @@ def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     return {**values, **masks}
 
 
-def rows_of(infos: dict[str, Any], count: int) -> list[dict[str, Any]]:
-    """Infos of all robots as one dict for each, with the entries that it has."""
-    rows: list[dict[str, Any]] = [{} for _ in range(count)]
+def row_of(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """What the infos of all robots tell of one."""
+    row = {}
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
-        if mask is None:  # a mask itself
+        if mask is None or not mask[i]:  # a mask itself, or not told
             continue
-        told = np.flatnonzero(mask).tolist()
         if isinstance(values, dict):
-            nested = rows_of(values, count)
-            for i in told:
-                rows[i][name] = nested[i]
+            row[name] = row_of(values, i)
         else:
-            for i in told:
-                value = values[i]
-                rows[i][name] = value.item() if isinstance(value, np.generic) else value
-    return rows
+            row[name] = values[i].item() if isinstance(values[i], np.generic) else values[i]
+    return row

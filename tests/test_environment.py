@@ -143,6 +143,34 @@ def test_the_running_cost_is_the_integral_along_the_path():
     assert coarse[-1][3] == pytest.approx(fine[-1][3], rel=1e-6)
 
 
+@pytest.mark.parametrize("period", [0.2, 1.0])
+def test_long_periods_are_charged_the_integral_too(period):
+    post = {"circle": {"center": [5.0, 5.36], "radius": 0.1}}
+    task = scenario(start=[3.0, 5.0, 0.0], goal=[7.0, 5.0, 0.0], obstacles=[post], horizon=2.0)
+    coarse = play(NavigateEnv(scenario=task, control_period=period), [np.array([1.0, 0.0])] * 10)
+    fine = play(NavigateEnv(scenario=task, control_period=0.01), [np.array([1.0, 0.0])] * 200)
+    assert coarse[-1][3] == pytest.approx(fine[-1][3], rel=1e-4)
+
+
+def test_after_the_end_nothing_moves_and_nothing_is_paid():
+    env = NavigateEnv(scenario=scenario(horizon=0.1))
+    play(env, [np.array([0.5, 0.0])] * 5)
+    pose, cost = env.pose, env.step(np.array([1.0, 0.0]))[4]["cost"]
+    _, reward, terminated, _, info = env.step(np.array([1.0, 1.0]))
+    assert (reward, terminated, env.pose, info["cost"]) == (0.0, True, pose, cost)
+
+
+def test_a_reset_that_fails_changes_nothing():
+    env, other = NavigateEnv(), NavigateEnv()
+    for each in (env, other):
+        each.reset(seed=3)
+        each.step(np.array([0.5, 0.0]))
+    with pytest.raises(IndexError):
+        env.reset(seed=77, options={"index": 99999})
+    assert env.pose == other.pose
+    assert env.reset()[1]["index"] == other.reset()[1]["index"]
+
+
 def test_the_last_period_ends_at_the_horizon():
     env = NavigateEnv(scenario=scenario(horizon=0.12))
     rows = play(env, [np.array([0.5, 0.0])] * 10)
@@ -226,6 +254,15 @@ def test_lidar_ranges_agree_with_a_fine_walk():
             assert ranges[k] == pytest.approx(walked, abs=3e-3)
 
 
+@pytest.mark.parametrize("heading", [0.0, -0.0, math.pi / 2, math.pi, -math.pi / 2, 1e-12])
+def test_beams_along_the_axes_see_what_is_there(heading):
+    disc = {"circle": {"center": [4.0, 1.0], "radius": 0.8}}
+    task = scenario(start=[1.0, 1.0, heading], goal=[8.0, 8.0, 0.0], obstacles=[disc])
+    ranges = NavigateEnv(scenario=task, lidar_beams=4).reset()[0][GOAL_ENTRIES:]
+    east_first = np.roll(ranges, round(heading / (math.pi / 2)))
+    assert east_first == pytest.approx([2.2, 9.0, 1.0, 1.0], abs=1e-5)
+
+
 def test_the_observation_says_what_the_docstring_promises():
     task = scenario(start=[2.0, 3.0, math.pi / 2], goal=[1.0, 6.0, math.pi], horizon=4.0)
     observation, _ = NavigateEnv(scenario=task).reset()
@@ -288,6 +325,14 @@ def test_an_action_that_is_not_finite_is_refused_and_changes_nothing():
         env.step(np.array([0.5]))
     assert env.time == 0.0
     assert env.pose == (5.0, 5.0, 0.3)
+
+
+@pytest.mark.parametrize("action", [["0.5", "1"], [True, False], np.array([1j, 0]), None, [[1], [2, 3]], "ab"])
+def test_an_action_that_is_no_two_numbers_is_refused(action):
+    env = NavigateEnv(scenario=scenario())
+    env.reset()
+    with pytest.raises(ValueError, match="action: expected two finite numbers, got"):
+        env.step(action)
 
 
 def test_a_step_before_the_first_reset_is_refused():

@@ -5,10 +5,10 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Scenario
+from leapnav.envs.arcs import follow_arc
 from leapnav.envs.obstacles import (
     clearance,
     clearances,
-    follow_arc,
     proximity,
     proximity_value,
     proximity_values,

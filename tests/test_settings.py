@@ -271,7 +271,8 @@ def test_each_part_of_the_disturbance_does_what_it_says():
     sensed, same = observe(sensing=0.05)
     assert np.array_equal(same, path)
     assert (sensed[:, 0] - still[:, 0]).std() == pytest.approx(0.05, rel=0.3)
-    assert (sensed[:, GOAL_ENTRIES] - still[:, GOAL_ENTRIES]).std() > 0.03
+    ranges, clear = sensed[:, GOAL_ENTRIES:], still[:, GOAL_ENTRIES:]
+    assert (ranges - clear)[clear < 9].std() == pytest.approx(0.05, rel=0.05)
 
 
 def test_a_number_stands_for_all_of_the_disturbance():
@@ -304,12 +305,29 @@ def test_the_reward_is_the_one_computed_from_the_goals(reward):
     assert steps[-1][4]["is_success"]
     if reward == "sparse":
         assert rewards.tolist() == [0.0] * 17 + [1.0] * 13
+        # After the end nothing is paid.
+        assert env.step(np.zeros(2, np.float32))[1] == 0.0
         elsewhere = env.unwrapped.compute_reward(achieved, np.roll(desired, 1, axis=1), [{}] * len(steps))
         assert not elsewhere.any()
     else:
         assert rewards.sum() == pytest.approx(-infos[-1]["cost"])
         missed = env.unwrapped.compute_reward(achieved, desired + np.float32(1.0), infos)
         assert missed.sum() == pytest.approx(-infos[-1]["cost"] - 7.0)
+
+
+@pytest.mark.parametrize("reward", ["sparse", "cost"])
+def test_goals_decide_by_where_the_robot_is(reward):
+    """Neither noise nor the bounds of the observation make a goal look achieved or missed."""
+    stay = scenario(start=[5.0, 5.0, 0.0], goal=[5.05, 5.0, 0.0], horizon=1.0)
+    noisy = NavigateGoalEnv(scenario=stay, reward=reward, disturbance={"sensing": 0.2})
+    steps = drive(noisy, [(0.0, 0.0)] * 20)
+    assert steps[-1][4]["is_success"]
+    assert [step[1] for step in steps] == pytest.approx([1.0] * 20 if reward == "sparse" else [0.0] * 20, abs=1e-9)
+    far = scenario(
+        arena=[0.0, 0.0, 5000.0, 5000.0], start=[1500.0, 1200.0, 0.0], goal=[3000.0, 4000.0, 0.0], horizon=0.1
+    )
+    steps = drive(NavigateGoalEnv(scenario=far, reward=reward), [(0.0, 0.0)] * 2)
+    assert steps[-1][1] == pytest.approx(0.0 if reward == "sparse" else -50.0)
 
 
 def test_a_free_goal_heading_is_reached_by_any():
@@ -366,7 +384,10 @@ def test_single_and_vector_agree_on_goals_too():
         ({"disturbance": "much"}, "disturbance: expected Disturbance .*'much'"),
         ({"motor": {"mass": 0}}, "motor: mass: expected a positive number, got 0"),
         ({"discount": 1.5}, r"discount: expected a number in \(0, 1\], got 1.5"),
-        ({"map_vertices": 2}, "map_vertices: expected an integer >= 3, got 2"),
+        ({"map_vertices": 2}, "map_vertices: expected an integer from 3 to 10000, got 2"),
+        ({"lidar_beams": 10**9}, "lidar_beams: expected an integer from 0 to 10000, got 1000000000"),
+        ({"bank": 5}, "bank: expected a ScenarioBank or its file, got 5"),
+        ({"family": []}, r"family: expected one of .*, got \[\]"),
         ({"dict_observation": 1}, "dict_observation: expected True or False, got 1"),
         ({"split": "validation"}, "split: expected one of train, test, fresh, got 'validation'"),
         ({"split": "test", "scenario": scenario_fields()}, "split: cannot be combined with scenario"),

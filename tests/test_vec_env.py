@@ -44,7 +44,8 @@ def test_the_last_step_of_an_episode_tells_of_it_and_starts_the_next():
                 assert infos[i]["reward_parts"] == info["reward_parts"]
                 totals[i], lengths[i] = 0.0, 0
                 alone, info = env.reset()
-                assert venv.reset_infos[i]["reference_cost"] == info["reference_cost"]
+                for name in ("index", "reference_cost", "cost", "time"):
+                    assert venv.reset_infos[i][name] == info[name]
             else:
                 assert infos[i] == {}
             assert np.array_equal(observations[i], alone)
@@ -56,6 +57,7 @@ def test_the_infos_of_all_steps_can_be_had():
     venv.reset()
     infos = venv.step(np.zeros((2, 2), np.float32))[3]
     assert infos[1]["time"] == 0.05
+    assert infos[1]["TimeLimit.truncated"] is False
     assert set(infos[0]["reward_parts"]) == {"effort", "proximity", "collision", "miss"}
 
 
@@ -84,6 +86,12 @@ def test_attributes_and_methods_reach_the_environment():
     assert rewards.tolist() == [0.0] * 3
     assert venv.env_is_wrapped(Monitor) == [True] * 3
     assert venv.env_is_wrapped(VecMonitor) == [False] * 3
+    assert venv.get_attr("action_space") == [venv.action_space] * 3
+    assert [tuple(pose) for pose in venv.get_attr("pose")] == [s.start for s in venv.get_attr("scenario")]
+    with pytest.raises(ValueError, match=r"indices: .*'reset' is called for all or none"):
+        venv.env_method("reset", indices=[0])
+    with pytest.raises(ValueError, match="attr_name: 'scenario' is set by a reset"):
+        venv.set_attr("scenario", scenarios[0])
     with pytest.raises(AttributeError):
         venv.get_attr("gravity")
     with pytest.raises(ValueError, match=r"indices: .*'gravity'"):

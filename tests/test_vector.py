@@ -128,15 +128,26 @@ def test_an_arena_s_history_does_not_leak_into_its_next_episode():
             assert same(one, other)
 
 
-def test_a_pickled_environment_goes_on_in_the_middle_of_its_episodes():
-    env = make(4, family="rooms", terminate_on_collision=False, disturbance=0.1)
+@pytest.mark.parametrize("actuation", ["velocity", "motor"])
+@pytest.mark.parametrize("period", [0.05, 0.5])
+def test_a_pickled_environment_goes_on_in_the_middle_of_its_episodes(actuation, period):
+    env = make(
+        6,
+        family="rooms",
+        terminate_on_collision=False,
+        disturbance=0.1,
+        actuation=actuation,
+        control_period=period,
+    )
     env.reset(seed=1)
-    for actions in bold_actions(130, 4):
-        env.step(actions)
-    copy = pickle.loads(pickle.dumps(env))
-    for actions in bold_actions(200, 4, seed=1):
-        for one, other in zip(env.step(actions)[:3], copy.step(actions)[:3], strict=True):
-            assert same(one, other)
+    in_contact = 0
+    for actions in bold_actions(80, 6):
+        copy = pickle.loads(pickle.dumps(env))  # often with robots in contact
+        before, after = env.step(actions), copy.step(actions)
+        in_contact += (before[4]["clearance"] <= 0).sum()
+        for k in range(4):
+            assert same(before[k], after[k])
+    assert in_contact > 20
 
 
 def test_in_same_step_mode_the_last_observation_is_in_the_infos():
@@ -220,6 +231,8 @@ def test_gymnasium_s_vector_wrappers_accept_the_environment(tmp_path):
         (lambda: make(2, autoreset_mode="later"), "autoreset_mode: expected one of .*'later'"),
         (lambda: make(2, render_mode="human"), "render_mode: expected None or one of rgb_array, got 'human'"),
         (lambda: make(2, lidar_beams=-3), "lidar_beams: .*-3"),
+        (lambda: make(2).reset(seed=1.5), "seed: expected an integer or a list of them, got 1.5"),
+        (lambda: make(2).reset(seed=[1, 2.7]), "seed: expected integers >= 0, got 2.7"),
         (lambda: make(2).reset(seed=[1, 2, 3]), "seed: expected one for each of 2 robots, got 3"),
         (lambda: make(2).reset(options={"index": [1, 2, 3]}), "index: expected one for each of 2 robots, got 3"),
         (lambda: make(2).reset(options={"mask": 1}), "options: .*'mask'"),
@@ -229,6 +242,28 @@ def test_gymnasium_s_vector_wrappers_accept_the_environment(tmp_path):
 def test_bad_arguments_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_an_unknown_argument_is_named():
+    with pytest.raises(TypeError, match="NavigateVectorEnv: unexpected argument 'lidar'"):
+        make(2, lidar=3)
+
+
+def test_a_reset_that_fails_changes_nothing():
+    env, other = make(2), make(2)
+    for each in (env, other):
+        each.reset(seed=3)
+        each.step(np.full((2, 2), 0.5, np.float32))
+    with pytest.raises(IndexError, match=r"clutter-train\.bank has 400 scenarios, got 400"):
+        env.reset(seed=77, options={"index": [0, 400]})
+    assert env.times.tolist() == [0.05, 0.05]
+    assert env.np_random_seed == (3, 4)
+    assert same(env.reset()[0], other.reset()[0])
+
+
+def test_films_run_in_real_time():
+    assert make(1, control_period=0.2).metadata["render_fps"] == 5
+    assert NavigateEnv(control_period=0.2).metadata["render_fps"] == 5
 
 
 def test_a_missing_bank_is_named():
@@ -252,19 +287,55 @@ def test_faulty_actions_are_refused_and_change_nothing():
         make(2).reset(options={"reset_mask": np.array([True, False])})
 
 
-def test_robots_that_go_on_after_a_touch_stay_out_of_obstacles():
+@pytest.mark.parametrize("period", [0.05, 0.4])
+@pytest.mark.parametrize("actuation", ["velocity", "motor"])
+def test_robots_that_go_on_after_a_touch_stay_out_of_obstacles(actuation, period):
+    for family in ("clutter", "polygons", "rooms", "slalom"):
+        env = make(12, family=family, actuation=actuation, terminate_on_collision=False, control_period=period)
+        env.reset(seed=3)
+        deepest, touched = 0.0, 0
+        for actions in bold_actions(120 if period < 0.1 else 40, 12, seed=5):
+            _, _, _, _, infos = env.step(actions)
+            touched += infos["collision"].sum()
+            for pose, task in zip(infos["pose"], env.scenarios, strict=True):
+                deepest = min(deepest, clearance(pose[0], pose[1], task.field)[0])
+        assert touched > 0
+        assert deepest > -1e-3
+
+
+@pytest.mark.parametrize(("radius", "wall", "speed"), [(0.002, 0.001, 2.0), (0.05, 0.02, 40.0), (0.25, 0.1, 150.0)])
+@pytest.mark.parametrize("actuation", ["velocity", "motor"])
+def test_no_robot_gets_through_a_wall(radius, wall, speed, actuation):
+    corners = [[6.0, 0.0], [6.0 + wall, 0.0], [6.0 + wall, 10.0], [6.0, 10.0]]
+    task = scenario_fields(
+        start=[5.0, 5.0, 0.3],
+        goal=[2.0, 2.0, 0.0],
+        horizon=4.0,
+        obstacles=[{"polygon": {"vertices": corners}}],
+        robot={"model": "unicycle", "radius": radius, "max_speed": speed, "max_turn_rate": 3.0},
+    )
+    env = NavigateEnv(scenario=task, actuation=actuation, terminate_on_collision=False, motor={"wheel_force": 1e4})
+    env.reset()
+    touched = False
+    for k in range(80):
+        *_, info = env.step(np.array([1.0, 0.4 * np.sin(k)], np.float32))
+        touched = touched or info["collision"]
+        assert 0.0 < env.pose[0] < 6.0
+    assert touched
+
+
+def test_in_contact_the_motion_is_charged_not_the_command():
+    corners = [[6.0, 0.0], [6.1, 0.0], [6.1, 10.0], [6.0, 10.0]]
+    task = scenario_fields(
+        start=[5.5, 5.0, 0.0], goal=[2.0, 2.0, 0.0], horizon=4.0, obstacles=[{"polygon": {"vertices": corners}}]
+    )
     for actuation in ("velocity", "motor"):
-        for family in ("clutter", "polygons", "rooms", "slalom"):
-            env = make(12, family=family, actuation=actuation, terminate_on_collision=False)
-            env.reset(seed=3)
-            deepest, touched = 0.0, 0
-            for actions in bold_actions(150, 12, seed=5):
-                _, _, _, _, infos = env.step(actions)
-                touched += infos["collision"].sum()
-                for pose, task in zip(infos["pose"], env.scenarios, strict=True):
-                    deepest = min(deepest, clearance(pose[0], pose[1], task.field)[0])
-            assert touched > 0
-            assert deepest > -1e-3
+        env = NavigateEnv(scenario=task, actuation=actuation, terminate_on_collision=False)
+        env.reset()
+        for k in range(40):
+            *_, info = env.step(np.array([1.0, 0.0], np.float32))
+            if k >= 20:  # it stands before the wall
+                assert info["reward_parts"]["effort"] == pytest.approx(0.0, abs=1e-3)  # commanded: -0.1
 
 
 def test_gymnasium_s_recorders_film_single_and_vector(tmp_path):

@@ -12,9 +12,12 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from leapnav.envs.vector import NavigateVectorEnv, rows_of
+from leapnav.envs.vector import NavigateVectorEnv, row_of
 
 ENVIRONMENT = "leapnav/Navigate-v0"
+# Attributes that each robot has for itself, or of which there is one for one robot and one for all.
+_OWN = {"scenario": "scenarios", "time": "times", "pose": "poses"}
+_SINGLE = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
 
 
 def make_vec_env(
@@ -37,6 +40,7 @@ def make_vec_env(
 
     Raises:
         ValueError: an argument is impossible, or the environment is none of leapnav's.
+        gymnasium.error.Error: there is no such environment.
 
     """
     if not str(gym.spec(env_id).vector_entry_point).startswith("leapnav."):
@@ -88,7 +92,7 @@ class NavigateVecEnv(VecEnv):
         for name in {name for chosen in self._options for name in chosen}:
             options[name] = [chosen.get(name) for chosen in self._options]
         observations, infos = self.venv.reset(seed=self._seeds, options=options)
-        self.reset_infos = rows_of(infos, self.num_envs)
+        self.reset_infos = [row_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0.0
@@ -104,14 +108,16 @@ class NavigateVecEnv(VecEnv):
         observations, rewards, ended, _, infos = self.venv.step(self._actions)
         self._returns += rewards
         self._lengths += 1
-        rows = rows_of(_without_ends(infos), self.num_envs) if self._step_infos else [{} for _ in range(self.num_envs)]
+        rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if self._step_infos:
+            rows = [{**row_of(infos, i), "TimeLimit.truncated": False} for i in range(self.num_envs)]
         if ended.any():
-            last = rows_of(infos["final_info"], self.num_envs)
+            last = infos.pop("final_info"), infos.pop("final_obs")
             for i in np.flatnonzero(ended).tolist():
-                self.reset_infos[i] = _reset_info(infos, i)
+                self.reset_infos[i] = row_of(infos, i)
                 rows[i] = {
-                    **last[i],
-                    "terminal_observation": infos["final_obs"][i],
+                    **row_of(last[0], i),
+                    "terminal_observation": last[1][i],
                     "TimeLimit.truncated": False,
                     "episode": {
                         "r": round(float(self._returns[i]), 6),
@@ -131,43 +137,43 @@ class NavigateVecEnv(VecEnv):
         return self.venv.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the environment for each robot: its own "scenario" and "time", else what all share."""
+        """An attribute of the environment for each robot: its own scenario, time and pose, else what all share."""
         robots = list(self._get_indices(indices))
-        if attr_name == "scenario":
-            scenarios = self.venv.scenarios
-            return [scenarios[i] for i in robots]
-        if attr_name == "time":
-            return self.venv.times[robots].tolist()
-        return [getattr(self.venv, attr_name)] * len(robots)
+        if attr_name in _OWN:
+            values = getattr(self.venv, _OWN[attr_name])
+            return [values[i] for i in robots]
+        return [getattr(self.venv, _SINGLE.get(attr_name, attr_name))] * len(robots)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of the environment, which all robots share.
 
         Raises:
-            ValueError: only some robots are to have it.
+            ValueError: only some robots are to have it, or it is one of their own, which only a reset sets.
 
         """
-        if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"indices: the robots share their attributes; {attr_name!r} is set for all or none")
+        if attr_name in _OWN:
+            raise ValueError(f"attr_name: {attr_name!r} is set by a reset")
+        self._check_all(f"{attr_name!r} is set", indices)
         setattr(self.venv, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of the environment once, and repeats its result for each robot asked for."""
+        """Calls a method of the environment once, and repeats its result for each robot asked for.
+
+        Raises:
+            ValueError: it is to be called for some robots only, and is not one that leaves the robots alone.
+
+        """
+        if method_name not in ("compute_reward", "render"):
+            self._check_all(f"{method_name!r} is called", indices)
         result = getattr(self.venv, method_name)(*method_args, **method_kwargs)
         return [result] * len(list(self._get_indices(indices)))
+
+    def _check_all(self, what: str, indices: VecEnvIndices) -> None:
+        if len(set(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"indices: the robots share their environment; {what} for all or none")
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """True for `Monitor`, whose records are kept here."""
         return [issubclass(Monitor, wrapper_class)] * len(list(self._get_indices(indices)))
-
-
-def _without_ends(infos: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in infos.items() if name.lstrip("_") not in ("final_obs", "final_info")}
-
-
-def _reset_info(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """What the reset of one robot told."""
-    names = ("index", "reference_cost", "scenario")
-    return {name: infos[name][i] for name in names if name in infos and infos[f"_{name}"][i]}
