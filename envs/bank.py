@@ -31,6 +31,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, overload
 
@@ -160,7 +161,7 @@ class ScenarioBank(Sequence[Scenario]):
 
     @classmethod
     def shipped(cls, family: str, split: str) -> ScenarioBank:
-        """A bank that comes with the package.
+        """A bank that comes with the package; always the same object, so that all share what has been read.
 
         Args:
             family: one of `leapnav.envs.FAMILIES`.
@@ -175,7 +176,7 @@ class ScenarioBank(Sequence[Scenario]):
             raise ValueError(f"family: expected one of {', '.join(families)}, got {family!r}")
         if split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}")
-        return cls(FOLDER / f"{family}-{split}.bank")
+        return _shipped(family, split)
 
     def __len__(self) -> int:
         return len(self.costs)
@@ -261,6 +262,11 @@ class ScenarioBank(Sequence[Scenario]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.path = state["path"]
         self._open()
+
+
+@cache
+def _shipped(family: str, split: str) -> ScenarioBank:
+    return ScenarioBank(FOLDER / f"{family}-{split}.bank")
 
 
 def _place(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
