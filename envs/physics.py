@@ -162,7 +162,7 @@ class ContactWorld:
         near = phi / 2
         for _ in range(pieces):
             self._space.step(step)
-            (to_x, to_y), to_angle = body.position, body.angle
+            to_x, to_y, to_angle = _pose(body)
             to_x, to_y, depth = settle(x, y, to_x, to_y, self._field)
             body.position = to_x, to_y
             lowest = min(lowest, depth)
@@ -175,6 +175,11 @@ class ContactWorld:
         velocity[:] = *body.velocity, body.angular_velocity
         self._space.remove(body, rim)
         return lowest, speeds, turns, (near - phi / 2) * step
+
+
+def _pose(body: pymunk.Body) -> tuple[float, float, float]:
+    x, y = body.position
+    return x, y, body.angle
 
 
 @njit(types.UniTuple(float64, 3)(float64, float64, float64, float64, _field), **_options)
