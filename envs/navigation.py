@@ -300,6 +300,11 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return scenario_of(self._choice, self.bank)
 
     @property
+    def index(self) -> int | None:
+        """The number of the episode's scenario in the bank, None if it is from elsewhere."""
+        return self._choice if isinstance(self._choice, int) else None
+
+    @property
     def control_period(self) -> float:
         """How long an action is held, in s."""
         return self.settings.control_period

@@ -253,6 +253,11 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return tuple(scenario_of(choice, self.bank) for choice in self._choices if choice is not None)
 
     @property
+    def indices(self) -> tuple[int | None, ...]:
+        """The number of each robot's scenario in the bank, None if it is from elsewhere."""
+        return tuple(choice if isinstance(choice, int) else None for choice in self._choices)
+
+    @property
     def control_period(self) -> float:
         """How long an action is held, in s."""
         return self.settings.control_period

@@ -58,6 +58,12 @@ class Demonstration:
     is_success: bool
 
     @property
+    def path(self) -> Path:
+        """The optimum at the control periods' ends, with costates."""
+        times = np.linspace(0.0, self.scenario.horizon, len(self.states))
+        return Path(times, self.states, self.costates)
+
+    @property
     def reference_cost(self) -> float:
         """J*, the cost of the scenario's optimum."""
         return float(self.cost_to_go[0])

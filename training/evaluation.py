@@ -186,7 +186,7 @@ def evaluate(
     """Plays policies side by side on the same scenarios.
 
     Args:
-        entrants: folders that `save_policy` wrote, or "expert" (drives the references), or "random".
+        entrants: folders that `save_policy` wrote, or "expert" (in closed loop), or "random".
         references: the expert's demonstrations of the scenarios.
         seed: of the random policy and the bootstrap.
 
@@ -213,7 +213,7 @@ def load_entrant(name: str, env: gym.Env, references: Sequence[Demonstration] = 
     Args:
         name: the name.
         env: the environment that it is to drive.
-        references: demonstrations that the expert drives; it solves other scenarios itself.
+        references: demonstrations whose optima the expert starts from; it solves other scenarios itself.
         seed: of the random policy.
 
     Raises:
@@ -221,7 +221,7 @@ def load_entrant(name: str, env: gym.Env, references: Sequence[Demonstration] = 
 
     """
     if name == "expert":
-        return ExpertPolicy(env, {reference.scenario: reference.actions for reference in references})
+        return ExpertPolicy(env, {reference.scenario: reference.path for reference in references})
     if name == "random":
         return RandomPolicy(env.action_space, seed)
     return load_policy(name, env)

@@ -1,0 +1,275 @@
+"""The optimum from wherever the robot is: re-solved from the one before, or read off neighbouring-extremal gains."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from leapnav.envs.obstacles import clearances
+from leapnav.envs.scenario import Scenario, ScenarioError
+from leapnav.experts.extremal import CONVERGED
+from leapnav.experts.integrator import propagate
+from leapnav.experts.multiple_shooting import newton
+from leapnav.experts.nodes import start_nodes
+from leapnav.experts.optimum import find_optimum
+from leapnav.experts.problem import OptimalControlProblem, Path
+from leapnav.experts.single_shooting import MARGIN
+
+# Seconds between the nodes, at most: fewer are quicker, but past an obstacle the flow may be too sensitive for that.
+SEGMENTS = (0.5, 0.25, 0.125)
+TOLERANCE = 1e-6  # largest residual of the boundary and continuity conditions, for controls good to as much
+SHORTEST_SEGMENT = 0.02  # s; a first segment that is shorter is joined to the next
+ACCURACY = 1e-8  # of the flow between nodes
+ITERATIONS = 8  # of Newton's method: what takes more is nearer to another solution
+SMALLEST_STEP = 1 / 16  # of the way to a state that Newton's method does not reach at once
+FAR = 0.05  # m or rad off the path from which on a re-solve is looked at closely
+SAMPLING = 0.05  # s between the points at which a path's clearance is looked at
+GAIN_STEP = 0.05  # s between the points of the gains
+STIFFEST = 0.25  # s before the horizon from which the gains stay as they are: they grow without bound
+
+
+class _Solution(NamedTuple):
+    """Times (K + 1,) in the episode, nodes (K + 1, 6): states and costates, and the cost (K,) of each segment."""
+
+    times: np.ndarray
+    nodes: np.ndarray
+    costs: np.ndarray
+
+
+class Feedback:
+    """The optimal control of one scenario from any state and time.
+
+    What it stores is the optimum from the last state that it was asked about. The next one is mostly near, and one or
+    two steps of Newton's method on states and costates at the remaining nodes lead there. Where they fail, it goes to
+    the state in smaller steps, and where that fails or leads through an obstacle, it searches anew.
+
+    Args:
+        scenario: the task.
+        path: its optimum, or one nearly so, with costates.
+
+    Attributes:
+        searches: how often a new search was needed.
+
+    Raises:
+        ValueError: there is no optimum.
+
+    """
+
+    def __init__(self, scenario: Scenario, path: Path) -> None:
+        self.scenario = scenario
+        self.searches = 0
+        problem = OptimalControlProblem.from_scenario(scenario)
+        if not self._take(problem, path, 0.0) and not self._search(np.array(scenario.start), 0.0):
+            raise ValueError(f"scenario {scenario.name!r}: no optimum was found")
+
+    def _take(self, problem: OptimalControlProblem, path: Path, since: float) -> bool:
+        """Stores the solution near a path of the task from time `since` on; False if there is none."""
+        problem = problem.with_winding_of(path.states)
+        self._arrays = problem.arrays
+        for spacing in SEGMENTS:
+            segments = max(1, math.ceil(problem.horizon / spacing - 1e-9))
+            times, nodes = start_nodes(problem, path, segments)
+            found = self._newton(times + since, nodes, problem.arrays.start, TOLERANCE)
+            if found is not None:
+                self._stored = found
+                return True
+        return False
+
+    def update(self, state: np.ndarray, time: float) -> bool:
+        """Re-solves from a state (3,) at a time, and stores the result.
+
+        Args:
+            state: x, y (m), heading (rad).
+            time: s since the start of the episode.
+
+        Returns:
+            False if there is no solution: what is stored is then the one before.
+
+        """
+        found = self._resolve(np.array(state, dtype=float), time, TOLERANCE)
+        if found is not None:
+            self._stored = found
+        return found is not None
+
+    def value(self, state: np.ndarray, time: float, tol: float = 1e-9) -> tuple[float, np.ndarray]:
+        """Cost-to-go and its gradient, the costate (3,), at a state and time; what is stored stays.
+
+        Raises:
+            ValueError: there is no solution from there.
+
+        """
+        stored = self._arrays, self._stored
+        try:
+            found = self._resolve(np.array(state, dtype=float), time, tol)
+        finally:
+            self._arrays, self._stored = stored
+        if found is None:
+            raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
+        return float(found.costs.sum()), found.nodes[0, 3:].copy()
+
+    def control(self, time: float) -> np.ndarray:
+        """Speed (m/s) and turn rate (rad/s) at a time, along what is stored."""
+        z = self._at(time)
+        control = np.empty(2)
+        self._arrays.control(z, self._arrays.data, control)
+        return control
+
+    def gains(self) -> Gains:
+        """Neighbouring-extremal gains along what is stored."""
+        arrays = self._arrays
+        start, end = float(self._stored.times[0]), float(self._stored.times[-1])
+        times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_STEP - 1e-9) + 1))
+        extremal = np.array([self._at(time) for time in times])
+        n = 3
+        transitions = np.empty((len(times) - 1, 2 * n, 2 * n))
+        for k, transition in enumerate(transitions):
+            transition[:] = np.eye(2 * n)
+            duration = times[k + 1] - times[k]
+            constants = arrays.data, arrays.field, ACCURACY, 0.0, False
+            propagate(arrays.flow, extremal[k].copy(), transition, duration, *constants)
+        slopes = np.zeros((len(times), n, n))
+        free = arrays.free
+        for k in range(len(times) - 2, -1, -1):
+            A, B = transitions[k, :n, :n], transitions[k, :n, n:]
+            C, D = transitions[k, n:, :n], transitions[k, n:, n:]
+            if k == len(times) - 2:  # what the end conditions fix: the state, or where it is free the costate
+                left, right = np.where(free[:, None], D, B), np.where(free[:, None], C, A)
+                slopes[k] = -np.linalg.solve(left, right)
+            else:
+                slopes[k] = np.linalg.solve(D - slopes[k + 1] @ B, slopes[k + 1] @ A - C)
+        last = max(0, int(np.searchsorted(times, end - STIFFEST, side="right")) - 1)
+        slopes[last:] = slopes[last]
+        return Gains(times, extremal, slopes, arrays.control, arrays.data)
+
+    def _at(self, time: float) -> np.ndarray:
+        """(q, lambda) at a time, along what is stored."""
+        times, nodes, _ = self._stored
+        k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
+        return self._flow(nodes[k], min(time, times[-1]) - times[k])
+
+    def _flow(self, node: np.ndarray, duration: float) -> np.ndarray:
+        z = node.copy()
+        if duration > 0.0:
+            arrays = self._arrays
+            propagate(arrays.flow, z, np.empty((len(z), 0)), duration, arrays.data, arrays.field, ACCURACY, 0.0, False)
+        return z
+
+    def _resolve(self, state: np.ndarray, time: float, tol: float) -> _Solution | None:
+        """Times, nodes and cost of each segment of the solution from a state and time; None if there is none."""
+        times, nodes = self._remaining(time)
+        if times[-1] - times[0] <= 0.0:
+            return None
+        expected = nodes[0, :3].copy()
+        found = self._newton(times, nodes, state, tol)
+        far = np.abs(state - expected).max() > FAR
+        if found is None:
+            found, far = self._walk(times, nodes, expected, state, tol), True
+        if found is not None and far and clearances(self._sample(found), self.scenario.field).min() <= 0.0:
+            found = None
+        if found is not None or not self._search(state, time):
+            return found
+        return self._stored if tol >= TOLERANCE else self._newton(self._stored.times, self._stored.nodes, state, tol)
+
+    def _remaining(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times and nodes of what is stored, from a time on."""
+        times, nodes, _ = self._stored
+        k = int(np.clip(np.searchsorted(times, time + 1e-9, side="right") - 1, 0, len(times) - 2))
+        first = self._flow(nodes[k], time - times[k])
+        kept = k + 1
+        if times[kept] - time < SHORTEST_SEGMENT and kept < len(times) - 1:
+            kept += 1
+        return np.concatenate([[time], times[kept:]]), np.concatenate([first[None], nodes[kept:]])
+
+    def _newton(self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, tol: float) -> _Solution | None:
+        """The solution from a state by Newton's method, started at the nodes; None if it does not converge."""
+        arrays, nodes = self._arrays, nodes.copy()
+        nodes[0, :3] = state
+        costs, log = np.empty(len(times) - 1), np.empty((ITERATIONS + 1, 3))
+        limits = MARGIN * tol, MARGIN * tol * 0.1, ITERATIONS, True
+        constants = arrays.goal, arrays.free, arrays.data, arrays.field
+        code, *_ = newton(arrays.flow, times - times[0], nodes, state, *constants, *limits, costs, log)
+        return _Solution(times, nodes, costs) if code == CONVERGED else None
+
+    def _walk(
+        self, times: np.ndarray, nodes: np.ndarray, start: np.ndarray, state: np.ndarray, tol: float
+    ) -> _Solution | None:
+        """The same by continuation in the state: the way there in steps that are halved where they fail."""
+        reached, step = 0.0, 0.5
+        found = None
+        while reached < 1.0:
+            share = min(1.0, reached + step)
+            following = self._newton(times, nodes, start + share * (state - start), tol)
+            if following is not None:
+                found, nodes, reached, step = following, following.nodes, share, 2 * step
+            else:
+                step /= 2
+                if step < SMALLEST_STEP:
+                    return None
+        return found
+
+    def _sample(self, solution: _Solution) -> np.ndarray:
+        """States (K, 3) along a solution."""
+        times, nodes, _ = solution
+        states = []
+        for k in range(len(times) - 1):
+            duration = times[k + 1] - times[k]
+            count = math.ceil(duration / SAMPLING)
+            z = nodes[k]
+            for _ in range(count):
+                states.append(z[:3])
+                z = self._flow(z, duration / count)
+        return np.array([*states, nodes[-1, :3]])
+
+    def _search(self, state: np.ndarray, time: float) -> bool:
+        """Stores the best optimum from a state and time, by a new search; False if there is none."""
+        self.searches += 1
+        update = {"start": tuple(state.tolist()), "horizon": float(self.scenario.horizon - time)}
+        try:
+            scenario = self.scenario.model_copy(update=update)
+        except ScenarioError:  # in contact, or no time left
+            return False
+        optimum = find_optimum(scenario)
+        path = Path(optimum.times, optimum.states, optimum.costates)
+        return optimum.success and self._take(optimum.problem, path, time)
+
+
+class Gains:
+    """A feedback law linear in the costate: lambda = lambda*(t) + P(t) (q - q*(t)), then the minimising control.
+
+    P is the derivative of the costate by the state along an extremal, by a backward sweep of the transition matrices
+    (A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975, ch. 6). It grows without bound towards a fixed end, and
+    is held where little time is left.
+
+    Args:
+        times (K,): s, evenly spaced.
+        extremal (K, 6): states and costates.
+        slopes (K, 3, 3): P.
+        control, data: the control law and its constants, see `ProblemArrays`.
+
+    """
+
+    def __init__(self, times: np.ndarray, extremal: np.ndarray, slopes: np.ndarray, control: Any, data: Any) -> None:
+        self.times, self.extremal, self.slopes = times, extremal, slopes
+        self._control, self._data = control, data
+
+    def control(self, state: np.ndarray, time: float, ahead: float = 0.0) -> np.ndarray:
+        """Speed and turn rate for a state at a time, as they will be `ahead` seconds later."""
+        k, share = self._place(time)
+        z = (1 - share) * self.extremal[k] + share * self.extremal[k + 1]
+        off = np.asarray(state, dtype=float) - z[:3]
+        k, share = self._place(time + ahead)
+        z = (1 - share) * self.extremal[k] + share * self.extremal[k + 1]
+        slope = (1 - share) * self.slopes[k] + share * self.slopes[k + 1]
+        z[:3] += off
+        z[3:] += slope @ off
+        control = np.empty(2)
+        self._control(z, self._data, control)
+        return control
+
+    def _place(self, time: float) -> tuple[int, float]:
+        step = self.times[1] - self.times[0]
+        at = min(max((time - self.times[0]) / step, 0.0), len(self.times) - 1.0)
+        k = min(int(at), len(self.times) - 2)
+        return k, at - k
