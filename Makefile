@@ -22,6 +22,7 @@ types: .venv/installed
 bench: .venv/installed
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]" --config-settings editable_mode=strict
 	$(BIN)/python benchmarks/environment.py
+	$(BIN)/python benchmarks/expert.py
 	$(BIN)/python benchmarks/solvers.py
 	$(BIN)/python benchmarks/optima.py
 

@@ -6,12 +6,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import float64, int64, njit, types
 
 from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario, ScenarioError
 from leapnav.experts.extremal import CONVERGED
-from leapnav.experts.integrator import propagate
-from leapnav.experts.multiple_shooting import newton
+from leapnav.experts.integrator import CONTROL, FLOW, constant, matrix, propagate, vector
+from leapnav.experts.multiple_shooting import flags, newton
 from leapnav.experts.nodes import start_nodes
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem import OptimalControlProblem, Path
@@ -23,6 +24,7 @@ TOLERANCE = 1e-6  # largest residual of the boundary and continuity conditions, 
 SHORTEST_SEGMENT = 0.02  # s; a first segment that is shorter is joined to the next
 ACCURACY = 1e-8  # of the flow between nodes
 ITERATIONS = 8  # of Newton's method: what takes more is nearer to another solution
+PAUSE = 0.5  # s after a search in vain before the next one
 SMALLEST_STEP = 1 / 16  # of the way to a state that Newton's method does not reach at once
 FAR = 0.05  # m or rad off the path from which on a re-solve is looked at closely
 SAMPLING = 0.05  # s between the points at which a path's clearance is looked at
@@ -60,6 +62,7 @@ class Feedback:
     def __init__(self, scenario: Scenario, path: Path) -> None:
         self.scenario = scenario
         self.searches = 0
+        self._patience = 0.0
         problem = OptimalControlProblem.from_scenario(scenario)
         if not self._take(problem, path, 0.0) and not self._search(np.array(scenario.start), 0.0):
             raise ValueError(f"scenario {scenario.name!r}: no optimum was found")
@@ -71,7 +74,7 @@ class Feedback:
         for spacing in SEGMENTS:
             segments = max(1, math.ceil(problem.horizon / spacing - 1e-9))
             times, nodes = start_nodes(problem, path, segments)
-            found = self._newton(times + since, nodes, problem.arrays.start, TOLERANCE)
+            found, _, _ = self._newton(times + since, nodes, problem.arrays.start, since, TOLERANCE)
             if found is not None:
                 self._stored = found
                 return True
@@ -111,24 +114,22 @@ class Feedback:
 
     def control(self, time: float) -> np.ndarray:
         """Speed (m/s) and turn rate (rad/s) at a time, along what is stored."""
-        z = self._at(time)
-        control = np.empty(2)
-        self._arrays.control(z, self._arrays.data, control)
-        return control
+        arrays, (times, nodes, _) = self._arrays, self._stored
+        return _control_at(arrays.flow, arrays.control, times, nodes, time, arrays.data, arrays.field)
 
     def gains(self) -> Gains:
         """Neighbouring-extremal gains along what is stored."""
         arrays = self._arrays
         start, end = float(self._stored.times[0]), float(self._stored.times[-1])
         times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_STEP - 1e-9) + 1))
-        extremal = np.array([self._at(time) for time in times])
+        constants = arrays.data, arrays.field
+        extremal = np.array([_follow(arrays.flow, *self._stored[:2], time, *constants) for time in times])
         n = 3
         transitions = np.empty((len(times) - 1, 2 * n, 2 * n))
         for k, transition in enumerate(transitions):
             transition[:] = np.eye(2 * n)
             duration = times[k + 1] - times[k]
-            constants = arrays.data, arrays.field, ACCURACY, 0.0, False
-            propagate(arrays.flow, extremal[k].copy(), transition, duration, *constants)
+            propagate(arrays.flow, extremal[k].copy(), transition, duration, *constants, ACCURACY, 0.0, False)
         slopes = np.zeros((len(times), n, n))
         free = arrays.free
         for k in range(len(times) - 2, -1, -1):
@@ -143,64 +144,39 @@ class Feedback:
         slopes[last:] = slopes[last]
         return Gains(times, extremal, slopes, arrays.control, arrays.data)
 
-    def _at(self, time: float) -> np.ndarray:
-        """(q, lambda) at a time, along what is stored."""
-        times, nodes, _ = self._stored
-        k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
-        return self._flow(nodes[k], min(time, times[-1]) - times[k])
-
-    def _flow(self, node: np.ndarray, duration: float) -> np.ndarray:
-        z = node.copy()
-        if duration > 0.0:
-            arrays = self._arrays
-            propagate(arrays.flow, z, np.empty((len(z), 0)), duration, arrays.data, arrays.field, ACCURACY, 0.0, False)
-        return z
-
     def _resolve(self, state: np.ndarray, time: float, tol: float) -> _Solution | None:
-        """Times, nodes and cost of each segment of the solution from a state and time; None if there is none."""
-        times, nodes = self._remaining(time)
-        if times[-1] - times[0] <= 0.0:
+        """The solution from a state and time; None if there is none."""
+        if self._stored.times[-1] - time <= 0.0:
             return None
-        expected = nodes[0, :3].copy()
-        found = self._newton(times, nodes, state, tol)
-        far = np.abs(state - expected).max() > FAR
+        found, times, before = self._newton(*self._stored[:2], state, time, tol)
+        far = np.abs(state - before[0, :3]).max() > FAR
         if found is None:
-            found, far = self._walk(times, nodes, expected, state, tol), True
+            found, far = self._walk(times, before, state, tol), True
         if found is not None and far and clearances(self._sample(found), self.scenario.field).min() <= 0.0:
             found = None
         if found is not None or not self._search(state, time):
             return found
-        return self._stored if tol >= TOLERANCE else self._newton(self._stored.times, self._stored.nodes, state, tol)
+        return self._stored if tol >= TOLERANCE else self._newton(*self._stored[:2], state, time, tol)[0]
 
-    def _remaining(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times and nodes of what is stored, from a time on."""
-        times, nodes, _ = self._stored
-        k = int(np.clip(np.searchsorted(times, time + 1e-9, side="right") - 1, 0, len(times) - 2))
-        first = self._flow(nodes[k], time - times[k])
-        kept = k + 1
-        if times[kept] - time < SHORTEST_SEGMENT and kept < len(times) - 1:
-            kept += 1
-        return np.concatenate([[time], times[kept:]]), np.concatenate([first[None], nodes[kept:]])
+    def _newton(
+        self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, time: float, tol: float
+    ) -> tuple[_Solution | None, np.ndarray, np.ndarray]:
+        """The solution from a state at a time by Newton's method, None if it does not converge.
 
-    def _newton(self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, tol: float) -> _Solution | None:
-        """The solution from a state by Newton's method, started at the nodes; None if it does not converge."""
-        arrays, nodes = self._arrays, nodes.copy()
-        nodes[0, :3] = state
-        costs, log = np.empty(len(times) - 1), np.empty((ITERATIONS + 1, 3))
-        limits = MARGIN * tol, MARGIN * tol * 0.1, ITERATIONS, True
+        It starts at those of the nodes that remain; their times and they themselves are returned too.
+        """
+        arrays = self._arrays
         constants = arrays.goal, arrays.free, arrays.data, arrays.field
-        code, *_ = newton(arrays.flow, times - times[0], nodes, state, *constants, *limits, costs, log)
-        return _Solution(times, nodes, costs) if code == CONVERGED else None
+        code, times, nodes, costs, before = _advance(arrays.flow, times, nodes, state, time, *constants, MARGIN * tol)
+        return (_Solution(times, nodes, costs) if code == CONVERGED else None), times, before
 
-    def _walk(
-        self, times: np.ndarray, nodes: np.ndarray, start: np.ndarray, state: np.ndarray, tol: float
-    ) -> _Solution | None:
+    def _walk(self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, tol: float) -> _Solution | None:
         """The same by continuation in the state: the way there in steps that are halved where they fail."""
+        start, found = nodes[0, :3], None
         reached, step = 0.0, 0.5
-        found = None
         while reached < 1.0:
             share = min(1.0, reached + step)
-            following = self._newton(times, nodes, start + share * (state - start), tol)
+            following, _, _ = self._newton(times, nodes, start + share * (state - start), times[0], tol)
             if following is not None:
                 found, nodes, reached, step = following, following.nodes, share, 2 * step
             else:
@@ -210,20 +186,16 @@ class Feedback:
         return found
 
     def _sample(self, solution: _Solution) -> np.ndarray:
-        """States (K, 3) along a solution."""
-        times, nodes, _ = solution
-        states = []
-        for k in range(len(times) - 1):
-            duration = times[k + 1] - times[k]
-            count = math.ceil(duration / SAMPLING)
-            z = nodes[k]
-            for _ in range(count):
-                states.append(z[:3])
-                z = self._flow(z, duration / count)
-        return np.array([*states, nodes[-1, :3]])
+        """States (K, 3) along a solution, evenly spaced in time."""
+        arrays, (times, nodes, _) = self._arrays, solution
+        count = math.ceil((times[-1] - times[0]) / SAMPLING) + 1
+        moments = np.linspace(times[0], times[-1], count)
+        return np.array([_follow(arrays.flow, times, nodes, t, arrays.data, arrays.field)[:3] for t in moments])
 
     def _search(self, state: np.ndarray, time: float) -> bool:
         """Stores the best optimum from a state and time, by a new search; False if there is none."""
+        if time < self._patience:
+            return False
         self.searches += 1
         update = {"start": tuple(state.tolist()), "horizon": float(self.scenario.horizon - time)}
         try:
@@ -232,7 +204,62 @@ class Feedback:
             return False
         optimum = find_optimum(scenario)
         path = Path(optimum.times, optimum.states, optimum.costates)
-        return optimum.success and self._take(optimum.problem, path, time)
+        if optimum.success and self._take(optimum.problem, path, time):
+            return True
+        self._patience = time + PAUSE
+        return False
+
+
+@njit(vector(FLOW, vector, matrix, float64, constant, constant), cache=True, error_model="numpy", nogil=True)
+def _follow(flow, times, nodes, time, data, field):
+    """(q, lambda) at a time: from the node before, by the flow."""
+    k = min(max(np.searchsorted(times, time, side="right") - 1, 0), len(times) - 2)
+    z = nodes[k].copy()
+    duration = min(time, times[-1]) - times[k]
+    if duration > 0.0:
+        propagate(flow, z, np.empty((len(z), 0)), duration, data, field, ACCURACY, 0.0, False)
+    return z
+
+
+@njit(vector(FLOW, CONTROL, vector, matrix, float64, constant, constant), cache=True, error_model="numpy", nogil=True)
+def _control_at(flow, control, times, nodes, time, data, field):
+    """The optimal control at a time."""
+    u = np.empty(2)
+    control(_follow(flow, times, nodes, time, data, field), data, u)
+    return u
+
+
+@njit(
+    types.Tuple((int64, vector, matrix, vector, matrix))(
+        FLOW, vector, matrix, vector, float64, vector, flags, constant, constant, float64
+    ),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def _advance(flow, times, nodes, state, time, goal, free, data, field, tolerance):
+    """Newton's method from a state at a time, started at the nodes that remain.
+
+    Returns (status, times, nodes, costs, the nodes before).
+    """
+    n = len(goal)
+    k = min(max(np.searchsorted(times, time + 1e-9, side="right") - 1, 0), len(times) - 2)
+    expected = _follow(flow, times, nodes, time, data, field) if time > times[k] else nodes[k].copy()
+    kept = k + 1
+    if times[kept] - time < SHORTEST_SEGMENT and kept < len(times) - 1:
+        kept += 1
+    count = 1 + len(times) - kept
+    new_times, new_nodes = np.empty(count), np.empty((count, 2 * n))
+    new_times[0], new_nodes[0] = time, expected
+    new_times[1:], new_nodes[1:] = times[kept:], nodes[kept:]
+    before = new_nodes.copy()
+    new_nodes[0, :n] = state
+    costs, log = np.empty(count - 1), np.empty((ITERATIONS + 1, 3))
+    left, accuracy = new_times - time, 0.1 * tolerance
+    code, _, _, _ = newton(
+        flow, left, new_nodes, state, goal, free, data, field, tolerance, accuracy, ITERATIONS, True, costs, log
+    )
+    return code, new_times, new_nodes, costs, before
 
 
 class Gains:
