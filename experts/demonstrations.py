@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import gymnasium as gym
 import minari
 import numpy as np
-from joblib import Parallel, delayed
 from minari.data_collector import EpisodeBuffer
-from tqdm.auto import tqdm
 
 import leapnav
-from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.feedback import Feedback
 from leapnav.experts.policy import plan_actions
 from leapnav.experts.problem import Path
 from leapnav.experts.solve import solve
@@ -42,14 +38,15 @@ RECOVERY_COST = (2.0, 1.0)  # factor, summand
 class Demonstration:
     """One episode of the expert in the environment, K steps.
 
-    observations (K + 1, d), actions (K, 2), rewards (K,), states (K + 1, 3) as driven; from the optimum: costates
-    (K + 1, 3) and cost_to_go (K + 1,), whose first entry is the reference cost J*. `running_cost` (K,) is what the
-    environment charged in each step.
+    observations (K + 1, d), actions (K, 2) of the expert and those executed, rewards (K,), states (K + 1, 3) as driven;
+    from the optimum: costates (K + 1, 3) and cost_to_go (K + 1,), whose first entry is the reference cost J*.
+    `running_cost` (K,) is what the environment charged in each step.
     """
 
     scenario: Scenario
     observations: np.ndarray
     actions: np.ndarray
+    executed: np.ndarray
     rewards: np.ndarray
     states: np.ndarray
     costates: np.ndarray
@@ -69,44 +66,85 @@ class Demonstration:
         return float(self.cost_to_go[0])
 
 
-@dataclass(frozen=True)
-class RolloutSummary:
-    """What `rollout` did: demonstrations written, scenarios without a certified optimum, replays that failed."""
-
-    demonstrations: int
-    unsolved: int
-    failed_replays: int
-    steps: int
-
-
 def demonstrate(env: gym.Env, scenario: Scenario, extremal: Extremal) -> Demonstration:
     """Drives an optimum through the environment."""
     inner = env.unwrapped
     assert isinstance(inner, NavigateEnv)
     actions = plan_actions(extremal, scenario, inner.control_period)
+
+    def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
+        return actions[step], actions[step]
+
+    driven = _drive(env, scenario, decide)
+    times = np.minimum(inner.control_period * np.arange(len(driven["states"])), scenario.horizon)
+    costates, cost_to_go = extremal.evaluate(times)[2], np.asarray(extremal.cost_to_go(times))
+    return Demonstration(scenario=scenario, costates=costates, cost_to_go=cost_to_go, **driven)
+
+
+def demonstrate_disturbed(
+    env: gym.Env, scenario: Scenario, extremal: Extremal, noise: float, rng: np.random.Generator
+) -> Demonstration:
+    """Drives with noise on the actions; the expert's own, in closed loop, are recorded.
+
+    Where the noise puts the goal out of reach, costate and cost-to-go are NaN and the expert goes on as before.
+
+    Args:
+        env: an environment of `leapnav/Navigate-v0`.
+        scenario: the task.
+        extremal: its optimum.
+        noise: standard deviation of what is added to the actions (in [-1, 1]).
+        rng: draws it.
+
+    """
+    inner = env.unwrapped
+    assert isinstance(inner, NavigateEnv)
+    feedback = Feedback(scenario, Path(extremal.times, extremal.states, extremal.costates))
+    limits = scenario.robot.max_speed, scenario.robot.max_turn_rate
+    costates, costs = [], []
+
+    def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
+        state, now = np.array(inner.pose), inner.time
+        if feedback.update(state, now):
+            cost, costate = feedback.value(state, now)
+        else:  # the goal is out of reach from there
+            cost, costate = np.nan, np.full(3, np.nan)
+        costs.append(cost)
+        costates.append(costate)
+        ahead = min(inner.control_period, scenario.horizon - inner.time) / 2
+        action = np.clip(feedback.control(inner.time + ahead) / limits, -1.0, 1.0).astype(np.float32)
+        executed = np.clip(action + noise * rng.standard_normal(2), -1.0, 1.0).astype(np.float32)
+        return action, executed
+
+    driven = _drive(env, scenario, decide)
+    costs.append(0.0)
+    costates.append(feedback.final_costate)
+    return Demonstration(scenario=scenario, costates=np.array(costates), cost_to_go=np.array(costs), **driven)
+
+
+def _drive(env: gym.Env, scenario: Scenario, decide: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
+    """One episode: `decide` gives the action of a step to record, and the one to execute."""
     observation, info = env.reset(options={"scenario": scenario})
-    observations, rewards, poses, costs = [observation], [], [info["pose"]], [0.0]
-    for action in actions:
-        observation, reward, terminated, _, info = env.step(action)
+    observations, poses, costs = [observation], [info["pose"]], [0.0]
+    actions, executed, rewards = [], [], []
+    terminated = False
+    while not terminated:
+        action, command = decide(len(actions))
+        observation, reward, terminated, _, info = env.step(command)
+        actions.append(action)
+        executed.append(command)
         observations.append(observation)
         rewards.append(float(reward))
         poses.append(info["pose"])
         costs.append(info["cost"])
-        if terminated:
-            break
-    steps = len(rewards)
-    times = np.minimum(inner.control_period * np.arange(steps + 1), scenario.horizon)
-    return Demonstration(
-        scenario=scenario,
-        observations=np.stack(observations),
-        actions=actions[:steps],
-        rewards=np.array(rewards),
-        states=np.array(poses),
-        costates=extremal.evaluate(times)[2],
-        cost_to_go=np.asarray(extremal.cost_to_go(times)),
-        running_cost=np.diff(costs),
-        is_success=bool(info["is_success"]),
-    )
+    return {
+        "observations": np.stack(observations),
+        "actions": np.stack(actions),
+        "executed": np.stack(executed),
+        "rewards": np.array(rewards),
+        "states": np.array(poses),
+        "running_cost": np.diff(costs),
+        "is_success": bool(info["is_success"]),
+    }
 
 
 def recovery(
@@ -139,132 +177,56 @@ def recovery(
     return task, solution
 
 
-def _demonstrations_of_seed(family: str, seed: int, recoveries: int) -> list[Demonstration]:
-    """The demonstrations of one scenario, its optimum first; empty if it has no certified optimum."""
-    scenario = sample_scenario(family, seed)
-    extremal = find_optimum(scenario)
-    if not extremal.success:
-        return []
-    env = NavigateEnv(family, split="fresh")
-    found = [demonstrate(env, scenario, extremal)]
-    # A stream of its own: recoveries change nothing in the scenarios.
-    rng = np.random.default_rng([seed, 1])
-    for number in range(recoveries):
-        pushed = recovery(scenario, extremal, rng, f"{scenario.name}-recovery-{number}")
-        if pushed is not None:
-            found.append(demonstrate(env, *pushed))
-    return found
+def write_dataset(demonstrations: Iterable[Demonstration], root: FilePath, family: str) -> None:
+    """Writes a Minari dataset below the folder `root`, with scenario, state, costate and cost-to-go of every step.
 
-
-def rollout(
-    family: str,
-    count: int,
-    out: str | os.PathLike[str],
-    *,
-    seed: int = 0,
-    recoveries: int = 0,
-    workers: int = 1,
-    progress: bool = True,
-) -> RolloutSummary:
-    """Samples scenarios, finds their optima, drives them, and writes a Minari dataset.
-
-    Args:
-        family: family of the scenarios.
-        count: how many scenarios; scenario i has seed `seed + i` (those without a certified optimum are replaced).
-        out: new folder, a root of Minari datasets: `load_demonstrations(out)` reads it, and with the environment
-            variable MINARI_DATASETS_PATH set to it, `minari.load_dataset(dataset_id(family))`.
-        recoveries: for each scenario, demonstrations that start from states pushed off its optimum.
-        workers: processes.
-        progress: show a progress bar.
-
-    Raises:
-        ValueError: an argument is impossible.
-        FileExistsError: `out` holds something already.
-
+    An episode's scenario is its `options["scenario"]`, so that Minari's `env.reset(options=...)` plays it again. The
+    demonstrations are taken one by one, so there may be more than memory holds.
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
-    for name, value, least in (
-        ("count", count, 1),
-        ("recoveries", recoveries, 0),
-        ("workers", workers, 1),
-        ("seed", seed, 0),
-    ):
-        if value < least:
-            raise ValueError(f"{name}: expected at least {least}, got {value!r}")
-    folder = FilePath(out).absolute()
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileExistsError(f"{folder}: exists and is not empty; choose another folder or remove it")
-    folder.parent.mkdir(parents=True, exist_ok=True)  # before the work: an impossible place is told at once
-    found: list[Demonstration] = []
-    solved = unsolved = failed = 0
-    following = seed
-    pool = Parallel(n_jobs=workers, return_as="generator")
-    with tqdm(total=count, desc=f"Solving {family}", unit="scenario", disable=not progress) as bar:
-        while solved < count:  # once, and again for the few that had no certified optimum
-            seeds = range(following, following + count - solved)
-            following = seeds.stop
-            results = pool(delayed(_demonstrations_of_seed)(family, s, recoveries) for s in seeds)
-            for demonstrations in cast(Iterator[list[Demonstration]], results):
-                unsolved += not demonstrations
-                failed += sum(not d.is_success for d in demonstrations)
-                if demonstrations and demonstrations[0].is_success:
-                    solved += 1
-                    found += [d for d in demonstrations if d.is_success]
-                    bar.update()
-    write_demonstrations(found, folder, family)
-    return RolloutSummary(len(found), unsolved, failed, sum(len(d.actions) for d in found))
-
-
-def write_demonstrations(demonstrations: Sequence[Demonstration], folder: FilePath, family: str) -> None:
-    """Writes a Minari dataset into `folder`, with scenario, states, costates and cost-to-go of every step.
-
-    An episode's scenario is its `options["scenario"]`, so that Minari's `env.reset(options=...)` plays it again.
-    """
-    episodes = []
-    for number, demonstration in enumerate(demonstrations):
-        steps = len(demonstration.actions)
-        terminations = np.zeros(steps, dtype=bool)
-        terminations[-1] = True
-        episodes.append(
-            EpisodeBuffer(
-                id=number,
-                options={"scenario": demonstration.scenario.to_json()},
-                # Minari declares lists, and takes arrays as well.
-                observations=cast(list[Any], demonstration.observations),
-                actions=cast(list[Any], demonstration.actions),
-                rewards=demonstration.rewards.tolist(),
-                terminations=terminations.tolist(),
-                truncations=[False] * steps,
-                infos={
-                    "state": demonstration.states,
-                    "costate": demonstration.costates,
-                    "cost_to_go": demonstration.cost_to_go,
-                    "running_cost": np.concatenate([[0.0], demonstration.running_cost]),
-                },
-            )
+    env = gym.make(ENVIRONMENT, family=family)
+    with _minari_root(str(root)):
+        minari.create_dataset_from_buffers(
+            dataset_id(family),
+            # Minari declares a list, and goes through it once.
+            cast(list[EpisodeBuffer], (_episode(number, d) for number, d in enumerate(demonstrations))),
+            env=env,
+            eval_env=env,
+            algorithm_name="leapnav.experts.find_optimum",
+            author="leapnav",
+            author_email="",
+            code_permalink="",
+            description="Certified optima driven in the environment. Infos: state (x, y, heading), control (speed, "
+            "turn rate), executed_action, costate, cost_to_go, running_cost; the episode's scenario is "
+            "options['scenario'] as JSON.",
+            requirements=[f"leapnav=={leapnav.__version__}"],
         )
-    # Written beside its place and moved there whole: an interrupted run leaves no half of a dataset behind.
-    with TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as scratch:
-        root = FilePath(scratch) / "root"
-        env = gym.make(ENVIRONMENT, family=family)
-        with _minari_root(str(root)):
-            minari.create_dataset_from_buffers(
-                dataset_id(family),
-                episodes,
-                env=env,
-                eval_env=env,
-                algorithm_name="leapnav.experts.find_optimum",
-                author="leapnav",
-                author_email="",
-                code_permalink="",
-                description="Certified optima driven in the environment. Infos: state (x, y, heading), "
-                "costate, cost_to_go, running_cost; the episode's scenario is options['scenario'] as JSON.",
-                requirements=[f"leapnav=={leapnav.__version__}"],
-            )
-        if folder.is_dir():
-            folder.rmdir()  # empty, or `rollout` would have refused it
-        root.rename(folder)
+
+
+def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
+    steps = len(demonstration.actions)
+    terminations = np.zeros(steps, dtype=bool)
+    terminations[-1] = True
+    robot = demonstration.scenario.robot
+    controls = demonstration.actions * np.array([robot.max_speed, robot.max_turn_rate])
+    return EpisodeBuffer(
+        id=number,
+        options={"scenario": demonstration.scenario.to_json()},
+        # Minari declares lists, and takes arrays as well.
+        observations=cast(list[Any], demonstration.observations),
+        actions=cast(list[Any], demonstration.actions),
+        rewards=demonstration.rewards.tolist(),
+        terminations=terminations.tolist(),
+        truncations=[False] * steps,
+        # Infos have an entry more than there are actions: the last control is held, nothing is charged at first.
+        infos={
+            "state": demonstration.states,
+            "control": np.concatenate([controls, controls[-1:]]),
+            "executed_action": np.concatenate([demonstration.executed, demonstration.executed[-1:]]),
+            "costate": demonstration.costates,
+            "cost_to_go": demonstration.cost_to_go,
+            "running_cost": np.concatenate([[0.0], demonstration.running_cost]),
+        },
+    )
 
 
 def dataset_id(family: str) -> str:
@@ -314,7 +276,7 @@ def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
         dataset.iterate_episodes(), dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True
     ):
         infos = episode.infos or {}
-        missing = sorted({"state", "costate", "cost_to_go", "running_cost"} - set(infos))
+        missing = sorted({"state", "executed_action", "costate", "cost_to_go", "running_cost"} - set(infos))
         text = (metadata.get("options") or {}).get("scenario")
         if missing or text is None:
             raise ValueError(
@@ -325,6 +287,7 @@ def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
                 scenario=Scenario.from_json(str(text)),
                 observations=episode.observations,
                 actions=episode.actions,
+                executed=infos["executed_action"][:-1],
                 rewards=np.asarray(episode.rewards),
                 states=infos["state"],
                 costates=infos["costate"],

@@ -112,6 +112,11 @@ class Feedback:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
         return float(found.costs.sum()), found.nodes[0, 3:].copy()
 
+    @property
+    def final_costate(self) -> np.ndarray:
+        """The costate (3,) at the horizon."""
+        return self._stored.nodes[-1, 3:].copy()
+
     def control(self, time: float) -> np.ndarray:
         """Speed (m/s) and turn rate (rad/s) at a time, along what is stored."""
         arrays, (times, nodes, _) = self._arrays, self._stored

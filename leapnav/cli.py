@@ -94,10 +94,13 @@ class Solve:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Sample scenarios, find their optima, drive them in the environment and write a Minari dataset."""
+    """Sample scenarios, find their optima, drive them in the environment and write a Minari dataset.
+
+    Stopped and started again with the same arguments, it goes on where it was.
+    """
 
     out: Path
-    """New folder for the dataset."""
+    """Folder for the dataset."""
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     count: int = 100
@@ -106,15 +109,27 @@ class Rollout:
     """Scenario i has seed SEED + i."""
     recoveries: int = 0
     """For each scenario, demonstrations that start from states pushed off its optimum."""
+    noise: float = 0.0
+    """Standard deviation of noise on the executed actions; the recorded ones are the expert's, in closed loop."""
     workers: int = os.cpu_count() or 1
-    """Processes."""
+    """Processes; their number changes nothing in the dataset."""
+    force: bool = False
+    """Replace a dataset or an unfinished rollout that the folder holds."""
 
     def run(self) -> int:
         """Writes the dataset."""
-        from leapnav.experts.demonstrations import dataset_id, rollout
+        from leapnav.experts.demonstrations import dataset_id
+        from leapnav.experts.rollouts import rollout
 
         summary = rollout(
-            self.family, self.count, self.out, seed=self.seed, recoveries=self.recoveries, workers=self.workers
+            self.family,
+            self.count,
+            self.out,
+            seed=self.seed,
+            recoveries=self.recoveries,
+            noise=self.noise,
+            workers=self.workers,
+            force=self.force,
         )
         print(
             f"wrote {self.out}: {summary.demonstrations} demonstrations, {summary.steps} steps "
@@ -182,7 +197,8 @@ class Evaluate:
         """Plays and reports."""
         from tempfile import TemporaryDirectory
 
-        from leapnav.experts.demonstrations import load_demonstrations, rollout
+        from leapnav.experts.demonstrations import load_demonstrations
+        from leapnav.experts.rollouts import rollout
         from leapnav.training.evaluation import evaluate
         from leapnav.training.reports import plot_gallery, print_scores, write_scores
 

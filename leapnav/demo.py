@@ -9,7 +9,8 @@ from pathlib import Path
 import gymnasium as gym
 from rich.console import Console
 
-from leapnav.experts.demonstrations import load_demonstrations, rollout
+from leapnav.experts.demonstrations import load_demonstrations
+from leapnav.experts.rollouts import rollout
 from leapnav.training.cloning import behaviour_clone
 from leapnav.training.config import CloningConfig
 from leapnav.training.evaluation import evaluate

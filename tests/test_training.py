@@ -9,7 +9,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
-from leapnav.experts.demonstrations import load_demonstrations, rollout
+from leapnav.experts.demonstrations import load_demonstrations
+from leapnav.experts.rollouts import rollout
 from leapnav.training import (
     CloningConfig,
     Episode,

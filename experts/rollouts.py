@@ -1,0 +1,251 @@
+"""Demonstrations by the thousand: solved in parallel, kept in shards when finished, and written as one dataset."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from joblib import Parallel, delayed
+from tqdm.auto import tqdm
+
+import leapnav
+from leapnav.envs.families import FAMILIES, sample_scenario
+from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenario import Scenario
+from leapnav.experts.demonstrations import Demonstration, demonstrate, demonstrate_disturbed, recovery, write_dataset
+from leapnav.experts.optimum import find_optimum
+from leapnav.experts.shards import Shards
+
+VERSION = 1  # of the shards
+SHARD = 16  # scenarios
+WORK = ".rollout"  # folder of what is not finished
+# Arrays of a demonstration, and whether they have an entry more than there are steps.
+_ARRAYS = {
+    "observations": True,
+    "actions": False,
+    "executed": False,
+    "rewards": False,
+    "states": True,
+    "costates": True,
+    "cost_to_go": True,
+    "running_cost": False,
+}
+
+
+@dataclass(frozen=True)
+class RolloutSummary:
+    """What `rollout` did: demonstrations written, scenarios without a certified optimum, replays that failed."""
+
+    demonstrations: int
+    unsolved: int
+    failed_replays: int
+    steps: int
+
+
+def rollout(
+    family: str,
+    count: int,
+    out: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    recoveries: int = 0,
+    noise: float = 0.0,
+    workers: int = 1,
+    force: bool = False,
+    progress: bool = True,
+) -> RolloutSummary:
+    """Samples scenarios, finds their optima, drives them, and writes a Minari dataset.
+
+    What is finished is kept in `out`: a rollout that was stopped, however rudely, goes on where it was when it is
+    called again with the same arguments, and its dataset is that of one that was not stopped.
+
+    Args:
+        family: family of the scenarios.
+        count: how many scenarios; scenario i has seed `seed + i` (those without a certified optimum are replaced by
+            following ones).
+        out: folder, a root of Minari datasets: `load_demonstrations(out)` reads it, and with the environment variable
+            MINARI_DATASETS_PATH set to it, `minari.load_dataset(dataset_id(family))`.
+        recoveries: for each scenario, demonstrations that start from states pushed off its optimum.
+        noise: standard deviation of what is added to the executed actions (in [-1, 1]); the expert acts in closed loop
+            then, and its own actions are the dataset's, so that they show how to recover.
+        workers: processes; their number changes nothing in the dataset.
+        force: replace a dataset or an unfinished rollout that `out` holds.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: an argument is impossible, a shard is damaged, or `out` holds an unfinished rollout of other
+            arguments.
+        FileExistsError: `out` holds something already.
+        OSError: `out` cannot be written; what is finished is kept.
+
+    """
+    if family not in FAMILIES:
+        raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
+    for name, value, least in (
+        ("count", count, 1),
+        ("recoveries", recoveries, 0),
+        ("workers", workers, 1),
+        ("seed", seed, 0),
+        ("noise", noise, 0.0),
+    ):
+        if not (math.isfinite(value) and value >= least):
+            raise ValueError(f"{name}: expected at least {least}, got {value!r}")
+    folder = Path(out).absolute()
+    _prepare(folder, force)
+    settings = {
+        "version": VERSION,
+        "software": leapnav.__version__,
+        "family": family,
+        "seed": seed,
+        "recoveries": recoveries,
+        "noise": float(noise),
+    }
+    shards = Shards(folder / WORK, settings)  # not of the count: a longer rollout goes on where a shorter one was
+    try:
+        parts = _solve(shards, family, count, seed, recoveries, float(noise), workers, progress)
+        summary = _write(shards, parts, folder, family, count)
+    finally:
+        shards.close()
+    shutil.rmtree(folder / WORK)
+    return summary
+
+
+def _prepare(folder: Path, force: bool) -> None:
+    """Makes the folder, or refuses it."""
+    content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if force and content and content <= {WORK, "leapnav"}:  # what a rollout makes, and nothing else
+        shutil.rmtree(folder)
+        content = set()
+    if (folder.exists() and not folder.is_dir()) or content - {WORK}:
+        raise FileExistsError(f"{folder}: exists and is not empty; choose another folder or remove it")
+    folder.mkdir(parents=True, exist_ok=True)  # before the work: an impossible place is told at once
+
+
+def _solve(
+    shards: Shards,
+    family: str,
+    count: int,
+    seed: int,
+    recoveries: int,
+    noise: float,
+    workers: int,
+    progress: bool,
+) -> int:
+    """Makes the shards that are missing; returns how many hold `count` solved scenarios."""
+    solved: dict[int, int] = {}
+    parts = 0
+    pool = Parallel(n_jobs=workers, return_as="generator_unordered")
+    with tqdm(total=count, desc=f"Solving {family}", unit="scenario", disable=not progress) as bar:
+        while sum(solved.values()) < count:  # once, and again for the few that had no certified optimum
+            first, parts = parts, parts + math.ceil((count - sum(solved.values())) / SHARD)
+            missing = []
+            for number in range(first, parts):
+                if number in shards:
+                    solved[number] = int(shards.read(number)["solved"].sum())
+                    bar.update(solved[number])
+                else:
+                    missing.append(number)
+            bar.unpause()  # the rate is of what is solved now
+            tasks = (delayed(_shard)(number, family, seed, recoveries, noise) for number in missing)
+            for number, arrays in cast(Iterator[tuple[int, dict[str, np.ndarray]]], pool(tasks)):
+                shards.write(number, arrays)
+                solved[number] = int(arrays["solved"].sum())
+                bar.update(solved[number])
+    return parts
+
+
+def _write(shards: Shards, parts: int, folder: Path, family: str, count: int) -> RolloutSummary:
+    """Writes the dataset of the first `count` solved scenarios, beside its place, and moves it there whole."""
+    totals = {"demonstrations": 0, "unsolved": 0, "failed": 0, "steps": 0}
+
+    def demonstrations() -> Iterator[Demonstration]:
+        solved = 0
+        for number in range(parts):
+            arrays = shards.read(number)
+            for kept, failed, found in zip(
+                arrays["kept"].tolist(), arrays["failed"].tolist(), _unpack(arrays), strict=True
+            ):
+                if solved == count:
+                    return
+                totals["unsolved"] += kept == 0 and failed == 0
+                totals["failed"] += failed
+                solved += kept > 0
+                for demonstration in found:
+                    totals["demonstrations"] += 1
+                    totals["steps"] += len(demonstration.actions)
+                    yield demonstration
+
+    root = folder / WORK / "root"
+    shutil.rmtree(root, ignore_errors=True)  # of a run that was stopped here
+    write_dataset(demonstrations(), root, family)
+    (root / "leapnav").replace(folder / "leapnav")
+    return RolloutSummary(totals["demonstrations"], totals["unsolved"], totals["failed"], totals["steps"])
+
+
+def _shard(number: int, family: str, seed: int, recoveries: int, noise: float) -> tuple[int, dict[str, np.ndarray]]:
+    first = seed + number * SHARD
+    return number, _pack([_of_seed(family, s, recoveries, noise) for s in range(first, first + SHARD)])
+
+
+def _of_seed(family: str, seed: int, recoveries: int, noise: float) -> list[Demonstration]:
+    """The demonstrations of one scenario, its optimum first; empty if it has no certified optimum."""
+    scenario = sample_scenario(family, seed)
+    extremal = find_optimum(scenario)
+    if not extremal.success:
+        return []
+    tasks = [(scenario, extremal)]
+    # Streams of their own: neither recoveries nor noise change anything in the scenarios.
+    rng = np.random.default_rng([seed, 1])
+    for number in range(recoveries):
+        pushed = recovery(scenario, extremal, rng, f"{scenario.name}-recovery-{number}")
+        if pushed is not None:
+            tasks.append(pushed)
+    env = NavigateEnv(family, split="fresh")
+    if noise == 0.0:
+        return [demonstrate(env, *task) for task in tasks]
+    disturbances = np.random.default_rng([seed, 2])
+    return [demonstrate_disturbed(env, *task, noise, disturbances) for task in tasks]
+
+
+def _pack(scenarios: list[list[Demonstration]]) -> dict[str, np.ndarray]:
+    """The demonstrations of scenarios as arrays; of a scenario whose optimum fails in the environment none is kept."""
+    kept = [[d for d in found if d.is_success] if found and found[0].is_success else [] for found in scenarios]
+    demonstrations = [d for found in kept for d in found]
+    texts = [d.scenario.to_json().encode() for d in demonstrations]
+    arrays: dict[str, np.ndarray] = {
+        "solved": np.array([bool(found) for found in kept]),
+        "kept": np.array([len(found) for found in kept]),
+        "failed": np.array([sum(not d.is_success for d in found) for found in scenarios]),
+        "steps": np.array([len(d.actions) for d in demonstrations], dtype=np.int64),
+        "texts": np.frombuffer(b"".join(texts), dtype="u1"),
+        "text_ends": np.cumsum([len(text) for text in texts], dtype=np.int64),
+    }
+    if demonstrations:
+        for name in _ARRAYS:
+            arrays[name] = np.concatenate([getattr(d, name) for d in demonstrations])
+    return arrays
+
+
+def _unpack(arrays: dict[str, np.ndarray]) -> Iterator[list[Demonstration]]:
+    """The inverse of `_pack`, scenario by scenario."""
+    steps, number, text_start = arrays["steps"].tolist(), 0, 0
+    starts = dict.fromkeys(_ARRAYS, 0)
+    for kept in arrays["kept"].tolist():
+        found = []
+        for _ in range(kept):
+            values: dict[str, Any] = {}
+            for name, one_more in _ARRAYS.items():
+                end = starts[name] + steps[number] + one_more
+                values[name] = arrays[name][starts[name] : end]
+                starts[name] = end
+            text_end = int(arrays["text_ends"][number])
+            scenario = Scenario.from_json(arrays["texts"][text_start:text_end].tobytes().decode())
+            found.append(Demonstration(scenario=scenario, is_success=True, **values))
+            text_start, number = text_end, number + 1
+        yield found

@@ -1,0 +1,171 @@
+"""Rollouts that are stopped, resumed, damaged, repeated."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from leapnav.envs import NavigateEnv
+from leapnav.experts import ExpertPolicy, rollouts
+from leapnav.experts.demonstrations import load_demonstrations
+from leapnav.experts.rollouts import SHARD, WORK, rollout
+from leapnav.experts.shards import Shards
+
+SETTINGS = {"family": "open", "seed": 3}
+
+
+def contents(folder):
+    """Every array and attribute of a dataset."""
+    (file,) = folder.glob("**/main_data.hdf5")
+    found = {}
+
+    def take(name, item):
+        values = item[()].tobytes() if isinstance(item, h5py.Dataset) else None
+        found[name] = values, sorted(map(str, item.attrs.items()))
+
+    with h5py.File(file) as data:
+        data.visititems(take)
+    (metadata,) = folder.glob("**/metadata.json")
+    return found, metadata.read_text()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    out = tmp_path_factory.mktemp("rollouts") / "whole"
+    summary = rollout("open", 60, out, seed=3, recoveries=1, workers=2, progress=False)
+    assert summary.demonstrations > 100
+    assert [path.name for path in out.iterdir()] == ["leapnav"]
+    return out
+
+
+def test_killed_and_resumed_it_is_the_dataset_of_one_that_was_not(whole, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["rollout", "--family", "open", "--count", "60", "--seed", "3", "--recoveries", "1", "--workers", "2"]
+    command = [sys.executable, "-m", "leapnav", *arguments, "--out", str(out)]
+    rng = np.random.default_rng(0)
+    kept = 0
+    for shards in (1, 2, 3):
+        process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
+        while len(list(out.glob(f"{WORK}/shard-*.npz"))) < shards and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.05))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        now = len(list(out.glob(f"{WORK}/shard-*.npz")))
+        assert now >= kept
+        kept = now
+    assert kept > 0
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert contents(out) == contents(whole)
+
+
+def test_stopped_while_the_dataset_is_written_it_writes_it_again(whole, tmp_path, monkeypatch):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(rollouts, "write_dataset", stop)
+        with pytest.raises(KeyboardInterrupt):
+            rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+    (tmp_path / "out" / WORK / "root" / "leapnav").mkdir(parents=True)  # half of a dataset
+    with monkeypatch.context() as patched:
+        patched.setattr(rollouts, "_shard", None)  # nothing is solved again
+        rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+    assert contents(tmp_path / "out") == contents(whole)
+
+
+def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
+    write, written = Shards.write, []
+
+    def fill(self, number, arrays):
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device", str(self.path(number)))
+        written.append(number)
+        write(self, number, arrays)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Shards, "write", fill)
+        with pytest.raises(OSError, match="No space left"):
+            rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+    assert len(list((tmp_path / "out" / WORK).glob("shard-*.npz"))) == 2
+    assert not list((tmp_path / "out" / WORK).glob(".*.partial"))
+    rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+    assert contents(tmp_path / "out") == contents(whole)
+
+
+def unfinished(folder, monkeypatch, **changes):
+    """A rollout that was stopped when all was solved."""
+    with monkeypatch.context() as patched:
+        patched.setattr(rollouts, "_write", lambda *arguments: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            rollout(**{"count": 2 * SHARD, "out": folder, "progress": False, **SETTINGS, **changes})
+    return sorted(folder.glob(f"{WORK}/shard-*.npz"))
+
+
+def test_a_damaged_shard_is_refused_by_name(tmp_path, monkeypatch):
+    first, second = unfinished(tmp_path / "out", monkeypatch)
+    content = bytearray(second.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    second.write_bytes(content)
+    with pytest.raises(ValueError, match=r"shard-000001\.npz: damaged: .*; remove it"):
+        rollout("open", 2 * SHARD, tmp_path / "out", seed=3, progress=False)
+    second.write_bytes(first.read_bytes())
+    with pytest.raises(ValueError, match=r"shard-000001\.npz: a shard of another rollout"):
+        rollout("open", 2 * SHARD, tmp_path / "out", seed=3, progress=False)
+    second.unlink()
+    assert rollout("open", 2 * SHARD, tmp_path / "out", seed=3, progress=False).demonstrations == 2 * SHARD
+
+
+def test_other_arguments_do_not_continue_it(tmp_path, monkeypatch):
+    unfinished(tmp_path / "out", monkeypatch)
+    for changes in ({"seed": 4}, {"noise": 0.1}, {"family": "slalom"}, {"recoveries": 2}):
+        with pytest.raises(ValueError, match=r"rollout\.json: holds an unfinished rollout of other settings"):
+            rollout(**{"count": 4, "out": tmp_path / "out", "progress": False, **SETTINGS, **changes})
+    # A longer one goes on.
+    assert rollout("open", 2 * SHARD + 3, tmp_path / "out", seed=3, progress=False).demonstrations == 2 * SHARD + 3
+
+
+def test_nothing_is_overwritten_without_force(tmp_path):
+    out = tmp_path / "out"
+    rollout("open", 2, out, progress=False)
+    with pytest.raises(FileExistsError, match="not empty"):
+        rollout("open", 3, out, progress=False)
+    assert rollout("open", 3, out, force=True, progress=False).demonstrations == 3
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="not empty"):
+        rollout("open", 3, out, force=True, progress=False)
+    assert (out / "notes.txt").exists()
+
+
+def test_two_processes_do_not_share_a_rollout(tmp_path):
+    first = Shards(tmp_path / WORK, SETTINGS)
+    with pytest.raises(ValueError, match="another process is at work"):
+        Shards(tmp_path / WORK, SETTINGS)
+    first.close()
+    Shards(tmp_path / WORK, SETTINGS).close()
+
+
+def test_with_noise_the_expert_s_own_actions_are_recorded(tmp_path):
+    rollout("clutter", 6, tmp_path, noise=0.2, workers=2, progress=False)
+    for demonstration in load_demonstrations(tmp_path):
+        off = demonstration.executed - demonstration.actions
+        assert 0.1 < off.std() < 0.25
+        env = NavigateEnv(scenario=demonstration.scenario)
+        expert = ExpertPolicy(env)
+        observation, _ = env.reset()
+        for k, executed in enumerate(demonstration.executed):
+            assert np.array_equal(observation, demonstration.observations[k])
+            if k % 20 == 0:
+                assert expert.predict(observation)[0].clip(-1, 1) == pytest.approx(demonstration.actions[k], abs=1e-4)
+                assert expert.value() == pytest.approx(demonstration.cost_to_go[k], rel=1e-6)
+                assert expert.costate() == pytest.approx(demonstration.costates[k], abs=1e-4)
+            observation, reward, *_ = env.step(executed)
+            assert reward == demonstration.rewards[k]
+        assert env.at_goal
