@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -30,6 +30,7 @@ PUSH = np.array([0.15, 0.15, 0.3])
 PUSH_FADES = 0.5  # s over which the guess returns to the optimum
 LAST_PUSH = 1.0  # s before the horizon: later the robot could not recover
 PUSH_CLEARANCE = 0.02  # m
+SCORED = 100  # scenarios that random actions are scored on
 # A pushed robot whose solution costs this much more than the rest of the optimum has left for another local optimum.
 RECOVERY_COST = (2.0, 1.0)  # factor, summand
 
@@ -40,7 +41,7 @@ class Demonstration:
 
     observations (K + 1, d), actions (K, 2) of the expert and those executed, rewards (K,), states (K + 1, 3) as driven;
     from the optimum: costates (K + 1, 3) and cost_to_go (K + 1,), whose first entry is the reference cost J*.
-    `running_cost` (K,) is what the environment charged in each step.
+    `running_cost` (K,) is what the environment charged in each step. `seed` is the scenario's, None if it has none.
     """
 
     scenario: Scenario
@@ -53,6 +54,7 @@ class Demonstration:
     cost_to_go: np.ndarray
     running_cost: np.ndarray
     is_success: bool
+    seed: int | None = None
 
     @property
     def path(self) -> Path:
@@ -184,11 +186,20 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: FilePath, famil
     demonstrations are taken one by one, so there may be more than memory holds.
     """
     env = gym.make(ENVIRONMENT, family=family)
+    scenarios: list[Scenario] = []
+    returns: list[float] = []
+
+    def episodes() -> Iterator[EpisodeBuffer]:
+        for number, demonstration in enumerate(demonstrations):
+            returns.append(-demonstration.reference_cost)
+            if number < SCORED:
+                scenarios.append(demonstration.scenario)
+            yield _episode(number, demonstration)
+
     with _minari_root(str(root)):
-        minari.create_dataset_from_buffers(
+        dataset = minari.create_dataset_from_buffers(
             dataset_id(family),
-            # Minari declares a list, and goes through it once.
-            cast(list[EpisodeBuffer], (_episode(number, d) for number, d in enumerate(demonstrations))),
+            cast(list[EpisodeBuffer], episodes()),  # Minari declares a list, and goes through it once
             env=env,
             eval_env=env,
             algorithm_name="leapnav.experts.find_optimum",
@@ -196,10 +207,25 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: FilePath, famil
             author_email="",
             code_permalink="",
             description="Certified optima driven in the environment. Infos: state (x, y, heading), control (speed, "
-            "turn rate), executed_action, costate, cost_to_go, running_cost; the episode's scenario is "
-            "options['scenario'] as JSON.",
+            "turn rate), executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's scenario is "
+            "options['scenario'] as JSON. Reference scores: random actions and the optimum.",
             requirements=[f"leapnav=={leapnav.__version__}"],
         )
+        scores = {"ref_min_score": _random_score(env, scenarios), "ref_max_score": float(np.mean(returns))}
+        dataset.storage.update_metadata(scores)
+
+
+def _random_score(env: gym.Env, scenarios: Sequence[Scenario]) -> float:
+    """Mean return of random actions."""
+    rng = np.random.default_rng(0)
+    total = 0.0
+    for scenario in scenarios:
+        env.reset(options={"scenario": scenario})
+        terminated = False
+        while not terminated:
+            _, reward, terminated, _, _ = env.step(rng.uniform(-1.0, 1.0, 2).astype(np.float32))
+            total += float(reward)
+    return total / len(scenarios)
 
 
 def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
@@ -210,6 +236,7 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
     controls = demonstration.actions * np.array([robot.max_speed, robot.max_turn_rate])
     return EpisodeBuffer(
         id=number,
+        seed=demonstration.seed,
         options={"scenario": demonstration.scenario.to_json()},
         # Minari declares lists, and takes arrays as well.
         observations=cast(list[Any], demonstration.observations),
@@ -225,6 +252,7 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
             "costate": demonstration.costates,
             "cost_to_go": demonstration.cost_to_go,
             "running_cost": np.concatenate([[0.0], demonstration.running_cost]),
+            "reference_cost": np.full(steps + 1, demonstration.reference_cost),
         },
     )
 
@@ -263,7 +291,17 @@ def open_dataset(folder: str | os.PathLike[str]) -> minari.MinariDataset:
 
 
 def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
-    """The demonstrations that `rollout` wrote.
+    """The demonstrations that `rollout` wrote, all in memory.
+
+    Raises:
+        FileNotFoundError, ValueError: see `iterate_demonstrations`.
+
+    """
+    return list(iterate_demonstrations(folder))
+
+
+def iterate_demonstrations(folder: str | os.PathLike[str]) -> Iterator[Demonstration]:
+    """The demonstrations that `rollout` wrote, one by one.
 
     Raises:
         FileNotFoundError: see `open_dataset`.
@@ -271,7 +309,6 @@ def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
 
     """
     dataset = open_dataset(folder)
-    demonstrations = []
     for episode, metadata in zip(
         dataset.iterate_episodes(), dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True
     ):
@@ -282,7 +319,7 @@ def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
             raise ValueError(
                 f"{os.fspath(folder)}: episode {episode.id} has no {missing[0] if missing else 'scenario'}"
             )
-        demonstrations.append(
+        yield (
             Demonstration(
                 scenario=Scenario.from_json(str(text)),
                 observations=episode.observations,
@@ -294,6 +331,6 @@ def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
                 cost_to_go=infos["cost_to_go"],
                 running_cost=infos["running_cost"][1:],
                 is_success=True,  # `rollout` writes no others
+                seed=metadata.get("seed"),
             )
         )
-    return demonstrations

@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -207,10 +207,12 @@ def _of_seed(family: str, seed: int, recoveries: int, noise: float) -> list[Demo
         if pushed is not None:
             tasks.append(pushed)
     env = NavigateEnv(family, split="fresh")
-    if noise == 0.0:
-        return [demonstrate(env, *task) for task in tasks]
     disturbances = np.random.default_rng([seed, 2])
-    return [demonstrate_disturbed(env, *task, noise, disturbances) for task in tasks]
+    found = []
+    for task in tasks:
+        driven = demonstrate(env, *task) if noise == 0.0 else demonstrate_disturbed(env, *task, noise, disturbances)
+        found.append(replace(driven, seed=seed))
+    return found
 
 
 def _pack(scenarios: list[list[Demonstration]]) -> dict[str, np.ndarray]:
@@ -223,6 +225,7 @@ def _pack(scenarios: list[list[Demonstration]]) -> dict[str, np.ndarray]:
         "kept": np.array([len(found) for found in kept]),
         "failed": np.array([sum(not d.is_success for d in found) for found in scenarios]),
         "steps": np.array([len(d.actions) for d in demonstrations], dtype=np.int64),
+        "seeds": np.array([d.seed for d in demonstrations], dtype=np.int64),
         "texts": np.frombuffer(b"".join(texts), dtype="u1"),
         "text_ends": np.cumsum([len(text) for text in texts], dtype=np.int64),
     }
@@ -246,6 +249,7 @@ def _unpack(arrays: dict[str, np.ndarray]) -> Iterator[list[Demonstration]]:
                 starts[name] = end
             text_end = int(arrays["text_ends"][number])
             scenario = Scenario.from_json(arrays["texts"][text_start:text_end].tobytes().decode())
-            found.append(Demonstration(scenario=scenario, is_success=True, **values))
+            seed = int(arrays["seeds"][number])
+            found.append(Demonstration(scenario=scenario, is_success=True, seed=seed, **values))
             text_start, number = text_end, number + 1
         yield found
