@@ -6,24 +6,34 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, delayed, parallel_config
 from tqdm.auto import tqdm
 
 import leapnav
 from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenario import Scenario
-from leapnav.experts.demonstrations import Demonstration, demonstrate, demonstrate_disturbed, recovery, write_dataset
+from leapnav.experts.demonstrations import (
+    Demonstration,
+    demonstrate,
+    demonstrate_disturbed,
+    iterate_demonstrations,
+    open_dataset,
+    recovery,
+    write_dataset,
+)
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.shards import Shards
 
 VERSION = 1  # of the shards
 SHARD = 16  # scenarios
+DASK_TIMEOUT = 30  # s to wait for a scheduler and its workers
 WORK = ".rollout"  # folder of what is not finished
 # Arrays of a demonstration, and whether they have an entry more than there are steps.
 _ARRAYS = {
@@ -57,6 +67,7 @@ def rollout(
     recoveries: int = 0,
     noise: float = 0.0,
     workers: int = 1,
+    dask: str | None = None,
     force: bool = False,
     progress: bool = True,
 ) -> RolloutSummary:
@@ -75,6 +86,8 @@ def rollout(
         noise: standard deviation of what is added to the executed actions (in [-1, 1]); the expert acts in closed loop
             then, and its own actions are the dataset's, so that they show how to recover.
         workers: processes; their number changes nothing in the dataset.
+        dask: address of a Dask scheduler (`tcp://host:8786`), whose workers do the work instead; they need leapnav, but
+            not this folder. Needs the extra `cluster`.
         force: replace a dataset or an unfinished rollout that `out` holds.
         progress: show a progress bar.
 
@@ -82,7 +95,8 @@ def rollout(
         ValueError: an argument is impossible, a shard is damaged, or `out` holds an unfinished rollout of other
             arguments.
         FileExistsError: `out` holds something already.
-        OSError: `out` cannot be written; what is finished is kept.
+        OSError: `out` cannot be written, or there is no such scheduler; what is finished is kept.
+        ModuleNotFoundError: `dask` without the extra `cluster`.
 
     """
     if family not in FAMILIES:
@@ -108,12 +122,75 @@ def rollout(
     }
     shards = Shards(folder / WORK, settings)  # not of the count: a longer rollout goes on where a shorter one was
     try:
-        parts = _solve(shards, family, count, seed, recoveries, float(noise), workers, progress)
+        with _backend(workers, dask) as pool:
+            parts = _solve(shards, pool, family, count, seed, recoveries, float(noise), progress)
         summary = _write(shards, parts, folder, family, count)
     finally:
         shards.close()
     shutil.rmtree(folder / WORK)
     return summary
+
+
+@dataclass(frozen=True)
+class Replay:
+    """How far a dataset is from what the environment does: largest deviations over all steps.
+
+    Attributes:
+        episodes: how many were replayed.
+        observation, reward, state: largest absolute deviation.
+        worst: number of the episode with the largest one, None if there are no episodes.
+
+    """
+
+    episodes: int
+    observation: float
+    reward: float
+    state: float
+    worst: int | None
+
+
+def check_dataset(folder: str | os.PathLike[str], *, progress: bool = True) -> Replay:
+    """Plays the executed actions of a dataset in the environment again.
+
+    An episode of another length counts as an infinite deviation.
+
+    Raises:
+        FileNotFoundError, ValueError: see `load_demonstrations`.
+
+    """
+    total = open_dataset(folder).total_episodes
+    env = NavigateEnv(split="fresh")
+    largest, worst, episodes = np.zeros(3), None, 0
+    for number, demonstration in enumerate(
+        tqdm(iterate_demonstrations(folder), total=total, desc="Replaying", unit="episode", disable=not progress)
+    ):
+        found = _replay(env, demonstration)
+        if worst is None or found.max() > largest.max():
+            worst = number
+        largest, episodes = np.maximum(largest, found), number + 1
+    observation, reward, state = largest.tolist()
+    return Replay(episodes, observation, reward, state, worst)
+
+
+def _replay(env: NavigateEnv, demonstration: Demonstration) -> np.ndarray:
+    """Largest deviation of observations, rewards and states."""
+    observation, info = env.reset(options={"scenario": demonstration.scenario})
+    observations, rewards, states, terminated = [observation], [], [info["pose"]], False
+    for action in demonstration.executed:
+        if terminated:
+            break
+        observation, reward, terminated, _, info = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        states.append(info["pose"])
+    if not terminated or len(rewards) != len(demonstration.rewards):
+        return np.full(3, np.inf)
+    pairs = (
+        (observations, demonstration.observations),
+        (rewards, demonstration.rewards),
+        (states, demonstration.states),
+    )
+    return np.array([np.abs(np.subtract(one, other)).max() for one, other in pairs])
 
 
 def _prepare(folder: Path, force: bool) -> None:
@@ -127,20 +204,34 @@ def _prepare(folder: Path, force: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)  # before the work: an impossible place is told at once
 
 
+@contextmanager
+def _backend(workers: int, dask: str | None) -> Iterator[Parallel]:
+    """What runs tasks: processes of this machine, or the workers of a Dask scheduler."""
+    if dask is None:
+        yield Parallel(n_jobs=workers, return_as="generator_unordered")
+        return
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        raise ModuleNotFoundError('a Dask cluster needs dask: pip install "leapnav[cluster]"') from None
+    with Client(dask, timeout=DASK_TIMEOUT), parallel_config(backend="dask", wait_for_workers_timeout=DASK_TIMEOUT):
+        # One task for each shard: a worker that is lost takes no more than these with it, and they are done again.
+        yield Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=cast(Any, 1))
+
+
 def _solve(
     shards: Shards,
+    pool: Parallel,
     family: str,
     count: int,
     seed: int,
     recoveries: int,
     noise: float,
-    workers: int,
     progress: bool,
 ) -> int:
     """Makes the shards that are missing; returns how many hold `count` solved scenarios."""
     solved: dict[int, int] = {}
     parts = 0
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered")
     with tqdm(total=count, desc=f"Solving {family}", unit="scenario", disable=not progress) as bar:
         while sum(solved.values()) < count:  # once, and again for the few that had no certified optimum
             first, parts = parts, parts + math.ceil((count - sum(solved.values())) / SHARD)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from leapnav.experts import Extremal, Optimum
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
+DEVIATION = 1e-6  # of a replay: what other versions of the libraries may make of the last bits
 DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
 
 
@@ -113,11 +114,18 @@ class Rollout:
     """Standard deviation of noise on the executed actions; the recorded ones are the expert's, in closed loop."""
     workers: int = os.cpu_count() or 1
     """Processes; their number changes nothing in the dataset."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers do the work instead."""
     force: bool = False
     """Replace a dataset or an unfinished rollout that the folder holds."""
+    check: bool = False
+    """Write nothing: replay the dataset that the folder holds and report the largest deviation (exit code 1 if there
+    is one)."""
 
     def run(self) -> int:
-        """Writes the dataset."""
+        """Writes the dataset, or checks it."""
+        if self.check:
+            return self._check()
         from leapnav.experts.demonstrations import dataset_id
         from leapnav.experts.rollouts import rollout
 
@@ -129,6 +137,7 @@ class Rollout:
             recoveries=self.recoveries,
             noise=self.noise,
             workers=self.workers,
+            dask=self.dask,
             force=self.force,
         )
         print(
@@ -138,6 +147,16 @@ class Rollout:
         )
         print(f"minari.load_dataset({dataset_id(self.family)!r}) reads it with MINARI_DATASETS_PATH={self.out}")
         return 0
+
+    def _check(self) -> int:
+        from leapnav.experts.rollouts import check_dataset
+
+        replay = check_dataset(self.out)
+        print(
+            f"{self.out}: {replay.episodes} episodes replayed; largest deviation of observations "
+            f"{replay.observation:.1e}, rewards {replay.reward:.1e}, states {replay.state:.1e} (episode {replay.worst})"
+        )
+        return 0 if max(replay.observation, replay.reward, replay.state) <= DEVIATION else FAILED
 
 
 @dataclass(frozen=True)
@@ -275,7 +294,7 @@ def main(arguments: list[str] | None = None) -> int:
     command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="leapnav", description=DESCRIPTION, args=arguments)
     try:
         return command.run()
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:

@@ -2,19 +2,22 @@
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import h5py
 import numpy as np
 import pytest
 
+from leapnav.cli import main
 from leapnav.envs import NavigateEnv
 from leapnav.experts import ExpertPolicy, rollouts
-from leapnav.experts.demonstrations import load_demonstrations
-from leapnav.experts.rollouts import SHARD, WORK, rollout
+from leapnav.experts.demonstrations import dataset_id, load_demonstrations
+from leapnav.experts.rollouts import SHARD, WORK, check_dataset, rollout
 from leapnav.experts.shards import Shards
 
 SETTINGS = {"family": "open", "seed": 3}
@@ -150,6 +153,75 @@ def test_two_processes_do_not_share_a_rollout(tmp_path):
         Shards(tmp_path / WORK, SETTINGS)
     first.close()
     Shards(tmp_path / WORK, SETTINGS).close()
+
+
+def test_a_dask_cluster_that_loses_a_worker_makes_the_same_dataset(whole, tmp_path):
+    from dask.distributed import Client, LocalCluster
+
+    out = tmp_path / "out"
+    killed = []
+
+    def kill_one(client):
+        while not list(out.glob(f"{WORK}/shard-*.npz")):
+            time.sleep(0.01)
+        pid = next(iter(client.run(os.getpid).values()))
+        os.kill(pid, signal.SIGKILL)
+        killed.append(pid)
+
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        killer = threading.Thread(target=kill_one, args=(client,))
+        killer.start()
+        summary = rollout("open", 60, out, seed=3, recoveries=1, dask=cluster.scheduler_address, progress=False)
+        killer.join()
+    assert len(killed) == 1
+    assert summary.demonstrations > 100
+    assert contents(out) == contents(whole)
+
+
+def test_without_dask_or_a_scheduler_a_cluster_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(rollouts, "DASK_TIMEOUT", 0.2)
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:1"):
+        rollout("open", 1, tmp_path / "one", dask="tcp://127.0.0.1:1", progress=False)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    with pytest.raises(ModuleNotFoundError, match=r"leapnav\[cluster\]"):
+        rollout("open", 1, tmp_path / "two", dask="tcp://127.0.0.1:1", progress=False)
+
+
+def test_a_dataset_is_replayed(whole, tmp_path, capsys):
+    replay = check_dataset(whole, progress=False)
+    assert replay.episodes > 100
+    assert (replay.observation, replay.reward, replay.state) == (0.0, 0.0, 0.0)
+    assert main(["rollout", "--check", "--out", str(whole)]) == 0
+    assert f"{replay.episodes} episodes replayed" in capsys.readouterr().out
+    changed = tmp_path / "changed"
+    shutil.copytree(whole, changed)
+    (file,) = changed.glob("**/main_data.hdf5")
+    with h5py.File(file, "r+") as data:
+        data["episode_7/rewards"][3] += 0.5
+    assert main(["rollout", "--check", "--out", str(changed)]) == 1
+    assert "rewards 5.0e-01" in (line := capsys.readouterr().out)
+    assert "(episode 7)" in line
+    assert main(["rollout", "--check", "--out", str(tmp_path / "nowhere")]) == 2
+
+
+def test_the_dataset_has_reference_scores_seeds_and_costs(whole, monkeypatch):
+    import minari
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(whole))
+    dataset = minari.load_dataset(dataset_id("open"))
+    demonstrations = load_demonstrations(whole)
+    optimum = -np.mean([d.reference_cost for d in demonstrations])
+    assert dataset.storage.metadata["ref_max_score"] == pytest.approx(optimum)
+    assert dataset.storage.metadata["ref_min_score"] < -40
+    returns = np.array([d.rewards.sum() for d in demonstrations])
+    scores = minari.get_normalized_score(dataset, returns)
+    assert scores.mean() == pytest.approx(1.0, abs=1e-3)
+    assert demonstrations[0].seed == 3
+    episode = dataset[5]
+    assert (episode.infos["reference_cost"] == episode.infos["cost_to_go"][0]).all()
 
 
 def test_with_noise_the_expert_s_own_actions_are_recorded(tmp_path):
