@@ -28,6 +28,7 @@ from leapnav.experts.demonstrations import (
     recovery,
     write_dataset,
 )
+from leapnav.experts.extremal import Extremal
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.shards import Shards
 
@@ -290,7 +291,7 @@ def _of_seed(family: str, seed: int, recoveries: int, noise: float) -> list[Demo
     extremal = find_optimum(scenario)
     if not extremal.success:
         return []
-    tasks = [(scenario, extremal)]
+    tasks: list[tuple[Scenario, Extremal]] = [(scenario, extremal)]
     # Streams of their own: neither recoveries nor noise change anything in the scenarios.
     rng = np.random.default_rng([seed, 1])
     for number in range(recoveries):
