@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from enum import Enum
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from leapnav.envs import driving
@@ -25,6 +26,17 @@ from leapnav.envs.navigation import (
 from leapnav.envs.scenario import Scenario
 from leapnav.envs.settings import Settings
 from leapnav.envs.tasks import Tasks, scenario_of
+
+try:
+    from gymnasium.vector import AutoresetMode
+except ImportError:  # Gymnasium 1.0, which d3rlpy asks for
+
+    class AutoresetMode(Enum):  # type: ignore[no-redef]
+        """As Gymnasium has it from 1.1 on."""
+
+        NEXT_STEP = "NextStep"
+        SAME_STEP = "SameStep"
+        DISABLED = "Disabled"
 
 
 class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 
 import leapnav
+from leapnav.envs.families import LONGEST_HORIZON
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
@@ -30,6 +32,8 @@ PUSH = np.array([0.15, 0.15, 0.3])
 PUSH_FADES = 0.5  # s over which the guess returns to the optimum
 LAST_PUSH = 1.0  # s before the horizon: later the robot could not recover
 PUSH_CLEARANCE = 0.02  # m
+# Of a dataset's environment. No episode is as long, but d3rlpy insists on a limit.
+MOST_STEPS = math.ceil(LONGEST_HORIZON / 0.05) + 1
 SCORED = 100  # scenarios that random actions are scored on
 # A pushed robot whose solution costs this much more than the rest of the optimum has left for another local optimum.
 RECOVERY_COST = (2.0, 1.0)  # factor, summand
@@ -185,7 +189,7 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: FilePath, famil
     An episode's scenario is its `options["scenario"]`, so that Minari's `env.reset(options=...)` plays it again. The
     demonstrations are taken one by one, so there may be more than memory holds.
     """
-    env = gym.make(ENVIRONMENT, family=family)
+    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=MOST_STEPS)
     scenarios: list[Scenario] = []
     returns: list[float] = []
 

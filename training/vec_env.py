@@ -8,11 +8,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from leapnav.envs.vector import NavigateVectorEnv, row_of
+from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv, row_of
 
 ENVIRONMENT = "leapnav/Navigate-v0"
 # Attributes that each robot has for itself, or of which there is one for one robot and one for all.
