@@ -126,6 +126,9 @@ class ExpertPolicy:
     def value(self, state: Any = None, time: Any = None) -> Any:
         """Cost-to-go J* from the robots' states, or from others in their episodes.
 
+        It is that of the local optimum which continues the one that the robot is on: after a small push still the best
+        one, after a large push maybe not.
+
         Args:
             state: x, y (m), heading (rad): (3,), or for many robots (N, 3); None for where they are.
             time: s since the start of the episode, a number or (N,); None for now.

@@ -90,8 +90,10 @@ class Shards:
             with partial.open("rb") as file:
                 os.fsync(file.fileno())
             partial.replace(path)
-        except BaseException:
+        except BaseException as error:
             partial.unlink(missing_ok=True)
+            if isinstance(error, OSError) and error.filename is None:  # of a full disk: say which
+                raise OSError(error.errno, error.strerror, str(path)) from None
             raise
 
     def close(self) -> None:

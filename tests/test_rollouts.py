@@ -103,6 +103,18 @@ def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
     assert contents(tmp_path / "out") == contents(whole)
 
 
+def test_a_full_disk_is_named(tmp_path, monkeypatch):
+    shards = Shards(tmp_path / WORK, SETTINGS)
+    monkeypatch.setattr(np, "savez", fail)
+    with pytest.raises(OSError, match="No space left") as caught:
+        shards.write(7, {})
+    assert caught.value.filename == str(shards.path(7))
+
+
+def fail(*arguments, **options):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def unfinished(folder, monkeypatch, **changes):
     """A rollout that was stopped when all was solved."""
     with monkeypatch.context() as patched:
