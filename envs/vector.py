@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,16 +27,19 @@ from leapnav.envs.scenario import Scenario
 from leapnav.envs.settings import Settings
 from leapnav.envs.tasks import Tasks, scenario_of
 
-try:
-    from gymnasium.vector import AutoresetMode
-except ImportError:  # Gymnasium 1.0, which d3rlpy asks for
+if TYPE_CHECKING:
+    from gymnasium.vector import AutoresetMode as AutoresetMode
+else:
+    try:
+        from gymnasium.vector import AutoresetMode
+    except ImportError:  # Gymnasium 1.0, which d3rlpy asks for
 
-    class AutoresetMode(Enum):  # type: ignore[no-redef]
-        """As Gymnasium has it from 1.1 on."""
+        class AutoresetMode(Enum):
+            """As Gymnasium has it from 1.1 on."""
 
-        NEXT_STEP = "NextStep"
-        SAME_STEP = "SameStep"
-        DISABLED = "Disabled"
+            NEXT_STEP = "NextStep"
+            SAME_STEP = "SameStep"
+            DISABLED = "Disabled"
 
 
 class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
