@@ -35,7 +35,7 @@ from leapnav.experts.shards import Shards
 VERSION = 1  # of the shards
 SHARD = 16  # scenarios
 DASK_TIMEOUT = 30  # s to wait for a scheduler and its workers
-WORK = ".rollout"  # folder of what is not finished
+WORK, DONE = ".rollout", ".rollout-done"  # folders of what is not finished, and of what is only to be removed
 # Arrays of a demonstration, and whether they have an entry more than there are steps.
 _ARRAYS = {
     "observations": True,
@@ -128,7 +128,9 @@ def rollout(
         summary = _write(shards, parts, folder, family, count)
     finally:
         shards.close()
-    shutil.rmtree(folder / WORK)
+    # At once: shards that are removed one by one would look like a rollout to go on with.
+    (folder / WORK).rename(folder / DONE)
+    shutil.rmtree(folder / DONE)
     return summary
 
 
@@ -196,11 +198,14 @@ def _replay(env: NavigateEnv, demonstration: Demonstration) -> np.ndarray:
 
 def _prepare(folder: Path, force: bool) -> None:
     """Makes the folder, or refuses it."""
+    shutil.rmtree(folder / DONE, ignore_errors=True)
     content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if force and content and content <= {WORK, "leapnav"}:  # what a rollout makes, and nothing else
         shutil.rmtree(folder)
         content = set()
-    if (folder.exists() and not folder.is_dir()) or content - {WORK}:
+    # A dataset beside the shards was moved there just before the end of a run that was stopped.
+    ours = {WORK, "leapnav"} if WORK in content else set()
+    if (folder.exists() and not folder.is_dir()) or content - ours:
         raise FileExistsError(f"{folder}: exists and is not empty; choose another folder or remove it")
     folder.mkdir(parents=True, exist_ok=True)  # before the work: an impossible place is told at once
 
@@ -276,6 +281,7 @@ def _write(shards: Shards, parts: int, folder: Path, family: str, count: int) ->
     root = folder / WORK / "root"
     shutil.rmtree(root, ignore_errors=True)  # of a run that was stopped here
     write_dataset(demonstrations(), root, family)
+    shutil.rmtree(folder / "leapnav", ignore_errors=True)  # the same one, see `_prepare`
     (root / "leapnav").replace(folder / "leapnav")
     return RolloutSummary(totals["demonstrations"], totals["unsolved"], totals["failed"], totals["steps"])
 

@@ -17,7 +17,7 @@ from leapnav.cli import main
 from leapnav.envs import NavigateEnv
 from leapnav.experts import ExpertPolicy, rollouts
 from leapnav.experts.demonstrations import dataset_id, load_demonstrations
-from leapnav.experts.rollouts import SHARD, WORK, check_dataset, rollout
+from leapnav.experts.rollouts import DONE, SHARD, WORK, check_dataset, rollout
 from leapnav.experts.shards import Shards
 
 SETTINGS = {"family": "open", "seed": 3}
@@ -82,6 +82,21 @@ def test_stopped_while_the_dataset_is_written_it_writes_it_again(whole, tmp_path
         patched.setattr(rollouts, "_shard", None)  # nothing is solved again
         rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
     assert contents(tmp_path / "out") == contents(whole)
+
+
+def test_stopped_just_before_the_end_it_ends(whole, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        patched.setattr(rollouts, "RolloutSummary", lambda *totals: 1 / 0)  # made when the dataset is in its place
+        with pytest.raises(ZeroDivisionError):
+            rollout("open", 60, out, seed=3, recoveries=1, progress=False)
+    assert {path.name for path in out.iterdir()} == {WORK, "leapnav"}
+    rollout("open", 60, out, seed=3, recoveries=1, progress=False)
+    assert contents(out) == contents(whole)
+    (out / DONE).mkdir()  # a run that was stopped while it tidied up
+    with pytest.raises(FileExistsError, match="not empty"):
+        rollout("open", 60, out, seed=3, recoveries=1, progress=False)
+    assert [path.name for path in out.iterdir()] == ["leapnav"]
 
 
 def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
