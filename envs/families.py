@@ -110,6 +110,20 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Layout]] = {
 }
 
 
+ALL = "all"  # stands for every family
+
+
+def check_family(family: object) -> None:
+    """Checks that scenarios of a family can be drawn.
+
+    Raises:
+        ValueError: they cannot.
+
+    """
+    if not isinstance(family, str) or family not in (*FAMILIES, ALL):
+        raise ValueError(f"family: expected one of {', '.join(FAMILIES)} or {ALL}, got {family!r}")
+
+
 def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     """A random scenario; the same family and seed give the same one.
 
@@ -117,16 +131,17 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     lets the robot follow the shortest such path at 0.8 m/s, but is 40 s at most.
 
     Args:
-        family: one of `FAMILIES`.
+        family: one of `FAMILIES`, or "all" to draw the family too.
         seed: an integer, or a generator to draw from.
 
     Raises:
         ValueError: the family is unknown.
 
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
+    check_family(family)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
+    if family == ALL:
+        family = list(FAMILIES)[rng.integers(len(FAMILIES))]
     name = family if isinstance(seed, np.random.Generator) else f"{family}-{seed}"
     robot, cost = Robot(), Cost()
     while True:  # some of the draws have no path; each draw is independent, so this ends

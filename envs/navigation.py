@@ -107,7 +107,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     ## Arguments
     | Argument | Default | Meaning |
     |---|---|---|
-    | `family` | `"clutter"` | family of scenarios, see `leapnav.envs.FAMILIES` |
+    | `family` | `"clutter"` | family of scenarios, see `leapnav.envs.FAMILIES`; `"all"` draws the family too, for `split="fresh"`, its default |
     | `scenario` | None | the one scenario of all episodes |
     | `split` | `"train"` | the family's bank that ships with leapnav, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` makes a new scenario (2 ms) for each episode |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
@@ -314,6 +314,11 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         """(x, y, heading) in m and rad, the heading unwrapped."""
         x, y, heading = self._fleet.poses[0].tolist()
         return x, y, heading
+
+    @property
+    def cost(self) -> float:
+        """J so far."""
+        return float(self._fleet.state[0, driving.COST])
 
     @property
     def time(self) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.bank import ScenarioBank
-from leapnav.envs.families import FAMILIES, sample_scenario
+from leapnav.envs.families import ALL, check_family, sample_scenario
 from leapnav.envs.scenario import Scenario, ScenarioError
 
 SPLITS = ("train", "test", "fresh")
@@ -32,14 +32,15 @@ class Tasks:
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
     ) -> None:
-        if not isinstance(family, str) or family not in FAMILIES:
-            raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
+        check_family(family)
         arguments = (("scenario", scenario), ("split", split), ("bank", bank))
         given = [name for name, value in arguments if value is not None]
         if len(given) > 1:
             raise ValueError(f"{given[1]}: cannot be combined with {given[0]}")
         if split is not None and split not in SPLITS:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}")
+        if family == ALL and split not in (None, "fresh"):
+            raise ValueError(f"split: all families together have 'fresh' scenarios only, got {split!r}")
         self.family = family
         self.scenario = None if scenario is None else as_scenario(scenario)
         self.bank: ScenarioBank | None = None
@@ -49,7 +50,7 @@ class Tasks:
             self.bank = bank if isinstance(bank, ScenarioBank) else ScenarioBank(bank)
             if len(self.bank) == 0:
                 raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
-        elif scenario is None and split != "fresh":
+        elif scenario is None and split != "fresh" and family != ALL:
             self.bank = ScenarioBank.shipped(family, split or "train")
 
     def given(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:

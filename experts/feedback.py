@@ -96,6 +96,19 @@ class Feedback:
             self._stored = found
         return found is not None
 
+    def reconsider(self, state: np.ndarray, time: float) -> bool:
+        """Searches anew from a state at a time, and stores what it finds if that is cheaper than what is stored.
+
+        Returns:
+            Whether it was.
+
+        """
+        stored, cost = (self._arrays, self._stored), float(self._stored.costs.sum())
+        if self._search(state, time) and float(self._stored.costs.sum()) < cost:
+            return True
+        self._arrays, self._stored = stored
+        return False
+
     def value(self, state: np.ndarray, time: float, tol: float = 1e-9) -> tuple[float, np.ndarray]:
         """Cost-to-go and its gradient, the costate (3,), at a state and time; what is stored stays.
 
@@ -111,6 +124,11 @@ class Feedback:
         if found is None:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
         return float(found.costs.sum()), found.nodes[0, 3:].copy()
+
+    @property
+    def stored(self) -> tuple[float, np.ndarray]:
+        """Cost-to-go and costate (3,) at the state and time of what is stored."""
+        return float(self._stored.costs.sum()), self._stored.nodes[0, 3:].copy()
 
     @property
     def final_costate(self) -> np.ndarray:
@@ -195,7 +213,7 @@ class Feedback:
         arrays, (times, nodes, _) = self._arrays, solution
         count = math.ceil((times[-1] - times[0]) / SAMPLING) + 1
         moments = np.linspace(times[0], times[-1], count)
-        return np.array([_follow(arrays.flow, times, nodes, t, arrays.data, arrays.field)[:3] for t in moments])
+        return _follow_all(arrays.flow, times, nodes, moments, arrays.data, arrays.field)
 
     def _search(self, state: np.ndarray, time: float) -> bool:
         """Stores the best optimum from a state and time, by a new search; False if there is none."""
@@ -224,6 +242,17 @@ def _follow(flow, times, nodes, time, data, field):
     if duration > 0.0:
         propagate(flow, z, np.empty((len(z), 0)), duration, data, field, ACCURACY, 0.0, False)
     return z
+
+
+@njit(matrix(FLOW, vector, matrix, vector, constant, constant), cache=True, error_model="numpy", nogil=True)
+def _follow_all(flow, times, nodes, moments, data, field):
+    """The states (K, n) at times (K,)."""
+    states = np.empty((len(moments), nodes.shape[1] // 2))
+    for k in range(len(moments)):
+        z = _follow(flow, times, nodes, moments[k], data, field)
+        for i in range(states.shape[1]):
+            states[k, i] = z[i]
+    return states
 
 
 @njit(vector(FLOW, CONTROL, vector, matrix, float64, constant, constant), cache=True, error_model="numpy", nogil=True)

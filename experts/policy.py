@@ -22,6 +22,7 @@ from leapnav.experts.problem import Path
 
 FEEDBACKS = ("resolve", "gains", "none")
 FEWEST_ROBOTS = 8  # for which threads are worth their while
+TOO_LATE = 1.0  # s before the horizon from which on there is only one way to the goal
 
 
 class NoOptimumError(RuntimeError):
@@ -50,6 +51,7 @@ class _Situation:
     bank: ScenarioBank | None
     pose: np.ndarray
     time: float
+    cost: float
     period: float
 
 
@@ -62,6 +64,8 @@ class _Robot:
     limits: np.ndarray
     feedback: Feedback
     gains: Gains | None
+    promised: float = math.nan  # cost of the whole episode, as the last search had it
+    label: tuple[float, np.ndarray] = (math.nan, np.full(3, math.nan))  # cost-to-go and costate of the last action
 
 
 class ExpertPolicy:
@@ -77,11 +81,14 @@ class ExpertPolicy:
             step before, or found by a new search where that fails. "gains": neighbouring-extremal gains along the
             optimum of the episode's start, a hundred times cheaper and good near it. "none": the optimum of the start,
             whatever happens.
+        reconsider: for "resolve": search anew, for a better way than the one that the robot is on, whenever the cost of
+            the episode, paid and to go, has grown by this share since the last search; None never does. A teacher
+            should: what is best must depend on where the robot is, not on how it came there.
         workers: threads for many robots; None for one on each core.
 
     Raises:
         TypeError: the environment is none of leapnav's.
-        ValueError: there is no such feedback.
+        ValueError: there is no such feedback, or `reconsider` is negative.
 
     """
 
@@ -91,10 +98,14 @@ class ExpertPolicy:
         references: Mapping[Scenario, Path] | None = None,
         *,
         feedback: Literal["resolve", "gains", "none"] = "resolve",
+        reconsider: float | None = None,
         workers: int | None = None,
     ) -> None:
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: expected one of {', '.join(FEEDBACKS)}, got {feedback!r}")
+        if reconsider is not None and not reconsider >= 0:
+            raise ValueError(f"reconsider: expected a number >= 0 or None, got {reconsider!r}")
+        self._reconsider = reconsider
         self._envs = _environments(env)
         self._references = dict(references or {})
         self._feedback = feedback
@@ -149,6 +160,14 @@ class ExpertPolicy:
         costates = [costate for _, costate in self._ask(state, time)]
         return np.array(costates) if len(costates) > 1 else costates[0]
 
+    def labels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cost-to-go (N,) and costate (N, 3) that the last `predict` acted on, at no further cost.
+
+        They are good to 1e-6, and NaN where the goal was out of reach. With feedback other than "resolve" all are NaN.
+        """
+        found = [(math.nan, np.full(3, math.nan)) if robot is None else robot.label for robot in self._robots]
+        return np.array([cost for cost, _ in found]), np.array([costate for _, costate in found])
+
     def _ask(self, state: Any, time: Any) -> list[tuple[float, np.ndarray]]:
         situations = self._situations()
         count = len(situations)
@@ -179,9 +198,23 @@ class ExpertPolicy:
             control = robot.gains.control(situation.pose, situation.time, ahead)
         else:
             if self._feedback == "resolve":
-                robot.feedback.update(situation.pose, situation.time)
+                solved = robot.feedback.update(situation.pose, situation.time)
+                if solved and self._reconsider is not None:
+                    self._look_round(robot, situation, self._reconsider)
+                robot.label = robot.feedback.stored if solved else (math.nan, np.full(3, math.nan))
             control = robot.feedback.control(situation.time + ahead)
         return control / robot.limits
+
+    def _look_round(self, robot: _Robot, situation: _Situation, share: float) -> None:
+        """Searches anew if the episode has become dearer than the last search promised."""
+        total = situation.cost + robot.feedback.stored[0]
+        if math.isnan(robot.promised):  # the first step
+            robot.promised = total
+        left = situation.scenario.horizon - situation.time
+        if total > (1 + share) * robot.promised and left > TOO_LATE:
+            if robot.feedback.reconsider(situation.pose, situation.time):
+                total = situation.cost + robot.feedback.stored[0]
+            robot.promised = total
 
     def _robot(self, i: int, situation: _Situation) -> _Robot:
         """What is known of a robot's episode; a new one is looked up or solved."""
@@ -215,10 +248,11 @@ class ExpertPolicy:
         for env in self._envs:
             period, bank = env.control_period, env.bank
             if isinstance(env, NavigateEnv):
-                found.append(_Situation(env.scenario, env.index, bank, np.array(env.pose), env.time, period))
+                pose, time, cost = np.array(env.pose), env.time, env.cost
+                found.append(_Situation(env.scenario, env.index, bank, pose, time, cost, period))
             else:
-                rows = zip(env.scenarios, env.indices, env.poses, env.times.tolist(), strict=True)
-                found += [_Situation(scenario, i, bank, pose, time, period) for scenario, i, pose, time in rows]
+                rows = zip(env.scenarios, env.indices, env.poses, env.times.tolist(), env.costs.tolist(), strict=True)
+                found += [_Situation(scene, i, bank, pose, time, cost, period) for scene, i, pose, time, cost in rows]
         return found
 
     def _each(self, function: Callable[[int, _Situation], Any], situations: list[_Situation]) -> list[Any]:

@@ -16,7 +16,7 @@ from joblib import Parallel, delayed, parallel_config
 from tqdm.auto import tqdm
 
 import leapnav
-from leapnav.envs.families import FAMILIES, sample_scenario
+from leapnav.envs.families import check_family, sample_scenario
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.demonstrations import (
@@ -100,8 +100,7 @@ def rollout(
         ModuleNotFoundError: `dask` without the extra `cluster`.
 
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family: expected one of {', '.join(FAMILIES)}, got {family!r}")
+    check_family(family)
     for name, value, least in (
         ("count", count, 1),
         ("recoveries", recoveries, 0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from leapnav.bank_commands import Build, Show
+from leapnav.evaluate_commands import Evaluate, Report
 from leapnav.outputs import check_outputs
-from leapnav.training.config import CloningConfig
+from leapnav.train_commands import TrainCommand, train_command
 from leapnav.watch import Watch
 
 if TYPE_CHECKING:
@@ -160,97 +161,6 @@ class Rollout:
 
 
 @dataclass(frozen=True)
-class Train:
-    """Train a policy on demonstrations. "bc": behaviour cloning."""
-
-    algorithm: tyro.conf.Positional[Literal["bc"]]
-    """Learning algorithm."""
-    demos: Path
-    """Folder that `leapnav rollout` wrote."""
-    out: Path
-    """New folder for the policy."""
-    cloning: Annotated[CloningConfig, tyro.conf.arg(name="")] = field(default_factory=CloningConfig)
-    """Settings of the fit."""
-
-    def run(self) -> int:
-        """Trains and saves."""
-        import gymnasium as gym
-
-        from leapnav.experts.demonstrations import load_demonstrations
-        from leapnav.training.cloning import behaviour_clone
-        from leapnav.training.policies import make_policy, save_policy
-
-        if self.out.exists():
-            raise FileExistsError(f"{self.out}: exists; choose another folder or remove it")
-        demonstrations = load_demonstrations(self.demos)
-        env = gym.make("leapnav/Navigate-v0")
-        policy = make_policy(env.observation_space, env.action_space, seed=self.cloning.seed)
-        losses = behaviour_clone(policy, demonstrations, self.cloning)
-        save_policy(policy, self.out, {"id": "leapnav/Navigate-v0"})
-        print(f"wrote {self.out}: validation loss {losses[-1].validation:.4f} after {len(losses)} epochs")
-        return 0
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Score policies against the optimum, on scenarios that they have never seen."""
-
-    policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...")]
-    """Folders of policies, or "expert", or "random"."""
-    references: Path | None = None
-    """Demonstrations of the test scenarios (from `leapnav rollout`); without it, --count scenarios are solved first."""
-    family: str = "clutter"
-    """Family of the scenarios."""
-    count: int = 200
-    """How many scenarios."""
-    seed: int = 1_000_000
-    """Scenario i has seed SEED + i. Keep it away from the training's."""
-    workers: int = os.cpu_count() or 1
-    """Processes that solve the scenarios."""
-    json: Path | None = None
-    """Write the table and every episode."""
-    plot: Path | None = None
-    """Write a picture of the first policy's first episodes."""
-
-    def run(self) -> int:
-        """Plays and reports."""
-        from tempfile import TemporaryDirectory
-
-        from leapnav.experts.demonstrations import load_demonstrations
-        from leapnav.experts.rollouts import rollout
-        from leapnav.training.evaluation import evaluate
-        from leapnav.training.reports import plot_gallery, print_scores, write_scores
-
-        if not self.policies:
-            raise ValueError("policies: name at least one folder, or expert, or random")
-        repeated = {name for name in self.policies if self.policies.count(name) > 1}
-        if repeated:
-            raise ValueError(f"policies: {sorted(repeated)[0]}: named more than once")
-        check_outputs(self.json, self.plot)
-        for name in self.policies:  # before minutes are spent on the references
-            if name not in ("expert", "random") and not (Path(name) / "policy.json").is_file():
-                raise FileNotFoundError(
-                    f"policies: {name}: no policy.json there; expected a policy's folder, expert or random"
-                )
-        if self.references is not None:
-            references = load_demonstrations(self.references)
-        else:
-            with TemporaryDirectory() as scratch:
-                folder = Path(scratch) / "references"
-                rollout(self.family, self.count, folder, seed=self.seed, workers=self.workers)
-                references = load_demonstrations(folder)
-        scores, episodes = evaluate(self.policies, references)
-        print_scores(scores)
-        if self.json is not None:
-            write_scores(scores, episodes, self.json)
-            print(f"wrote {self.json}")
-        if self.plot is not None:
-            plot_gallery(references[:8], episodes[self.policies[0]][:8], self.plot)
-            print(f"wrote {self.plot}")
-        return 0
-
-
-@dataclass(frozen=True)
 class Demo:
     """The whole way on clutter scenarios: optima, demonstrations, a clone, and its score against the optimum."""
 
@@ -282,8 +192,9 @@ COMMANDS = {
     "solve": Solve,
     "bank": Bank,
     "rollout": Rollout,
-    "train": Train,
+    "train": TrainCommand,  # `main` puts one in its place that knows the defaults of the family
     "evaluate": Evaluate,
+    "report": Report,
     "watch": Watch,
     "demo": Demo,
 }
@@ -291,8 +202,10 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code; bad input is one line on standard error and exit code 2."""
-    command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="leapnav", description=DESCRIPTION, args=arguments)
+    words = sys.argv[1:] if arguments is None else arguments
     try:
+        commands = {**COMMANDS, "train": train_command(words)}
+        command = tyro.extras.subcommand_cli_from_dict(commands, prog="leapnav", description=DESCRIPTION, args=words)
         return command.run()
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)

@@ -5,36 +5,49 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
+from leapnav.experts import ExpertPolicy
 from leapnav.experts.demonstrations import load_demonstrations
 from leapnav.experts.rollouts import rollout
 from leapnav.training import (
     CloningConfig,
-    Episode,
+    DAgger,
+    DAggerConfig,
+    Dataset,
     NavigationFeatures,
-    RandomPolicy,
     behaviour_clone,
     evaluate,
     load_policy,
     make_policy,
-    run_episodes,
+    make_vec_env,
+    network,
     save_policy,
-    score,
 )
-from leapnav.training.reports import plot_gallery, print_scores, write_scores
+from leapnav.training.actors import copy_actor, mean_action
+from leapnav.training.cloning import Cloning
 from leapnav.training.symmetries import mirror, turn_round
 
 QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)
+SMALL = (32, 32)
 
 
 @pytest.fixture(scope="module")
-def demonstrations(tmp_path_factory):
+def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("training") / "open"
     rollout("open", 40, out, seed=300, recoveries=1, workers=2, progress=False)
-    return load_demonstrations(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def demonstrations(folder):
+    return load_demonstrations(folder)
+
+
+@pytest.fixture(scope="module")
+def dataset(folder):
+    return Dataset.of(folder)
 
 
 @pytest.fixture
@@ -43,11 +56,62 @@ def env():
 
 
 @pytest.fixture(scope="module")
-def clone(demonstrations):
+def clone(dataset):
     env = NavigateEnv("open")
     policy = make_policy(env.observation_space, env.action_space, seed=0)
-    losses = behaviour_clone(policy, demonstrations, CloningConfig(epochs=60, batch_size=256), progress=False)
-    return policy, losses
+    config = CloningConfig(epochs=60, batch_size=256, patience=0)
+    return policy, behaviour_clone(policy, dataset, config, progress=False)
+
+
+def fresh(env, seed=0, hidden=SMALL):
+    return make_policy(env.observation_space, env.action_space, seed, hidden)
+
+
+def test_a_dataset_is_the_same_from_a_folder_and_from_demonstrations(demonstrations, dataset):
+    other = Dataset.of(demonstrations)
+    assert len(dataset) == len(other) == sum(len(d.actions) for d in demonstrations)
+    for name in ("observations", "actions", "returns", "costates", "states", "times", "executed", "rewards"):
+        np.testing.assert_allclose(getattr(dataset, name), getattr(other, name), atol=1e-9, err_msg=name)
+    np.testing.assert_array_equal(dataset.courses, other.courses)
+    assert (dataset.limits == [2.0, 3.0]).all()
+    assert (dataset.weights == [1.0, 0.5]).all()
+    first = demonstrations[0]
+    np.testing.assert_allclose(dataset.returns[: len(first.actions)], -first.cost_to_go[:-1])
+
+
+def test_datasets_are_joined_saved_and_loaded(dataset, tmp_path):
+    parts = dataset[:100], dataset[100:300]
+    joined = Dataset.joined(parts)
+    np.testing.assert_array_equal(joined.observations, dataset.observations[:300])
+    scenarios = [joined.scenarios[i] for i in joined.episodes]
+    assert scenarios == [dataset.scenarios[i] for i in dataset.episodes[:300]]
+    joined.save(tmp_path / "part.npz")
+    loaded = Dataset.load(tmp_path / "part.npz")
+    np.testing.assert_array_equal(loaded.costates, joined.costates)
+    assert loaded.scenarios == joined.scenarios
+    (tmp_path / "part.npz").write_bytes((tmp_path / "part.npz").read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"part\.npz: not a dataset's file"):
+        Dataset.load(tmp_path / "part.npz")
+
+
+def test_datasets_that_cannot_be_learned_from_are_refused(folder, dataset, tmp_path, env, monkeypatch):
+    import shutil
+
+    with pytest.raises(ValueError, match="expected at least one"):
+        Dataset.of([])
+    with pytest.raises(FileNotFoundError, match="expected one Minari dataset"):
+        Dataset.of(tmp_path)
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    metadata = next(other.glob("**/metadata.json"))
+    content = json.loads(metadata.read_text())
+    content["env_spec"] = content["env_spec"].replace("Navigate-v0", "Navigate-v1")
+    metadata.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"a dataset of leapnav/Navigate-v1; leapnav learns from leapnav/Navigate-v0"):
+        Dataset.of(other)
+    fewer = gym.make("leapnav/Navigate-v0", lidar_beams=16)
+    with pytest.raises(ValueError, match="its observations have 41 numbers, the policy's 25"):
+        behaviour_clone(fresh(fewer), dataset, QUICK, progress=False)
 
 
 def test_mirroring_and_turning_round_are_symmetries_of_the_environment():
@@ -100,82 +164,178 @@ def test_the_features_have_the_promised_size_and_are_finite(env):
     assert th.isfinite(features(th.as_tensor(np.stack([low, high, np.zeros_like(low)])))).all()
 
 
-def test_cloning_learns(clone, demonstrations, env):
+def test_cloning_learns(clone, env):
     policy, losses = clone
     assert losses[-1].training < 0.1 * losses[0].training
-    assert losses[-1].validation < 0.3  # of the actions' variance
-    references = demonstrations[:20]
-    learned = score("clone", run_episodes(policy, env, references, progress=False))
-    untrained = make_policy(env.observation_space, env.action_space, seed=1)
-    before = score("untrained", run_episodes(untrained, env, references, progress=False))
-    assert learned.mean_return.value > before.mean_return.value + 10
+    assert losses[-1].validation < 0.3  # of what the mean action loses
+    learned = evaluate(policy, "open", count=20, timed=False, progress=False)
+    before = evaluate(fresh(env), "open", count=20, timed=False, progress=False)
+    assert np.mean([e.episode_return for e in learned]) > np.mean([e.episode_return for e in before]) + 10
 
 
 def test_the_noise_of_a_clone_is_the_error_that_remains(clone):
-    policy, _ = clone
-    assert th.all(policy.log_std.exp() < 0.2)
+    assert th.all(clone[0].log_std.exp() < 0.2)
 
 
-def test_the_same_seed_gives_the_same_weights(demonstrations, env):
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3])
+def test_the_actors_of_all_algorithms_can_be_cloned(algorithm, dataset, env):
+    model = algorithm("MlpPolicy", env, policy_kwargs=network(SMALL), seed=0, device="cpu")
+    losses = behaviour_clone(model, dataset, CloningConfig(epochs=6, batch_size=256), progress=False)
+    assert losses[-1].training < 0.5 * losses[0].training
+    inputs = th.as_tensor(dataset.observations[:50])
+    with th.no_grad():
+        expected = mean_action(model.policy, inputs).clamp(-1, 1).numpy()
+    found, _ = model.predict(dataset.observations[:50], deterministic=True)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_model_without_an_actor_is_refused(dataset):
+    with pytest.raises(TypeError, match="expected one of Stable-Baselines3 or its policy, got int"):
+        behaviour_clone(3, dataset, QUICK)
+
+
+def test_the_same_seed_gives_the_same_weights(dataset, env):
     weights = []
     for _ in range(2):
-        policy = make_policy(env.observation_space, env.action_space, seed=3)
-        behaviour_clone(policy, demonstrations[:10], QUICK, progress=False)
+        policy = fresh(env, seed=3)
+        behaviour_clone(policy, dataset[:2000], QUICK, progress=False)
         weights.append(policy.parameters_to_vector())
         th.rand(5)  # the global generator plays no part
     assert weights[0].tobytes() == weights[1].tobytes()
 
 
-def test_making_and_cloning_leave_the_global_generators_alone(demonstrations, env):
+def test_making_and_cloning_leave_the_global_generators_alone(dataset, env):
     th.manual_seed(0)
     np.random.seed(0)
     torch_before, numpy_before = th.get_rng_state().clone(), np.random.get_state()[1].copy()
-    behaviour_clone(make_policy(env.observation_space, env.action_space), demonstrations[:5], QUICK, progress=False)
+    behaviour_clone(fresh(env), dataset[:1000], QUICK, progress=False)
     assert th.equal(torch_before, th.get_rng_state())
     assert np.array_equal(numpy_before, np.random.get_state()[1])
 
 
-def test_no_course_is_in_both_training_and_validation(demonstrations):
+def test_no_course_is_in_both_training_and_validation(dataset):
     from leapnav.training.cloning import _split
 
-    train, held_out = _split(demonstrations, CloningConfig(validation_share=0.25), th.Generator().manual_seed(0))
-    assert len(train) + len(held_out) == len(demonstrations)
-    assert not {d.scenario.goal for d in train} & {d.scenario.goal for d in held_out}
+    train, held_out = _split(dataset, 0.25, th.Generator().manual_seed(0))
+    assert train.sum() + held_out.sum() == len(dataset)
+    assert held_out.any()
+    assert not set(dataset.courses[train]) & set(dataset.courses[held_out])
+
+
+def test_cloning_stops_early_and_keeps_the_best_epoch(dataset, env):
+    policy = fresh(env)
+    # A learning rate at which the loss soon rises.
+    config = CloningConfig(epochs=50, patience=2, batch_size=64, learning_rate=0.05, validation_share=0.3)
+    fit = Cloning(policy, dataset[:1500], config)
+    while not fit.finished:
+        fit.run_epoch()
+    validation = [loss.validation for loss in fit.losses]
+    assert len(validation) < 50
+    assert min(validation[:-2]) <= min(validation[-2:])
+    fit.finish()
+    assert fit._validation() == pytest.approx(min(validation), rel=1e-5)
+
+
+def test_a_fit_that_was_put_aside_goes_on_to_the_same_bits(dataset, env):
+    config = CloningConfig(epochs=4, batch_size=256)
+    straight, first, second = fresh(env), fresh(env), fresh(env, seed=9)
+    behaviour_clone(straight, dataset, config, progress=False)
+    begun = Cloning(first, dataset, config)
+    begun.run_epoch()
+    begun.run_epoch()
+    state, weights = begun.state_dict(), first.state_dict()
+    resumed = Cloning(second, dataset, config)
+    second.load_state_dict(weights)
+    resumed.load_state_dict(state)
+    while not resumed.finished:
+        resumed.run_epoch()
+    resumed.finish()
+    assert second.parameters_to_vector().tobytes() == straight.parameters_to_vector().tobytes()
+
+
+def test_the_hamiltonian_loss_is_what_an_error_costs():
+    """H(q, lambda, u) - H(q, lambda, u*), written out, for optima inside the robot's limits and on them."""
+    from leapnav.training.cloning import _hamiltonian_loss, _slopes
+
+    rng = np.random.default_rng(0)
+    count, limits, weights = 200, np.array([2.0, 3.0]), np.array([1.0, 0.5])
+    heading, costates = rng.uniform(-4, 4, count), 3 * rng.normal(size=(count, 3))
+    p = np.stack([np.cos(heading) * costates[:, 0] + np.sin(heading) * costates[:, 1], costates[:, 2]], axis=1)
+    best = np.clip(-p / weights, -limits, limits)
+    assert (np.abs(best) == limits).any()
+    taken = np.clip(best + rng.normal(size=best.shape), -limits, limits)
+    extra = (0.5 * weights * (taken**2 - best**2) + p * (taken - best)).sum(axis=1)
+    dataset = Dataset(
+        observations=np.zeros((count, 41), np.float32),
+        actions=best / limits,
+        returns=np.zeros(count),
+        costates=costates,
+        states=np.stack([np.zeros(count), np.zeros(count), heading], axis=1),
+        times=np.zeros(count),
+        executed=best / limits,
+        rewards=np.zeros(count),
+        episodes=np.zeros(count, dtype=int),
+        scenarios=(sample_scenario("open", 1).to_json(),),
+    )
+    error = th.as_tensor((taken - best) / limits)
+    loss = _hamiltonian_loss(error, th.as_tensor(_slopes(dataset)), th.as_tensor(weights * limits**2))
+    assert loss.sum(dim=1).numpy() == pytest.approx(extra, abs=1e-9)
+
+
+def test_cloning_by_the_hamiltonian_learns(dataset, env):
+    losses = behaviour_clone(
+        fresh(env), dataset, CloningConfig(epochs=8, batch_size=256, loss="hamiltonian"), progress=False
+    )
+    assert losses[-1].validation < 0.3 < losses[0].validation
 
 
 def test_ppo_can_go_on_from_a_clone(clone, env):
-    policy, _ = clone
-    model = PPO(
-        ActorCriticPolicy,
-        env,
-        n_steps=64,
-        batch_size=64,
-        policy_kwargs={
-            "net_arch": policy.net_arch,
-            "activation_fn": policy.activation_fn,
-            "features_extractor_class": NavigationFeatures,
-        },
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, policy_kwargs=network())
+    copy_actor(clone[0], model.policy)
+    observation, _ = env.reset(seed=0)
+    assert model.predict(observation, deterministic=True)[0] == pytest.approx(
+        clone[0].predict(observation, deterministic=True)[0], abs=1e-6
     )
-    model.policy.load_state_dict(policy.state_dict())
     model.learn(64)
+    with pytest.raises(ValueError, match="its network has the shapes"):
+        copy_actor(clone[0], fresh(env))
 
 
-def test_a_saved_policy_acts_the_same(clone, env, tmp_path):
-    policy, _ = clone
-    save_policy(policy, tmp_path / "policy", {"id": "leapnav/Navigate-v0"})
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_a_saved_policy_acts_the_same(algorithm, env, tmp_path):
+    model = algorithm("MlpPolicy", env, policy_kwargs=network(SMALL), seed=0, device="cpu")
+    save_policy(model, tmp_path / "policy")
     loaded = load_policy(tmp_path / "policy", env)
     for seed in range(5):
         observation, _ = env.reset(seed=seed)
         assert np.array_equal(
-            policy.predict(observation, deterministic=True)[0], loaded.predict(observation, deterministic=True)[0]
+            model.predict(observation, deterministic=True)[0], loaded.predict(observation, deterministic=True)[0]
         )
 
 
-def test_broken_and_foreign_policies_are_refused(clone, env, tmp_path):
-    policy, _ = clone
-    save_policy(policy, tmp_path, {"id": "leapnav/Navigate-v0"})
-    with pytest.raises(ValueError, match="the policy observes 41 numbers with other bounds"):
+def test_half_precision_keeps_the_actor(clone, env, tmp_path):
+    save_policy(clone[0], tmp_path / "whole")
+    save_policy(clone[0], tmp_path / "half", half=True)
+    sizes = [(tmp_path / name / "weights.pt").stat().st_size for name in ("whole", "half")]
+    assert sizes[1] < 0.3 * sizes[0]
+    loaded = load_policy(tmp_path / "half", env)
+    observation, _ = env.reset(seed=0)
+    assert loaded.predict(observation, deterministic=True)[0] == pytest.approx(
+        clone[0].predict(observation, deterministic=True)[0], abs=0.01
+    )
+
+
+def test_a_policy_with_another_network_is_not_saved(env, tmp_path):
+    with pytest.raises(ValueError, match=r"policy_kwargs=leapnav\.training\.network\(\)"):
+        save_policy(PPO("MlpPolicy", env), tmp_path)
+
+
+def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
+    save_policy(clone[0], tmp_path)
+    with pytest.raises(ValueError, match=r"observes another environment than this one: lidar_beams=32 \(here 16\)"):
         load_policy(tmp_path, gym.make("leapnav/Navigate-v0", lidar_beams=16))
+    with pytest.raises(ValueError, match=r"actuation='velocity' \(here 'motor'\)"):
+        load_policy(tmp_path, gym.make("leapnav/Navigate-v0", actuation="motor"))
     weights = (tmp_path / "weights.pt").read_bytes()
     (tmp_path / "weights.pt").write_bytes(weights[:1000])
     with pytest.raises(ValueError, match=r"weights\.pt: not this policy's weights"):
@@ -184,12 +344,18 @@ def test_broken_and_foreign_policies_are_refused(clone, env, tmp_path):
     with pytest.raises(FileNotFoundError):
         load_policy(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
-    (tmp_path / "policy.json").write_text(json.dumps({**description, "format": 99}))
-    with pytest.raises(ValueError, match="format: expected 1, got 99"):
-        load_policy(tmp_path)
-    (tmp_path / "policy.json").write_text("{}")
-    with pytest.raises(ValueError, match="not a policy's description"):
-        load_policy(tmp_path)
+    faults = [
+        ({**description, "format": 99}, "format: expected 2, got 99"),
+        ({}, "not a policy's description"),
+        ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
+        ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, tqc, got 'dqn'"),
+        ({**description, "hidden": ["wide"]}, "not a policy's description"),
+        ({**description, "observation_low": [0.0]}, "not a policy's description"),
+    ]
+    for content, message in faults:
+        (tmp_path / "policy.json").write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=message):
+            load_policy(tmp_path)
 
 
 def test_loading_a_policy_executes_nothing(clone, tmp_path):
@@ -200,80 +366,11 @@ def test_loading_a_policy_executes_nothing(clone, tmp_path):
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "executed"),)
 
-    save_policy(clone[0], tmp_path, {})
+    save_policy(clone[0], tmp_path)
     (tmp_path / "weights.pt").write_bytes(pickle.dumps(Evil()))
     with pytest.raises(ValueError, match="not this policy's weights"):
         load_policy(tmp_path)
     assert not (tmp_path / "executed").exists()
-
-
-def test_the_expert_scores_one_and_random_zero(demonstrations):
-    scores, episodes = evaluate(["expert", "random"], demonstrations[:10], progress=False)
-    expert, random = scores
-    assert expert.success.value == 1.0
-    assert expert.soc.value == pytest.approx(1.0, abs=1e-3)
-    assert abs(expert.regret.value) < 1e-3
-    assert random.success.value == 0.0
-    assert random.soc.value == 0.0
-    assert math.isnan(random.regret.value)
-    assert len(episodes["expert"]) == 10
-
-
-def test_evaluation_is_deterministic(demonstrations):
-    one, other = (evaluate(["random"], demonstrations[:5], seed=4, progress=False)[0] for _ in range(2))
-    assert str(one) == str(other)
-
-
-def test_regret_allows_for_the_pose_that_was_reached(demonstrations, env):
-    """A policy that stops short saves cost; the reference for the pose reached must follow to first order."""
-    reference = demonstrations[0]
-
-    class Slow:
-        def __init__(self):
-            self.step = 0
-
-        def predict(self, observation, state=None, episode_start=None, deterministic=False):
-            if episode_start[0]:
-                self.step = 0
-            action = reference.actions[self.step] * np.array([0.995, 1.0], np.float32)
-            self.step += 1
-            return action, state
-
-    episode = run_episodes(Slow(), env, [reference], progress=False)[0]
-    assert episode.cost < reference.reference_cost
-    assert abs(episode.cost - reference.reference_cost) > 1e-3
-    assert abs(episode.regret) < 1e-3
-
-
-def episode(success=True, collision=False, cost=2.0, reference=1.0):
-    return Episode("s", success, collision, cost, -cost, reference, reference, np.zeros((2, 3)))
-
-
-def test_the_score_is_what_its_definition_says():
-    episodes = [episode(cost=1.0), episode(cost=2.0), episode(cost=4.0), episode(success=False, collision=True)]
-    found = score("policy", episodes)
-    assert found.success.value == 0.75
-    assert found.collision.value == 0.25
-    assert found.soc.value == pytest.approx((1 + 1 / 2 + 1 / 4 + 0) / 4)
-    assert found.regret.value == 1.0
-    assert found.mean_return.value == -(1 + 2 + 4 + 2) / 4
-    assert found.success.low < 0.75 < found.success.high
-
-
-def test_bootstrap_intervals_cover_the_truth():
-    rng = np.random.default_rng(0)
-    hits = 0
-    for trial in range(40):
-        episodes = [episode(success=bool(s)) for s in rng.random(100) < 0.7]
-        interval = score("policy", episodes, seed=trial).success
-        hits += interval.low <= 0.7 <= interval.high
-    assert hits >= 33  # 95 % of 40 is 38
-
-
-def test_one_episode_and_none():
-    assert score("policy", [episode()]).success.low == 1.0
-    with pytest.raises(ValueError, match="episodes: expected at least one"):
-        score("policy", [])
 
 
 @pytest.mark.parametrize(
@@ -284,30 +381,57 @@ def test_one_episode_and_none():
         ({"validation_share": 1.0}, "validation_share"),
         ({"learning_rate": math.inf}, "learning_rate: .*inf"),
         ({"seed": 10**20}, "seed: "),
+        ({"patience": -1}, "patience: .*-1"),
+        ({"loss": "l3"}, "loss: expected action or hamiltonian, got 'l3'"),
     ],
 )
-def test_bad_settings_are_named(settings, message, demonstrations, env):
-    policy = make_policy(env.observation_space, env.action_space)
+def test_bad_settings_are_named(settings, message, dataset, env):
     with pytest.raises(ValueError, match=message):
-        behaviour_clone(policy, demonstrations, CloningConfig(**settings), progress=False)
-    with pytest.raises(ValueError, match="demonstrations: expected at least one"):
-        behaviour_clone(policy, [], progress=False)
+        behaviour_clone(fresh(env), dataset, CloningConfig(**settings), progress=False)
 
 
-def test_a_random_policy_repeats_itself_for_the_same_seed(env):
-    one, other = RandomPolicy(env.action_space, 3), RandomPolicy(gym.make("leapnav/Navigate-v0").action_space, 3)
-    assert np.array_equal(one.predict(np.zeros(41))[0], other.predict(np.zeros(41))[0])
+def test_dagger_labels_what_the_learner_sees(dataset, env, tmp_path):
+    """The labels are the expert's at the learner's states, with value and costate; rounds are kept on disk."""
+    policy = fresh(env)
+    behaviour_clone(policy, dataset, QUICK, progress=False)
+    venv = make_vec_env(n_envs=4, family="open", split="fresh")
+    config = DAggerConfig(rounds=2, steps=60, expert_share=0.5)
+    dagger = DAgger(
+        policy, ExpertPolicy(venv), venv, config, cloning=QUICK, dataset=dataset, folder=tmp_path / "rounds"
+    )
+    rounds = dagger.run(progress=False)
+    assert [done.number for done in rounds] == [1, 2]
+    assert len(dagger.dataset) == len(dataset) + sum(done.samples for done in rounds)
+    kept = Dataset.load(tmp_path / "rounds" / "round-001.npz")
+    assert len(kept) == rounds[0].samples
+    for i in (0, len(kept) // 2, len(kept) - 1):
+        scenario = Scenario.from_json(kept.scenarios[kept.episodes[i]])
+        rest = scenario.model_copy(
+            update={"start": tuple(kept.states[i].tolist()), "horizon": scenario.horizon - float(kept.times[i])}
+        )
+        one = NavigateEnv(scenario=rest)
+        observation, _ = one.reset()
+        assert observation == pytest.approx(kept.observations[i], abs=1e-4)
+        expert = ExpertPolicy(one)
+        assert expert.predict(observation)[0] == pytest.approx(kept.actions[i], abs=2e-2)
+        assert -expert.value() == pytest.approx(kept.returns[i], rel=1e-4)
+        assert expert.costate() == pytest.approx(kept.costates[i], abs=1e-2 * max(1, np.abs(kept.costates[i]).max()))
+        assert scenario.horizon - kept.times[i] >= config.forgiven
 
 
-def test_reports_are_written(demonstrations, tmp_path, capsys):
-    scores, episodes = evaluate(["expert", "random"], demonstrations[:4], progress=False)
-    print_scores(scores)
-    printed = capsys.readouterr().out
-    assert "expert" in printed
-    assert "100.0" in printed
-    write_scores(scores, episodes, tmp_path / "scores.json")
-    content = json.loads((tmp_path / "scores.json").read_text())
-    assert content["scores"][1]["regret"]["value"] is None
-    assert content["episodes"]["expert"][0]["success"] is True
-    plot_gallery(demonstrations[:4], episodes["random"], tmp_path / "episodes.png")
-    assert (tmp_path / "episodes.png").read_bytes()[:4] == b"\x89PNG"
+def test_dagger_with_the_same_seed_is_the_same(dataset, env):
+    weights = []
+    for _ in range(2):
+        policy = fresh(env)
+        venv = make_vec_env(n_envs=2, family="open", split="fresh")
+        config = DAggerConfig(rounds=1, steps=20, seed=4)
+        DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK).run(progress=False)
+        weights.append(policy.parameters_to_vector())
+    assert weights[0].tobytes() == weights[1].tobytes()
+
+
+@pytest.mark.parametrize("settings", [{"rounds": 0}, {"expert_share": 1.5}, {"learning_rate": -1.0}])
+def test_bad_settings_of_dagger_are_named(settings, env):
+    venv = make_vec_env(n_envs=1, family="open", split="fresh")
+    with pytest.raises(ValueError, match=f"{next(iter(settings))}: "):
+        DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(**settings))

@@ -4,48 +4,89 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from leapnav.training.baselines import GoToGoal, RandomPolicy
     from leapnav.training.cloning import EpochLoss, behaviour_clone
-    from leapnav.training.config import CloningConfig
-    from leapnav.training.evaluation import (
-        Episode,
-        Interval,
-        Policy,
-        RandomPolicy,
-        Score,
-        evaluate,
-        run_episodes,
-        score,
+    from leapnav.training.config import (
+        BCConfig,
+        CloningConfig,
+        DAggerConfig,
+        DAggerRunConfig,
+        PPOConfig,
+        SACConfig,
+        WarmStartConfig,
     )
-    from leapnav.training.policies import NavigationFeatures, load_policy, make_policy, save_policy
+    from leapnav.training.dagger import DAgger
+    from leapnav.training.dataset import Dataset
+    from leapnav.training.evaluation import Episode, Evaluation, Policy, evaluate
+    from leapnav.training.html_report import write_report
+    from leapnav.training.imitation import train_bc, train_dagger
+    from leapnav.training.policies import NavigationFeatures, load_policy, make_policy, network, save_policy
+    from leapnav.training.reinforcement import train_ppo, train_sac
+    from leapnav.training.scores import Interval, Score, profile, score
     from leapnav.training.vec_env import NavigateVecEnv, make_vec_env
+    from leapnav.training.warm_start import WarmStart, warm_start
 
 __all__ = [
+    "BCConfig",
     "CloningConfig",
+    "DAgger",
+    "DAggerConfig",
+    "DAggerRunConfig",
+    "Dataset",
     "Episode",
     "EpochLoss",
+    "Evaluation",
+    "GoToGoal",
     "Interval",
     "NavigateVecEnv",
     "NavigationFeatures",
+    "PPOConfig",
     "Policy",
     "RandomPolicy",
+    "SACConfig",
     "Score",
+    "WarmStart",
+    "WarmStartConfig",
     "behaviour_clone",
     "evaluate",
     "load_policy",
     "make_policy",
     "make_vec_env",
-    "run_episodes",
+    "network",
+    "profile",
     "save_policy",
     "score",
+    "train_bc",
+    "train_dagger",
+    "train_ppo",
+    "train_sac",
+    "warm_start",
+    "write_report",
 ]
 
 # Loaded when first used: torch takes seconds, which `leapnav solve` and `leapnav --help` need not spend.
 _MODULES = {
+    "baselines": ("GoToGoal", "RandomPolicy"),
     "cloning": ("EpochLoss", "behaviour_clone"),
-    "config": ("CloningConfig",),
-    "evaluation": ("Episode", "Interval", "Policy", "RandomPolicy", "Score", "evaluate", "run_episodes", "score"),
-    "policies": ("NavigationFeatures", "load_policy", "make_policy", "save_policy"),
+    "config": (
+        "BCConfig",
+        "CloningConfig",
+        "DAggerConfig",
+        "DAggerRunConfig",
+        "PPOConfig",
+        "SACConfig",
+        "WarmStartConfig",
+    ),
+    "dagger": ("DAgger",),
+    "dataset": ("Dataset",),
+    "evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
+    "policies": ("NavigationFeatures", "load_policy", "make_policy", "network", "save_policy"),
+    "html_report": ("write_report",),
+    "imitation": ("train_bc", "train_dagger"),
+    "reinforcement": ("train_ppo", "train_sac"),
+    "scores": ("Interval", "Score", "profile", "score"),
     "vec_env": ("NavigateVecEnv", "make_vec_env"),
+    "warm_start": ("WarmStart", "warm_start"),
 }
 
 

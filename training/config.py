@@ -2,24 +2,288 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import tomllib
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, Self
+
+# Of the runs, by the name of their class; "-warm" for warm starts; in a table of its own what holds for a family alone.
+_DEFAULTS: dict[str, Any] = tomllib.loads(files("leapnav.training").joinpath("defaults.toml").read_text())
 
 
 @dataclass(frozen=True)
 class CloningConfig:
     """Settings of behaviour cloning."""
 
-    epochs: int = 12
-    """Passes over the demonstrations."""
-    batch_size: int = 1024
+    epochs: int = 20
+    """Passes over the samples, at most."""
+    patience: int = 5
+    """Stop after so many epochs without a lower validation loss; 0: never. The best epoch's weights are kept."""
+    batch_size: int = 2048
     """Samples per gradient step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Peak of the learning rate, which then falls to zero along a cosine."""
     weight_decay: float = 1e-4
     """Of AdamW."""
     validation_share: float = 0.05
-    """Share of the scenarios that is held out to measure the loss."""
+    """Share of the obstacle courses that is held out to measure the loss."""
+    loss: Literal["action", "hamiltonian"] = "action"
+    """"action": Huber's loss of the error, each component in units of its spread; "hamiltonian": what the error costs
+    per second, H(q, lambda, u) - H(q, lambda, u*) with the expert's costate."""
     augment: bool = True
-    """Use the mirrored and the turned-round twin of each sample too."""
+    """Use the mirrored and the turned-round twins of the samples too."""
     seed: int = 0
     """Of the split, the order of the samples and the twins."""
+
+
+@dataclass(frozen=True)
+class DAggerConfig:
+    """Settings of dataset aggregation."""
+
+    rounds: int = 16
+    """How often the learner drives and the expert labels what it sees."""
+    steps: int = 400
+    """Control periods of each robot in a round."""
+    expert_share: float = 0.5
+    """Share of the first round's episodes that the expert drives; the others the learner."""
+    expert_decay: float = 0.5
+    """Factor of that share from round to round."""
+    epochs: int = 1
+    """Passes over all samples after each round but the last."""
+    learning_rate: float = 5e-4
+    """Peak of the learning rate after each round but the last."""
+    forgiven: float = 0.5
+    """s before the horizon from which on labels are dropped: there the expert corrects what the tolerance forgives,
+    ever more violently, and the demonstrations show how to arrive."""
+    seed: int = 0
+    """Of the scenarios and of who drives."""
+
+
+@dataclass(frozen=True)
+class WarmStartConfig:
+    """Settings of a warm start; each part can be left out."""
+
+    actor: bool = True
+    """Clone the expert's actions."""
+    critic: bool = True
+    """Fit the critic to the expert's cost-to-go."""
+    gradient: bool = True
+    """Fit the critic's gradient to the costate too."""
+    critic_epochs: int = 3
+    """Passes over the samples, for the critic."""
+    critic_learning_rate: float = 1e-3
+    """Peak of the critic's learning rate, which then falls to zero along a cosine."""
+    critic_batch_size: int = 4096
+    """Samples per gradient step, for the critic."""
+    gradient_weight: float = 0.3
+    """Of the error of the gradient, beside that of the value, each in units of its spread."""
+    slopes: int = 200_000
+    """How many samples the gradient is fitted at."""
+    seed: int = 0
+    """Of the order of the samples and of the directions of the gradient."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """What all training runs have in common."""
+
+    out: Path
+    """Folder of the run: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
+    family: str = "clutter"
+    """Family of the scenarios: open, clutter, polygons, rooms, slalom or all."""
+    seed: int = 0
+    """Of everything that is random."""
+    resume: bool = False
+    """Go on with the run that the folder holds."""
+    hidden: tuple[int, ...] = (256, 256, 256)
+    """Widths of the actor's and the critic's hidden layers."""
+    evaluation_scenarios: int = 100
+    """Scenarios of each family's test split that an evaluation on the way plays; the last one plays all."""
+
+    @classmethod
+    def tuned(cls, family: str, *, warm: bool = False, **changes: Any) -> Self:
+        """The settings that were tuned for a family, from the file `defaults.toml`, with changes.
+
+        Args:
+            family: one of the families, or "all".
+            warm: whether those for a warm start.
+            changes: of any settings.
+
+        """
+        config = cls(out=Path(), family=family)
+        for section in (cls.__name__, f"{cls.__name__}-warm")[: 2 if warm else 1]:
+            table = _DEFAULTS.get(section, {})
+            common = {name: value for name, value in table.items() if not isinstance(value, dict)}
+            config = replace(config, **common, **table.get(family, {}))
+        return replace(config, **changes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BCConfig(RunConfig):
+    """Clone the expert: a policy fitted to its demonstrations."""
+
+    demos: tuple[Path, ...] = ()
+    """Folders that `leapnav rollout` wrote; without any, demonstrations are made first, in the run's folder."""
+    scenarios: int = 10_000
+    """How many scenarios are demonstrated if none are given."""
+    cloning: CloningConfig = field(default_factory=CloningConfig)
+    """Settings of the fit; its seed is the run's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DAggerRunConfig(RunConfig):
+    """Dataset aggregation: the learner drives, the expert says what it would have done there."""
+
+    demos: tuple[Path, ...] = ()
+    """Folders that `leapnav rollout` wrote, for the clone that is the first learner and among the samples; without any,
+    demonstrations are made first, in the run's folder."""
+    scenarios: int = 10_000
+    """How many scenarios are demonstrated if none are given."""
+    policy: Path | None = None
+    """A policy that is the first learner instead of a new clone."""
+    n_envs: int = 128
+    """Robots that drive at once."""
+    cloning: CloningConfig = field(default_factory=CloningConfig)
+    """Settings of the first clone and of the last fit; its seed is the run's."""
+    dagger: DAggerConfig = field(default_factory=DAggerConfig)
+    """Settings of the aggregation; its seed is the run's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LearnerConfig(RunConfig):
+    """What the runs of reinforcement learning have in common."""
+
+    total_timesteps: int
+    """Control periods of all robots together."""
+    n_envs: int
+    """Robots that drive at once."""
+    learning_rate: float
+    """At first; it falls to zero along a line."""
+    gamma: float
+    """Discount factor. The horizon is finite and observed, so 1 is possible, and the critic's values are minus the
+    costs to go then."""
+    reward: Literal["cost", "shaped"]
+    """Reward of the environment; "shaped" tells on the way how near the goal is."""
+    reward_scale: float = 0.1
+    """Factor of the rewards."""
+    warm_start: tuple[Path, ...] = ()
+    """Demonstrations (folders that `leapnav rollout` wrote) and at most one policy (a run's folder) to start from: the
+    actor is a clone of the demonstrations, or the policy's; the critic is fitted to the demonstrations."""
+    start: WarmStartConfig = field(default_factory=WarmStartConfig)
+    """Settings of the warm start; its seed is the run's."""
+    cloning: CloningConfig = field(default_factory=CloningConfig)
+    """Settings of the clone that a warm start makes; its seed is the run's."""
+    jump_start: float = 0.0
+    """Share of an episode's time that the expert drives at most, at first; it falls to zero along a line. 0: none."""
+    jump_start_until: float = 0.5
+    """Share of the steps after which the expert drives no more."""
+    evaluate_every: int = 200_000
+    """Steps between evaluations."""
+    checkpoint_every: int = 200_000
+    """Steps between checkpoints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(_LearnerConfig):
+    """Proximal policy optimisation, from scratch or from a warm start."""
+
+    total_timesteps: int = 5_000_000
+    """Control periods of all robots together."""
+    n_envs: int = 128
+    """Robots that drive at once."""
+    learning_rate: float = 3e-4
+    """At first; it falls to zero along a line."""
+    gamma: float = 1.0
+    """Discount factor. The horizon is finite and observed, so 1 is possible, and the critic's values are minus the
+    costs to go then."""
+    reward: Literal["cost", "shaped"] = "shaped"
+    """Reward of the environment; "shaped" tells on the way how near the goal is."""
+    n_steps: int = 128
+    """Control periods of each robot between two updates."""
+    batch_size: int = 2048
+    """Samples per gradient step."""
+    n_epochs: int = 6
+    """Passes over the samples of an update."""
+    gae_lambda: float = 0.95
+    """Of the generalised advantage estimate."""
+    clip_range: float = 0.2
+    """Of the ratio of likelihoods."""
+    ent_coef: float = 0.0
+    """Weight of the entropy."""
+    std: float = 0.5
+    """Standard deviation of the actions at first."""
+    divergence: float = 0.0
+    """Weight of the divergence from the clone, at first; it falls to zero along a line. 0: none."""
+    divergence_until: float = 0.5
+    """Share of the steps after which the divergence does not count any more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(_LearnerConfig):
+    """Soft actor-critic, or its variant with truncated quantile critics, from scratch or from a warm start."""
+
+    algorithm: Literal["sac", "tqc"] = "sac"
+    """"tqc" needs the extra `contrib`."""
+    total_timesteps: int = 200_000
+    """Control periods of all robots together."""
+    n_envs: int = 16
+    """Robots that drive at once."""
+    learning_rate: float = 3e-4
+    """At first; it falls to zero along a line."""
+    gamma: float = 0.99
+    """Discount factor."""
+    reward: Literal["cost", "shaped"] = "shaped"
+    """Reward of the environment; "shaped" tells on the way how near the goal is."""
+    batch_size: int = 512
+    """Samples per gradient step."""
+    gradient_steps: int = 4
+    """Per control period of all robots."""
+    buffer_size: int = 500_000
+    """Transitions that are remembered."""
+    learning_starts: int = 5_000
+    """Steps before the first gradient step; without a warm start the actions are random until then."""
+    ent_coef: str = "auto_0.01"
+    """Weight of the entropy: a number, or "auto" with the first value."""
+    demonstrations: float = 0.25
+    """Share of each batch that is demonstrations, if a warm start has some."""
+    evaluate_every: int = 20_000
+    """Steps between evaluations."""
+    checkpoint_every: int = 50_000
+    """Steps between checkpoints."""
+
+
+ALGORITHMS: dict[str, type[RunConfig]] = {
+    "bc": BCConfig,
+    "dagger": DAggerRunConfig,
+    "ppo": PPOConfig,
+    "sac": SACConfig,
+}
+
+
+def read_config(folder: Path) -> tuple[str, RunConfig]:
+    """The algorithm and the configuration of the run in a folder.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged.
+
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    record = folder / "config.json"
+    if not record.is_file():
+        raise FileNotFoundError(f"{record}: there is no run in this folder")
+    try:
+        found = json.loads(record.read_text())["config"]
+        algorithm = {"tqc": "sac"}.get(found["algorithm"], found["algorithm"])
+        return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
+            {name: value for name, value in found.items() if name != "algorithm" or algorithm == "sac"}
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{record}: {name}: {first['msg']}, got {first['input']!r}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{record}: not a run's configuration: {error!r}") from None

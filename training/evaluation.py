@@ -1,32 +1,35 @@
-"""The score of a policy: how often it succeeds, and how far from the optimum it is. Every policy goes through here."""
+"""A policy on the scenarios of a bank, beside their optima: what every policy goes through, the expert too."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
-import gymnasium as gym
 import numpy as np
-from scipy.stats import bootstrap
 from tqdm.auto import tqdm
 
-from leapnav.experts.demonstrations import ENVIRONMENT, Demonstration
-from leapnav.experts.policy import ExpertPolicy
-from leapnav.training.policies import load_policy
+from leapnav.envs.bank import Reference, ScenarioBank
+from leapnav.envs.families import FAMILIES
+from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenario import Scenario
+from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
+from leapnav.experts.problem import Path
+from leapnav.experts.solve import solve
 
-RESAMPLES = 2000
-CONFIDENCE = 0.95
+ROBOTS = 256  # that drive at once
+TIMED = 100  # actions whose time is taken
+REVERSING = 0.05  # m/s; an optimum that goes backwards at least this fast reverses
 
 
 class Policy(Protocol):
-    """What can be scored: anything with Stable-Baselines3's `predict`."""
+    """What can be scored: anything with Stable-Baselines3's `predict` for many observations at once."""
 
     def predict(
         self,
-        observation: np.ndarray,
+        observation: Any,
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
@@ -35,32 +38,31 @@ class Policy(Protocol):
         ...
 
 
-class RandomPolicy:
-    """Uniform random actions from a generator of its own."""
-
-    def __init__(self, action_space: gym.spaces.Space, seed: int = 0) -> None:
-        self._space = action_space
-        self._space.seed(seed)
-
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """A random action, whatever the observation."""
-        return np.asarray(self._space.sample()), state
+# One that must know the environment that it drives, as `ExpertPolicy` does, is given as a function that makes it.
+Entrant = Policy | Callable[[Any], Policy]
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
     """How a policy did on one scenario.
 
-    `reference_cost` is J* of the scenario, `reached_reference` J* for the pose that was reached, to first order:
-    J*(q) = J* - lambda(T)'(q - q_f). `states` (K + 1, 3) is the path driven.
+    Attributes:
+        family, index, scenario: which one: its family, its number in the bank, its name.
+        success, collision: how it ended.
+        cost: J that was paid.
+        episode_return: the sum of the rewards.
+        reference_cost: J* of the scenario.
+        reached_reference: J* for the pose that was reached, re-solved from the optimum's costates where the episode was
+            a success; NaN otherwise, and where no certified extremal was found.
+        clearance: m, the smallest on the way.
+        reference_clearance: m, the optimum's.
+        reversing: whether the optimum drives backwards somewhere.
+        states (K + 1, 3): the path driven.
+
     """
 
+    family: str
+    index: int
     scenario: str
     success: bool
     collision: bool
@@ -68,6 +70,9 @@ class Episode:
     episode_return: float
     reference_cost: float
     reached_reference: float
+    clearance: float
+    reference_clearance: float
+    reversing: bool
     states: np.ndarray
 
     @property
@@ -76,152 +81,199 @@ class Episode:
         return float(self.success) * self.reference_cost / max(self.cost, self.reference_cost)
 
     @property
+    def ratio(self) -> float:
+        """J / J* of a success, infinite otherwise: what a performance profile counts."""
+        return self.cost / self.reference_cost if self.success else math.inf
+
+    @property
     def regret(self) -> float:
         """(J - J*) / J*, with J* for the pose that was reached."""
         return (self.cost - self.reached_reference) / self.reached_reference
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A statistic with its 95 % bootstrap interval; NaN where there is nothing to measure."""
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A policy on a bank: its episodes in the bank's order, and the median time (ms) that it takes for one action."""
 
-    value: float
-    low: float
-    high: float
+    episodes: tuple[Episode, ...]
+    milliseconds: float
 
+    def __len__(self) -> int:
+        return len(self.episodes)
 
-@dataclass(frozen=True)
-class Score:
-    """The row of a policy: means over the episodes, regret as the median over the successes."""
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.episodes)
 
-    policy: str
-    episodes: int
-    success: Interval
-    collision: Interval
-    soc: Interval
-    regret: Interval
-    mean_return: Interval
+    @property
+    def success(self) -> float:
+        """Success rate."""
+        return float(np.mean([episode.success for episode in self.episodes]))
 
+    @property
+    def collision(self) -> float:
+        """Collision rate."""
+        return float(np.mean([episode.collision for episode in self.episodes]))
 
-def run_episodes(
-    policy: Policy,
-    env: gym.Env,
-    references: Sequence[Demonstration],
-    *,
-    label: str = "Evaluating",
-    progress: bool = True,
-) -> list[Episode]:
-    """Plays each reference's scenario once with deterministic actions.
+    @property
+    def soc(self) -> float:
+        """Mean of the success weighted by optimal cost."""
+        return float(np.mean([episode.soc for episode in self.episodes]))
 
-    Args:
-        policy: for `ExpertPolicy`, one made for this same `env`.
-        env: an environment of `leapnav/Navigate-v0`.
-        references: the expert's demonstrations of the scenarios, which carry their optimal costs.
-
-    """
-    episodes = []
-    for reference in tqdm(references, desc=label, unit="episode", disable=not progress):
-        observation, info = env.reset(options={"scenario": reference.scenario})
-        poses, total, state, start, done = [info["pose"]], 0.0, None, True, False
-        while not done:
-            action, state = policy.predict(observation, state, np.array([start]), deterministic=True)
-            observation, reward, terminated, truncated, info = env.step(action)
-            poses.append(info["pose"])
-            total += float(reward)
-            start, done = False, terminated or truncated
-        error = np.array(poses[-1]) - reference.states[-1]
-        error[2] = math.remainder(error[2], 2 * math.pi)
-        episodes.append(
-            Episode(
-                scenario=reference.scenario.name,
-                success=bool(info["is_success"]),
-                collision=bool(info["collision"]),
-                cost=float(info["cost"]),
-                episode_return=total,
-                reference_cost=reference.reference_cost,
-                reached_reference=reference.reference_cost - float(reference.costates[-1] @ error),
-                states=np.array(poses),
-            )
-        )
-    return episodes
-
-
-def score(name: str, episodes: Sequence[Episode], seed: int = 0) -> Score:
-    """The statistics of a policy's episodes, with percentile bootstrap intervals over the episodes.
-
-    Raises:
-        ValueError: there are no episodes.
-
-    """
-    if not episodes:
-        raise ValueError("episodes: expected at least one, got none")
-    rng = np.random.default_rng(seed)
-
-    def interval(values: Sequence[float], statistic: Callable[..., Any] = np.mean) -> Interval:
-        sample = np.asarray(values, dtype=float)
-        if len(sample) == 0:
-            return Interval(math.nan, math.nan, math.nan)
-        value = float(statistic(sample))
-        if len(sample) == 1 or np.ptp(sample) == 0:  # all resamples are the same
-            return Interval(value, value, value)
-        found = bootstrap(
-            (sample,), statistic, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile", rng=rng
-        ).confidence_interval
-        return Interval(value, float(found.low), float(found.high))
-
-    return Score(
-        policy=name,
-        episodes=len(episodes),
-        success=interval([e.success for e in episodes]),
-        collision=interval([e.collision for e in episodes]),
-        soc=interval([e.soc for e in episodes]),
-        regret=interval([e.regret for e in episodes if e.success], np.median),
-        mean_return=interval([e.episode_return for e in episodes]),
-    )
+    @property
+    def regret(self) -> float:
+        """Median regret of the successes, NaN without any."""
+        values = [episode.regret for episode in self.episodes if episode.success]
+        return float(np.nanmedian(values)) if values else math.nan
 
 
 def evaluate(
-    entrants: Sequence[str], references: Sequence[Demonstration], *, seed: int = 0, progress: bool = True
-) -> tuple[list[Score], dict[str, list[Episode]]]:
-    """Plays policies side by side on the same scenarios.
+    policy: Entrant,
+    bank: ScenarioBank | str = "clutter",
+    *,
+    count: int | None = None,
+    environment: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    timed: bool = True,
+    label: str = "Evaluating",
+    progress: bool = True,
+) -> Evaluation:
+    """Plays each scenario of a bank once, with deterministic actions.
+
+    The same policy, bank and seed give the same episodes.
 
     Args:
-        entrants: folders that `save_policy` wrote, or "expert" (in closed loop), or "random".
-        references: the expert's demonstrations of the scenarios.
-        seed: of the random policy and the bootstrap.
-
-    Returns:
-        A score for each entrant, and its episodes by name.
-
-    Raises:
-        FileNotFoundError, ValueError: a policy cannot be loaded, see `load_policy`.
-
-    """
-    env = gym.make(ENVIRONMENT)
-    # All are loaded before the first is played: a broken file is told at once.
-    policies = {name: load_entrant(name, env, references, seed=seed) for name in entrants}
-    episodes = {
-        name: run_episodes(policy, env, references, label=f"Evaluating {Path(name).name}", progress=progress)
-        for name, policy in policies.items()
-    }
-    return [score(name, played, seed) for name, played in episodes.items()], episodes
-
-
-def load_entrant(name: str, env: gym.Env, references: Sequence[Demonstration] = (), *, seed: int = 0) -> Policy:
-    """A policy by its name: a folder that `save_policy` wrote, or "expert", or "random".
-
-    Args:
-        name: the name.
-        env: the environment that it is to drive.
-        references: demonstrations whose optima the expert starts from; it solves other scenarios itself.
-        seed: of the random policy.
+        policy: anything with Stable-Baselines3's `predict` for many observations at once; or a function that makes one
+            for an environment, as `ExpertPolicy` does.
+        bank: a bank, or a family's name for its test split.
+        count: only so many scenarios, from the first on.
+        environment: arguments of the environment, `observation` and so on.
+        seed: of the disturbances, if the environment has any.
+        timed: whether to time single actions; otherwise `milliseconds` is NaN.
+        label: of the progress bar.
+        progress: show it.
 
     Raises:
-        FileNotFoundError, ValueError: see `load_policy`.
+        ValueError: an argument is impossible, or the policy's observations are not the environment's.
 
     """
-    if name == "expert":
-        return ExpertPolicy(env, {reference.scenario: reference.path for reference in references})
-    if name == "random":
-        return RandomPolicy(env.action_space, seed)
-    return load_policy(name, env)
+    if isinstance(bank, str):
+        if bank not in FAMILIES:
+            raise ValueError(f"bank: expected a ScenarioBank or one of {', '.join(FAMILIES)}, got {bank!r}")
+        bank = ScenarioBank.shipped(bank, "test")
+    if len(bank) == 0 or (count is not None and count < 1):
+        raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
+    settings = dict(environment or {})
+    numbers = list(range(len(bank) if count is None else min(count, len(bank))))
+    episodes: list[Episode] = []
+    with tqdm(total=len(numbers), desc=label, unit="episode", disable=not progress) as bar:
+        for first in range(0, len(numbers), ROBOTS):
+            episodes += _play(policy, bank, numbers[first : first + ROBOTS], settings, seed, bar.update)
+    return Evaluation(tuple(episodes), _time(policy, bank, settings) if timed else math.nan)
+
+
+def _play(
+    entrant: Entrant,
+    bank: ScenarioBank,
+    numbers: Sequence[int],
+    settings: Mapping[str, Any],
+    seed: int,
+    on_episode: Callable[[], Any],
+) -> list[Episode]:
+    """Plays scenarios of a bank side by side."""
+    count = len(numbers)
+    venv = NavigateVectorEnv(count, bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
+    policy = _made(entrant, venv, venv.single_observation_space)
+    observations, _ = venv.reset(seed=seed, options={"index": list(numbers)})
+    poses, totals, clearances = [venv.poses], np.zeros(count), np.full(count, np.inf)
+    found: list[Episode | None] = [None] * count
+    state, starts = None, np.ones(count, dtype=bool)
+    while any(episode is None for episode in found):
+        actions, state = policy.predict(observations, state, starts, deterministic=True)
+        observations, rewards, starts, _, infos = venv.step(actions)
+        playing = np.array([episode is None for episode in found])
+        totals += np.where(playing, rewards, 0.0)
+        ended = starts & playing
+        last = infos.get("final_info", infos)  # of the robots whose episode has ended; the others' are in `infos`
+        reached = np.where(starts[:, None], last["pose"], infos["pose"])
+        clearances = np.minimum(clearances, np.where(starts, last["clearance"], infos["clearance"]))
+        poses.append(reached)
+        for i in np.flatnonzero(ended).tolist():
+            found[i] = _episode(
+                bank,
+                numbers[i],
+                np.array([row[i] for row in poses]),
+                bool(last["is_success"][i]),
+                bool(last["collision"][i]),
+                float(last["cost"][i]),
+                float(totals[i]),
+                float(clearances[i]),
+            )
+            on_episode()
+    venv.close()
+    return [episode for episode in found if episode is not None]
+
+
+def _episode(
+    bank: ScenarioBank,
+    number: int,
+    states: np.ndarray,
+    success: bool,
+    collision: bool,
+    cost: float,
+    episode_return: float,
+    clearance: float,
+) -> Episode:
+    scenario, reference = bank[number], bank.reference(number)
+    return Episode(
+        family=bank.family,
+        index=number,
+        scenario=scenario.name,
+        success=success,
+        collision=collision,
+        cost=cost,
+        episode_return=episode_return,
+        reference_cost=reference.cost,
+        reached_reference=_reference_to(scenario, reference, states[-1]) if success else math.nan,
+        clearance=clearance,
+        reference_clearance=reference.certificate[3],
+        reversing=bool(reference.controls[:, 0].min() < -REVERSING),
+        states=states,
+    )
+
+
+def _reference_to(scenario: Scenario, reference: Reference, pose: np.ndarray) -> float:
+    """J* of the scenario with a pose near its goal as the goal, solved from its optimum; NaN if that fails."""
+    heading = None if scenario.goal[2] is None else math.remainder(float(pose[2]), 2 * math.pi)
+    task = scenario.model_copy(update={"goal": (float(pose[0]), float(pose[1]), heading)})
+    guess = Path(reference.times, reference.states.astype(float), reference.costates.astype(float))
+    extremal = solve(task, "multiple_shooting", guess=guess)
+    return extremal.cost if extremal.success else math.nan
+
+
+def _time(entrant: Entrant, bank: ScenarioBank, settings: Mapping[str, Any]) -> float:
+    """Median milliseconds for one action, on the bank's first scenario."""
+    env = NavigateEnv(bank=bank, **settings)
+    policy = _made(entrant, env, env.observation_space)
+    observation, _ = env.reset(seed=0, options={"index": 0})
+    seconds, state, start = [], None, True
+    for _ in range(TIMED):
+        begun = time.perf_counter()
+        action, state = policy.predict(observation, state, np.array([start]), deterministic=True)
+        seconds.append(time.perf_counter() - begun)
+        observation, _, start, _, _ = env.step(action.reshape(2))
+        if start:
+            break
+    env.close()
+    return 1e3 * float(np.median(seconds))
+
+
+def _made(entrant: Entrant, env: Any, space: Any) -> Policy:
+    """The policy for an environment."""
+    policy = entrant if hasattr(entrant, "predict") and not isinstance(entrant, type) else cast(Any, entrant)(env)
+    learned = getattr(policy, "observation_space", None)
+    if learned is not None and learned != space:
+        raise ValueError(
+            f"policy: it observes {learned.shape or 'a dict'}, the environment shows {space.shape or 'a dict'}, or "
+            "with other bounds; pass the environment's arguments that it was trained with"
+        )
+    return policy

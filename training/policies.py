@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 import leapnav
+from leapnav.envs.families import FAMILIES
 from leapnav.envs.observations import GOAL_ENTRIES
+from leapnav.envs.settings import Settings
+from leapnav.experts.demonstrations import ENVIRONMENT
+from leapnav.training.actors import policy_of
 
-FORMAT = 1
+FORMAT = 2
+SHIPPED = Path(__file__).parent / "shipped"
 HIDDEN = (256, 256, 256)
 ROBOT_RADIUS = 0.25  # m, the scale on which a near obstacle matters
 
@@ -72,82 +80,244 @@ class NavigationFeatures(BaseFeaturesExtractor):
         )
 
 
-def make_policy(observation_space: spaces.Space, action_space: spaces.Space, seed: int = 0) -> ActorCriticPolicy:
+def network(hidden: Sequence[int] = HIDDEN, critic: Sequence[int] | None = None) -> dict[str, Any]:
+    """The `policy_kwargs` of PPO, A2C, SAC or TQC for the network of this module.
+
+    Args:
+        hidden: widths of the actor's hidden layers.
+        critic: of the critic's, the same if not given.
+
+    """
+    widths = list(hidden if critic is None else critic)
+    return {
+        "net_arch": {"pi": list(hidden), "vf": widths, "qf": widths},
+        "activation_fn": nn.ReLU,
+        "features_extractor_class": NavigationFeatures,
+    }
+
+
+def make_policy(
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    seed: int = 0,
+    hidden: Sequence[int] = HIDDEN,
+    critic: Sequence[int] | None = None,
+) -> ActorCriticPolicy:
     """A freshly initialised actor-critic for `leapnav/Navigate-v0`, which PPO and A2C can go on training.
 
     Raises:
         ValueError: the spaces are not the environment's.
 
     """
-    box = isinstance(observation_space, spaces.Box) and observation_space.shape[0] > GOAL_ENTRIES
-    if not box or not isinstance(action_space, spaces.Box):
-        raise ValueError(f"observation_space: expected one of leapnav/Navigate-v0, got {observation_space}")
+    _check_spaces(observation_space, action_space)
     with th.random.fork_rng(devices=[]):  # the caller's generator stays as it is
         th.manual_seed(seed)
         return ActorCriticPolicy(
             observation_space,
             action_space,
             lr_schedule=lambda _: 3e-4,
-            net_arch={"pi": list(HIDDEN), "vf": list(HIDDEN)},
-            activation_fn=nn.ReLU,
             log_std_init=-2.0,
-            features_extractor_class=NavigationFeatures,
+            **network(hidden, critic),
         )
 
 
-def save_policy(policy: ActorCriticPolicy, folder: str | Path, environment: dict[str, Any]) -> None:
+def _check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    box = isinstance(observation_space, spaces.Box) and observation_space.shape[0] > GOAL_ENTRIES
+    if not box or not isinstance(action_space, spaces.Box):
+        raise ValueError(f"observation_space: expected one of {ENVIRONMENT} with a lidar, got {observation_space}")
+
+
+def save_policy(
+    model: BaseAlgorithm | BasePolicy,
+    folder: str | Path,
+    environment: Mapping[str, Any] | None = None,
+    *,
+    training: Mapping[str, Any] | None = None,
+    half: bool = False,
+) -> None:
     """Writes `policy.json` (what it is) and `weights.pt` (tensors only) into a folder.
 
     Args:
-        environment: the arguments of `gym.make` that the policy was trained for.
+        model: an algorithm with the network of this module (PPO, A2C, SAC or TQC), or its policy.
+        folder: made if it is not there.
+        environment: the arguments of `gym.make` that the policy was trained for, besides the family: `observation` and
+            so on.
+        training: what to remember of how it came about; JSON.
+        half: store the actor alone, in half precision: a fifth of the size, and actions that differ by about 1e-3.
+
+    Raises:
+        ValueError: the policy has another network, or an argument of the environment is impossible.
 
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    policy, folder = policy_of(model), Path(folder)
+    kind = next((name for name, type_ in _kinds().items() if type(policy) is type_), None)
+    if kind is None or policy.features_extractor_class is not NavigationFeatures:
+        raise ValueError(
+            f"model: expected a policy made with policy_kwargs=leapnav.training.network(), got {type(policy).__name__}"
+        )
     assert isinstance(policy.observation_space, spaces.Box)
-    th.save(policy.state_dict(), folder / "weights.pt")
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = policy.state_dict()
+    if half:
+        weights = {name: value.half() for name, value in weights.items() if _is_of_actor(name)}
     description = {
         "format": FORMAT,
         "leapnav": leapnav.__version__,
-        "environment": environment,
+        "environment": {"id": ENVIRONMENT, **_plain(Settings(**(environment or {})))},
         "observation_low": policy.observation_space.low.tolist(),
         "observation_high": policy.observation_space.high.tolist(),
+        "kind": kind,
+        "hidden": policy.net_arch["pi"],
+        "critic": policy.net_arch["vf"],
+        "actor_only": half,
+        "training": dict(training or {}),
     }
-    (folder / "policy.json").write_text(json.dumps(description, indent=1) + "\n")
+    # The weights first: a folder with a description has all.
+    for name, write in (
+        ("weights.pt", lambda path: th.save(weights, path)),
+        ("policy.json", lambda path: path.write_text(json.dumps(description, indent=1) + "\n")),
+    ):
+        partial = folder / f".{name}.partial"
+        write(partial)
+        partial.replace(folder / name)
 
 
-def load_policy(folder: str | Path, env: gym.Env | None = None) -> ActorCriticPolicy:
-    """Reads a policy that `save_policy` wrote. Nothing of the file is executed.
-
-    Args:
-        env: if given, the environment that the policy is to drive; its spaces must be the policy's.
+def read_description(folder: str | Path) -> dict[str, Any]:
+    """What `policy.json` says of a policy.
 
     Raises:
         FileNotFoundError: the folder holds no policy.
-        ValueError: the files are broken, of another format or for another observation; the message says which.
+        ValueError: the file is broken, of another format or for another environment; the message says which.
 
     """
-    folder = Path(folder)
+    path = Path(folder) / "policy.json"
+    text = path.read_text()
     try:
-        description = json.loads((folder / "policy.json").read_text())
-        low, high = (np.array(description[key], np.float32) for key in ("observation_low", "observation_high"))
+        description = json.loads(text)
         found = description["format"]
-    except (ValueError, KeyError, TypeError) as error:  # ValueError: syntax, encoding, numbers
-        raise ValueError(f"{folder / 'policy.json'}: not a policy's description: {error!r}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a policy's description: {error!r}") from None
     if found != FORMAT:
-        raise ValueError(f"{folder / 'policy.json'}: format: expected {FORMAT}, got {found!r}")
-    observation_space = spaces.Box(low, high, dtype=np.float32)
-    if env is not None and env.observation_space != observation_space:
-        raise ValueError(
-            f"{folder}: the policy observes {len(low)} numbers with other bounds than the environment's "
-            f"{env.observation_space.shape}; make the environment with the arguments in policy.json"
-        )
-    policy = make_policy(observation_space, spaces.Box(-1.0, 1.0, (2,), np.float32))
+        raise ValueError(f"{path}: format: expected {FORMAT}, got {found!r}; train the policy anew")
     try:
-        policy.load_state_dict(th.load(folder / "weights.pt", weights_only=True, map_location="cpu"))
+        environment = description["environment"]["id"]
+        if environment != ENVIRONMENT:
+            raise ValueError(f"{path}: a policy for {environment}; this leapnav has {ENVIRONMENT}")
+        for name, type_ in (("kind", str), ("hidden", list), ("critic", list), ("actor_only", bool)):
+            if not isinstance(description[name], type_):
+                raise TypeError(f"{name} is {description[name]!r}")
+        if description["kind"] not in _KINDS:
+            raise ValueError(f"{path}: kind: expected one of {', '.join(_KINDS)}, got {description['kind']!r}")
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a policy's description: {error!r}") from None
+    return description
+
+
+def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
+    """Reads a policy that `save_policy` wrote; nothing of the file is executed. Or one that ships with leapnav.
+
+    Args:
+        folder: the folder, or the name of a family for the policy that ships with leapnav, or "all" for the one that
+            drives in all of them.
+        env: if given, the environment that the policy is to drive, single or vector; it must show what the policy
+            observes.
+
+    Returns:
+        A policy of Stable-Baselines3: `policy.predict(observation, deterministic=True)[0]` is the action.
+
+    Raises:
+        FileNotFoundError: the folder holds no policy.
+        ValueError: the files are broken, of another format or for other observations; the message says which.
+
+    """
+    folder = _located(folder)
+    description = read_description(folder)
+    try:
+        low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
+        observation_space = spaces.Box(low, high, dtype=np.float32)
+        action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        _check_spaces(observation_space, action_space)
+        policy = _kind(description["kind"])(
+            observation_space,
+            action_space,
+            lambda _: 3e-4,
+            **network(description["hidden"], description["critic"]),
+        )
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # whatever a damaged description makes of a network
+        raise ValueError(f"{folder / 'policy.json'}: not a policy's description: {error!r}") from None
+    if env is not None:
+        _check_environment(folder, description, observation_space, env)
+    try:
+        weights = th.load(folder / "weights.pt", weights_only=True, map_location="cpu")
+        if description["actor_only"]:
+            weights = {**policy.state_dict(), **{name: value.float() for name, value in weights.items()}}
+        policy.load_state_dict(weights)
     except FileNotFoundError:
         raise
     except Exception as error:  # torch raises many kinds for a broken file
         raise ValueError(f"{folder / 'weights.pt'}: not this policy's weights: {str(error).splitlines()[0]}") from None
     policy.set_training_mode(False)
     return policy
+
+
+def _located(folder: str | Path) -> Path:
+    """A policy's folder; a family's name means the policy that ships, unless there is such a folder."""
+    path = Path(folder)
+    if not path.exists() and str(folder) in (*FAMILIES, "all"):
+        return SHIPPED / str(folder)
+    return path
+
+
+def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
+    """Refuses an environment that shows something else than the policy has learned to see."""
+    inner: Any = env.unwrapped
+    trained, given = description["environment"], _plain(inner.settings)
+    differing = [
+        f"{name}={trained.get(name)!r} (here {given[name]!r})" for name in OBSERVED if trained.get(name) != given[name]
+    ]
+    if differing or getattr(env, "single_observation_space", env.observation_space) != space:
+        of_what = ", ".join(differing) or "other bounds"
+        raise ValueError(f"{folder}: the policy observes another environment than this one: {of_what}")
+
+
+# Settings that what is observed depends on.
+OBSERVED = (
+    "observation",
+    "actuation",
+    "dict_observation",
+    "lidar_beams",
+    "lidar_range",
+    "map_obstacles",
+    "map_vertices",
+)
+
+
+def _plain(settings: Settings) -> dict[str, Any]:
+    """Settings as JSON has them."""
+    return {field.name: value for field in fields(settings) if (value := asdict(settings)[field.name]) is not None}
+
+
+_KINDS = ("actor-critic", "sac", "tqc")
+
+
+def _kind(name: str) -> Any:
+    """The class of a policy."""
+    if name == "tqc":
+        from sb3_contrib.tqc.policies import TQCPolicy  # of the extra `contrib`
+
+        return TQCPolicy
+    return {"actor-critic": ActorCriticPolicy, "sac": SACPolicy}[name]
+
+
+def _kinds() -> dict[str, Any]:
+    """The classes that are there."""
+    from importlib.util import find_spec
+
+    return {name: _kind(name) for name in _KINDS if name != "tqc" or find_spec("sb3_contrib") is not None}
+
+
+def _is_of_actor(name: str) -> bool:
+    """Whether a weight belongs to the mean action or its noise."""
+    return name.startswith(("actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))

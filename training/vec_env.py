@@ -9,8 +9,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import (
+    VecEnv,
+    VecEnvIndices,
+    VecEnvObs,
+    VecEnvStepReturn,
+    VecEnvWrapper,
+)
 
+from leapnav.envs.scenario import Scenario
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv, row_of
 
 ENVIRONMENT = "leapnav/Navigate-v0"
@@ -127,6 +134,31 @@ class NavigateVecEnv(VecEnv):
                 self._returns[i], self._lengths[i] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, rows
 
+    def restart(self, mask: np.ndarray, scenarios: Sequence[Scenario | None]) -> VecEnvObs:
+        """Starts other episodes than those that have just begun.
+
+        Args:
+            mask (n_envs,): bool, which robots' episodes.
+            scenarios: one for each robot; those of the others are not looked at.
+
+        Returns:
+            The observations of all robots.
+
+        """
+        observations, infos = self.venv.reset(options={"reset_mask": mask, "scenario": scenarios})
+        for i in np.flatnonzero(mask).tolist():
+            self.reset_infos[i] = row_of(infos, i)
+            self._returns[i], self._lengths[i] = 0.0, 0
+        return observations
+
+    def state_dict(self) -> dict[str, Any]:
+        """All robots where they are, and what they will play: a training run's checkpoint needs it."""
+        return {"venv": self.venv, "returns": self._returns, "lengths": self._lengths}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Takes up what `state_dict` described, of an environment with the same arguments."""
+        self.venv, self._returns, self._lengths = state["venv"], state["returns"], state["lengths"]
+
     def close(self) -> None:
         """Closes the environment."""
         self.venv.close()
@@ -176,3 +208,28 @@ class NavigateVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """True for `Monitor`, whose records are kept here."""
         return [issubclass(Monitor, wrapper_class)] * len(list(self._get_indices(indices)))
+
+
+class ScaledReward(VecEnvWrapper):
+    """Multiplies the rewards by a constant, so that a critic's targets are of the order of 1.
+
+    Unlike a running normalisation it keeps the critic's meaning: its values are the scale times the return.
+
+    Args:
+        venv: the robots.
+        scale: the factor.
+
+    """
+
+    def __init__(self, venv: VecEnv, scale: float) -> None:
+        super().__init__(venv)
+        self.scale = scale
+
+    def reset(self) -> VecEnvObs:
+        """Starts episodes of all robots."""
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Steps all robots; the episodes' records in the infos keep the unscaled return."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, rewards * self.scale, dones, infos

@@ -1,0 +1,277 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
+from leapnav.experts import ExpertPolicy, find_optimum
+from leapnav.experts.policy import plan_actions
+from leapnav.training import (
+    Episode,
+    Evaluation,
+    GoToGoal,
+    RandomPolicy,
+    evaluate,
+    make_policy,
+    network,
+    profile,
+    save_policy,
+    score,
+)
+from leapnav.training.contest import contest
+from leapnav.training.entrants import grouped, load_entrant, make_entrant
+from leapnav.training.reports import extremes, plot_episodes, plot_scores, print_scores, write_scores
+
+
+class Planned:
+    """Drives the banks' optima, with another speed."""
+
+    def __init__(self, env, factor):
+        self.env, self.factor, self.step = env.unwrapped, factor, 0
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        if np.any(episode_start):
+            self.step = self.step if self.step and not np.all(episode_start) else 0
+        single = isinstance(self.env, NavigateEnv)
+        indices = [self.env.index] if single else self.env.indices
+        rows = []
+        for i in indices:
+            plan = PLANS[i % COUNT]
+            rows.append(plan[min(self.step, len(plan) - 1)] * np.float32([self.factor, 1.0]))
+        self.step += 1
+        actions = np.array(rows)
+        return (actions[0] if single else actions), state
+
+
+BANK, COUNT = ScenarioBank.shipped("open", "test"), 4
+PLANS = [plan_actions(find_optimum(BANK[i]), BANK[i], 0.05) for i in range(COUNT)]
+
+
+def test_the_expert_scores_one_and_random_zero():
+    expert = evaluate(ExpertPolicy, "open", count=10, progress=False)
+    assert expert.success == 1.0
+    assert expert.soc == pytest.approx(1.0, abs=1e-3)
+    assert abs(expert.regret) < 1e-3
+    assert 0 < expert.milliseconds < 1000
+    random = evaluate(lambda env: RandomPolicy(NavigateEnv().action_space), "open", count=10, progress=False)
+    assert random.success == 0.0
+    assert random.soc == 0.0
+    assert math.isnan(random.regret)
+    assert [e.reference_cost for e in random] == pytest.approx(BANK.costs[:10].tolist())
+
+
+def test_going_to_the_goal_suffices_where_nothing_is_in_the_way():
+    found = evaluate(GoToGoal, "open", count=50, timed=False, progress=False)
+    reached = np.mean([np.hypot(*(e.states[-1, :2] - np.array(BANK[e.index].goal[:2]))) < 0.3 for e in found])
+    assert reached > 0.9
+    blocked = evaluate(GoToGoal, "clutter", count=50, timed=False, progress=False)
+    assert blocked.collision > 0.3
+
+
+def test_the_episodes_are_those_of_the_single_environment():
+    """One by one, in the environment that users have, the same policy does the same."""
+    env = NavigateEnv("open", split="test")
+    policy = make_policy(env.observation_space, env.action_space, 0, (16,))
+    found = evaluate(policy, "open", count=5, timed=False, progress=False)
+    for episode in found:
+        observation, info = env.reset(options={"index": episode.index})
+        poses, total, lowest, done = [info["pose"]], 0.0, math.inf, False
+        while not done:
+            observation, reward, done, _, info = env.step(policy.predict(observation, deterministic=True)[0])
+            poses.append(info["pose"])
+            total, lowest = total + float(reward), min(lowest, info["clearance"])
+        np.testing.assert_allclose(episode.states, poses, atol=1e-5)
+        assert episode.episode_return == pytest.approx(total, rel=1e-5)
+        assert episode.cost == pytest.approx(info["cost"], rel=1e-5)
+        assert episode.clearance == pytest.approx(lowest, abs=1e-4)
+        assert episode.collision == info["collision"]
+
+
+def test_evaluation_is_deterministic():
+    one, other = (
+        evaluate(lambda env: RandomPolicy(NavigateEnv().action_space, 4), "open", count=5, timed=False, progress=False)
+        for _ in range(2)
+    )
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.states, b.states)
+        assert a.cost == b.cost
+
+
+def test_regret_is_measured_against_the_pose_that_was_reached():
+    """A policy that stops a little short saves cost; the optimum to where it stopped does too."""
+    found = evaluate(lambda env: Planned(env, 0.995), "open", count=COUNT, timed=False, progress=False)
+    assert found.success == 1.0
+    for episode in found:
+        assert episode.cost < episode.reference_cost
+        assert abs(episode.cost - episode.reference_cost) > 1e-3
+        assert 0 <= episode.regret < 2e-3
+        reached = BANK[episode.index].model_copy(update={"goal": tuple(episode.states[-1].tolist())})
+        assert episode.reached_reference == pytest.approx(find_optimum(reached).cost, rel=1e-5)
+
+
+def test_bad_arguments_are_named():
+    env = NavigateEnv("open", lidar_beams=16)
+    policy = PPO("MlpPolicy", env, policy_kwargs=network((16,)))
+    with pytest.raises(ValueError, match=r"policy: it observes \(25,\), the environment shows \(41,\)"):
+        evaluate(policy, "open", count=1, progress=False)
+    found = evaluate(policy, "open", count=1, environment={"lidar_beams": 16}, progress=False)
+    assert len(found) == 1
+    with pytest.raises(ValueError, match=r"bank: expected .* got 'maze'"):
+        evaluate(policy, "maze")
+    with pytest.raises(ValueError, match="count: expected at least one scenario, got 0"):
+        evaluate(policy, "open", count=0)
+
+
+def episode(success=True, collision=False, cost=2.0, reference=1.0, family="open", index=0):
+    return Episode(
+        family=family,
+        index=index,
+        scenario=f"{family}-{index}",
+        success=success,
+        collision=collision,
+        cost=cost,
+        episode_return=-cost,
+        reference_cost=reference,
+        reached_reference=reference if success else math.nan,
+        clearance=0.2,
+        reference_clearance=0.3,
+        reversing=False,
+        states=np.zeros((2, 3)),
+    )
+
+
+def run(*episodes):
+    numbered = [Episode(**{**vars(e), "index": i}) for i, e in enumerate(episodes)]
+    return Evaluation(tuple(numbered), 0.5)
+
+
+def test_the_score_is_what_its_definition_says():
+    found = score("policy", run(episode(cost=1), episode(cost=2), episode(cost=4), episode(False, True)))
+    assert found.success.value == 0.75
+    assert found.collision.value == 0.25
+    assert found.soc.value == pytest.approx((1 + 1 / 2 + 1 / 4 + 0) / 4)
+    assert found.soc_iqm.value == pytest.approx((1 / 2 + 1 / 4) / 2)
+    assert found.regret.value == 1.0
+    assert found.mean_return.value == -(1 + 2 + 4 + 2) / 4
+    assert found.success.low < 0.75 < found.success.high
+    assert found.milliseconds == 0.5
+
+
+def test_bootstrap_intervals_cover_the_truth():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for trial in range(40):
+        interval = score("policy", run(*(episode(bool(s)) for s in rng.random(100) < 0.7)), seed=trial).success
+        hits += interval.low <= 0.7 <= interval.high
+    assert hits >= 33  # 95 % of 40 is 38
+
+
+def test_with_several_runs_the_runs_are_resampled_for_each_scenario():
+    """All runs alike: nothing is uncertain, though scenarios differ. Runs that differ: as uncertain as they are."""
+    same = run(episode(True), episode(False), episode(True))
+    found = score("policy", [same, same, same])
+    assert found.runs == 3
+    assert found.success.low == found.success.value == found.success.high == pytest.approx(2 / 3)
+    runs = [run(*(episode(bool(s)) for s in np.random.default_rng(k).random(50) < 0.5)) for k in range(5)]
+    found = score("policy", runs)
+    # The mean of 250 independent draws has a standard deviation of 0.03.
+    assert 0.08 < found.success.high - found.success.low < 0.16
+    with pytest.raises(ValueError, match="its runs have played different scenarios"):
+        score("policy", [same, run(episode())])
+
+
+def test_resamples_keep_the_families_shares():
+    episodes = [episode(True, family="open")] * 30 + [episode(False, family="rooms")] * 10
+    found = score("policy", run(*episodes)).success
+    assert found.low == found.value == found.high == 0.75
+
+
+def test_the_performance_profile_counts_episodes_up_to_a_cost():
+    value, low, high = profile(
+        [run(episode(cost=1.0), episode(cost=1.5), episode(cost=3.0), episode(False, True, cost=0.5))],
+        np.array([1.0, 1.5, 2.0, 3.0]),
+    )
+    assert value.tolist() == [0.25, 0.5, 0.5, 0.75]
+    assert (low <= value).all()
+    assert (value <= high).all()
+
+
+def test_one_episode_and_none():
+    assert score("policy", run(episode())).success.low == 1.0
+    with pytest.raises(ValueError, match="policy: expected at least one run"):
+        score("policy", [])
+
+
+def test_a_random_policy_repeats_itself_for_the_same_seed():
+    one, other = (RandomPolicy(NavigateEnv().action_space, 3) for _ in range(2))
+    assert np.array_equal(one.predict(np.zeros((2, 41)))[0], other.predict(np.zeros((2, 41)))[0])
+    assert one.predict(np.zeros(41))[0].shape == (2,)
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory):
+    """Folders of two seeds of one method, and of another policy."""
+    root, env = tmp_path_factory.mktemp("policies"), NavigateEnv("open")
+    for seed in (0, 1):
+        training = {"algorithm": "bc", "family": "open", "seed": seed, "out": f"anything-{seed}"}
+        policy = make_policy(env.observation_space, env.action_space, seed, (16,))
+        save_policy(policy, root / f"seed{seed}", training=training)
+    save_policy(make_policy(env.observation_space, env.action_space, 5, (16,)), root / "other")
+    return root
+
+
+def test_seeds_of_one_method_share_a_row(policies):
+    names = [str(policies / name) for name in ("seed0", "other", "seed1")]
+    rows = grouped([load_entrant(name) for name in [*names, "expert"]])
+    assert [[member.name for member in members] for members in rows.values()] == [
+        [names[0], names[2]],
+        [names[1]],
+        ["expert"],
+    ]
+    labelled = grouped([load_entrant(f"mine={names[0]}"), load_entrant(f"mine={names[1]}")])
+    assert list(labelled) == ["mine"]
+    with pytest.raises(ValueError, match="expert: named more than once"):
+        grouped([load_entrant("expert"), load_entrant("expert")])
+
+
+def test_the_contest_is_printed_written_and_drawn(policies, tmp_path, capsys):
+    names = [str(policies / "seed0"), str(policies / "seed1"), "expert", "random", "go-to-goal"]
+    banks = [ScenarioBank.shipped(family, "test") for family in ("open", "rooms")]
+    found = contest([load_entrant(name) for name in names], banks, count=4, progress=False)
+    print_scores(found)
+    printed = capsys.readouterr().out
+    assert "expert" in printed
+    assert "100.0" in printed
+    assert "success % / SOC by family" in printed
+    write_scores(found, tmp_path / "scores.json")
+    content = json.loads((tmp_path / "scores.json").read_text())
+    rows = {row["policy"]: row for row in content["scores"]}
+    assert rows["random"]["regret"]["value"] is None
+    assert rows[names[0]]["runs"] == 2
+    assert content["episodes"]["expert"][0][0]["success"] is True
+    assert {row["policy"] for row in content["families"]["rooms"]} == set(rows)
+    plot_scores(found, tmp_path / "scores.png")
+    plot_episodes(banks, found.runs["random"][0].episodes, tmp_path / "episodes.png")
+    for name in ("scores.png", "episodes.png"):
+        assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_extremes_are_the_best_the_median_and_the_worst():
+    episodes = [episode(cost=1 + k / 10) for k in range(9)] + [episode(False), episode(False, True)]
+    rows = extremes(episodes, 2)
+    assert [e.cost for e in rows["best"]] == [1.0, 1.1]
+    assert [e.cost for e in rows["median"]] == pytest.approx([1.3, 1.4])
+    assert [e.collision for e in rows["worst"]] == [True, False]
+    assert list(extremes([episode(False, True)], 2)) == ["worst"]
+
+
+def test_entrants_drive_single_and_vector_environments(policies):
+    for env in (NavigateEnv("open"), NavigateVectorEnv(3, "open")):
+        observation, _ = env.reset(seed=0)
+        for name in ("expert", "random", "go-to-goal", str(policies / "other")):
+            action, _ = make_entrant(name, env).predict(observation, deterministic=True)
+            assert action.shape == env.action_space.shape
+    with pytest.raises(FileNotFoundError):
+        load_entrant("nobody")

@@ -1,0 +1,239 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch as th
+
+from leapnav.experts.rollouts import rollout
+from leapnav.training import load_policy
+from leapnav.training.config import (
+    ALGORITHMS,
+    BCConfig,
+    CloningConfig,
+    DAggerConfig,
+    DAggerRunConfig,
+    PPOConfig,
+    SACConfig,
+    WarmStartConfig,
+    read_config,
+)
+from leapnav.training.html_report import write_report
+from leapnav.training.imitation import train_bc, train_dagger
+from leapnav.training.reinforcement import train_ppo, train_sac
+
+QUICK = CloningConfig(epochs=3, batch_size=256)
+COMMON = {"family": "open", "hidden": (16, 16), "evaluation_scenarios": 4}
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demos") / "open"
+    rollout("open", 12, out, seed=700, workers=2, progress=False)
+    return out
+
+
+def bc(out, demos, **changes):
+    return BCConfig(out=out, demos=(demos,), cloning=QUICK, **{**COMMON, **changes})
+
+
+def ppo(out, **changes):
+    settings = {"n_envs": 4, "n_steps": 64, "batch_size": 64, "n_epochs": 2, "total_timesteps": 1536, "seed": 3}
+    every = {"evaluate_every": 512, "checkpoint_every": 512}
+    return PPOConfig(out=out, **{**COMMON, **settings, **every, **changes})
+
+
+def sac(out, **changes):
+    settings = {"n_envs": 4, "batch_size": 32, "total_timesteps": 400, "learning_starts": 100, "buffer_size": 1000}
+    every = {"evaluate_every": 200, "checkpoint_every": 100}
+    return SACConfig(out=out, **{**COMMON, **settings, **every, **changes})
+
+
+def weights(folder):
+    return th.nn.utils.parameters_to_vector(load_policy(folder).parameters()).detach().numpy().tobytes()
+
+
+def lines(folder):
+    return [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
+
+
+def test_a_run_leaves_its_configuration_policy_and_evaluations(demos, tmp_path):
+    config = bc(tmp_path / "run", demos)
+    evaluations = train_bc(config, progress=False)
+    assert [len(e) for e in evaluations] == [200]
+    found = lines(config.out)
+    assert [line["final"] for line in found] == [False, False, False, True]
+    assert found[-1]["open"]["success"] == evaluations[0].success
+    assert read_config(config.out) == ("bc", config)
+    record = json.loads((config.out / "config.json").read_text())
+    assert record["versions"]["torch"] == th.__version__
+    assert list((config.out / "tensorboard").glob("events*"))
+    assert load_policy(config.out).observation_space.shape == (41,)
+
+
+def test_a_folder_is_used_once_and_resumed_with_the_same_settings_only(demos, tmp_path):
+    config = bc(tmp_path / "run", demos)
+    train_bc(config, progress=False)
+    with pytest.raises(FileExistsError, match="exists; --resume goes on with it"):
+        train_bc(config, progress=False)
+    with pytest.raises(ValueError, match=r"seed: the run in .* has 0, got 1"):
+        train_bc(replace(config, resume=True, seed=1), progress=False)
+    with pytest.raises(FileNotFoundError, match="no such run to resume"):
+        train_bc(bc(tmp_path / "other", demos, resume=True), progress=False)
+    before = weights(config.out)
+    train_bc(replace(config, resume=True), progress=False)  # there is nothing left to do
+    assert weights(config.out) == before
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    config = ppo(tmp_path / "run")
+    train_ppo(config, progress=False)
+    model = config.out / "checkpoint" / "model.zip"
+    content = model.read_bytes()
+    model.write_bytes(content[:100] + b"x" + content[101:])
+    with pytest.raises(ValueError, match=r"model\.zip: damaged; the run cannot be resumed"):
+        train_ppo(replace(config, resume=True), progress=False)
+    (config.out / "checkpoint" / "manifest.json").write_text("{")
+    with pytest.raises(ValueError, match="a damaged checkpoint"):
+        train_ppo(replace(config, resume=True), progress=False)
+    (config.out / "config.json").write_text('{"config": {"algorithm": "ppo", "out": "x", "n_envs": "many"}}')
+    with pytest.raises(ValueError, match=r"config\.json: n_envs: .*, got 'many'"):
+        read_config(config.out)
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+import test_runs
+name, out, demos = sys.argv[2:5]
+out, demos, resume = Path(out), Path(demos), sys.argv[5] == "resume"
+if name == "bc":
+    test_runs.train_bc(test_runs.bc(out, demos, resume=resume), progress=False)
+elif name == "ppo":
+    test_runs.train_ppo(test_runs.ppo(out, resume=resume), progress=False)
+elif name == "warm":
+    test_runs.train_ppo(test_runs.warm(out, demos, resume=resume), progress=False)
+else:
+    test_runs.train_sac(test_runs.sac(out, warm_start=(demos,), cloning=test_runs.QUICK, resume=resume), progress=False)
+"""
+
+
+def warm(out, demos, **changes):
+    start = WarmStartConfig(critic_epochs=1, slopes=100)
+    extra = {"divergence": 0.1, "jump_start": 0.5, "reward": "cost", "warm_start": (demos,), "cloning": QUICK}
+    return ppo(out, start=start, **{**extra, **changes})
+
+
+@pytest.mark.parametrize("name", ["bc", "ppo", "warm", "sac"])
+def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
+    """SIGKILL as soon as there is a checkpoint, and again after the next one."""
+
+    def start(out, how):
+        arguments = [sys.executable, "-c", SCRIPT, os.path.dirname(__file__), name, out, demos, how]
+        return subprocess.Popen([str(a) for a in arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+    straight, killed = tmp_path / "straight", tmp_path / "killed"
+    whole = start(straight, "new")
+    manifest, seen, kills = killed / "checkpoint" / "manifest.json", None, 0
+    process = start(killed, "new")
+    while kills < 2:
+        content = manifest.read_bytes() if manifest.exists() else None
+        if content is not None and content != seen:
+            process.send_signal(signal.SIGKILL)
+            seen, kills = content, kills + (process.wait() == -signal.SIGKILL)
+            process = start(killed, "resume")
+        elif process.poll() is not None:
+            break  # it was done before it could be killed again
+        time.sleep(0.002)
+    output = process.communicate()[0].decode()
+    assert process.returncode == 0, output
+    assert whole.wait() == 0, whole.stdout.read().decode()
+    assert kills >= 1
+    assert weights(killed) == weights(straight)
+    without_time = [
+        [{k: v for k, v in line.items() if k != "seconds"} for line in lines(f)] for f in (killed, straight)
+    ]
+    assert without_time[0] == without_time[1]
+
+
+def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
+    def config(out, **changes):
+        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, steps=20)}
+        return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
+
+    train_dagger(config(tmp_path / "straight"), progress=False)
+    from leapnav.training import dagger
+
+    whole, calls = dagger.DAgger.run_round, []
+
+    def stopped(self, **arguments):
+        if calls:
+            raise KeyboardInterrupt
+        calls.append(1)
+        return whole(self, **arguments)
+
+    monkeypatch.setattr(dagger.DAgger, "run_round", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        train_dagger(config(tmp_path / "stopped"), progress=False)
+    monkeypatch.undo()
+    train_dagger(config(tmp_path / "stopped", resume=True), progress=False)
+    assert weights(tmp_path / "stopped") == weights(tmp_path / "straight")
+
+
+def test_sac_and_tqc_train_and_their_policies_load(tmp_path):
+    for algorithm in ("sac", "tqc"):
+        config = sac(tmp_path / algorithm, algorithm=algorithm)
+        train_sac(config, progress=False)
+        policy = load_policy(config.out)
+        assert policy.predict(np.zeros((2, 41), np.float32), deterministic=True)[0].shape == (2, 2)
+
+
+def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
+    train_bc(bc(tmp_path / "clone", demos), progress=False)
+    for name, given in (("policy", (tmp_path / "clone",)), ("both", (tmp_path / "clone", demos))):
+        config = ppo(tmp_path / name, warm_start=given, total_timesteps=256, reward="cost", learning_rate=1e-9)
+        train_ppo(config, progress=False)
+        one, other = (load_policy(folder) for folder in (tmp_path / "clone", tmp_path / name))
+        inputs = np.random.default_rng(0).uniform(0, 3, (20, 41)).astype(np.float32)
+        found = [policy.predict(inputs, deterministic=True)[0] for policy in (one, other)]
+        np.testing.assert_allclose(*found, atol=1e-4)
+    with pytest.raises(ValueError, match="warm_start: expected at most one policy"):
+        train_ppo(ppo(tmp_path / "two", warm_start=(tmp_path / "clone", tmp_path / "policy")), progress=False)
+    with pytest.raises(FileNotFoundError, match=r"warm_start: .*nowhere: no such folder"):
+        train_ppo(ppo(tmp_path / "none", warm_start=(tmp_path / "nowhere",)), progress=False)
+
+
+def test_tuned_settings_depend_on_the_family_and_the_warm_start():
+    for kind in ALGORITHMS.values():
+        for family in ("open", "clutter", "polygons", "rooms", "slalom", "all"):
+            assert kind.tuned(family).family == family
+    assert PPOConfig.tuned("clutter", warm=True).reward == "cost"
+    assert PPOConfig.tuned("clutter", seed=7).seed == 7
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):
+    folders = []
+    for seed in (0, 1):
+        train_bc(bc(tmp_path / f"bc{seed}", demos, seed=seed), progress=False)
+        folders.append(str(tmp_path / f"bc{seed}"))
+    train_ppo(ppo(tmp_path / "ppo"), progress=False)
+    page = tmp_path / "report.html"
+    found = write_report([*folders, str(tmp_path / "ppo")], page, count=5, progress=False)
+    assert list(found.runs) == [folders[0], str(tmp_path / "ppo"), "expert", "go-to-goal", "random"]
+    assert [len(runs) for runs in found.runs.values()] == [2, 1, 1, 1, 1]
+    text = page.read_text()
+    assert text.count("<svg") == 3
+    assert text.count("data:image/png;base64") == 2
+    assert "http" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
+        "http://creativecommons.org", ""
+    ).replace("https://matplotlib.org", "")
+    for words in ("by family", "by clearance", "by reversing", "(2 runs)"):
+        assert words in text
+    with pytest.raises(FileNotFoundError):
+        write_report([str(demos)], page)

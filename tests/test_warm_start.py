@@ -1,0 +1,239 @@
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import VecNormalize
+
+from leapnav.envs import NavigateEnv, ScenarioBank, sample_scenario
+from leapnav.envs.observer import Observer
+from leapnav.experts import ExpertPolicy
+from leapnav.experts.rollouts import rollout
+from leapnav.training import CloningConfig, Dataset, make_vec_env, network, warm_start
+from leapnav.training.anchored import AnchoredPolicy
+from leapnav.training.config import WarmStartConfig
+from leapnav.training.jump_start import JumpStart
+from leapnav.training.replay import DemonstrationReplayBuffer
+from leapnav.training.vec_env import ScaledReward
+
+
+def small():
+    return network((64, 64))  # a new one for each: SB3 adds to it
+
+
+CLONING = CloningConfig(epochs=4, batch_size=256)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demos") / "open"
+    rollout("open", 60, out, seed=500, workers=2, progress=False)
+    return Dataset.of(out)
+
+
+def ppo(**arguments):
+    return PPO("MlpPolicy", make_vec_env(n_envs=2, family="open"), policy_kwargs=small(), seed=0, **arguments)
+
+
+def test_an_observer_sees_what_the_environment_shows():
+    env, rng = NavigateEnv("clutter", split="fresh"), np.random.default_rng(0)
+    scenarios, states, times, expected = [], [], [], []
+    for seed in range(8):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(rng.integers(1, 6)):
+            observation, _, done, _, _ = env.step(rng.uniform(-1, 1, 2).astype(np.float32))
+            assert not done
+        scenarios.append(env.scenario)
+        states.append(env.pose)
+        times.append(env.time)
+        expected.append(observation)
+    found = Observer().observe(scenarios, np.array(states), np.array(times))
+    np.testing.assert_array_equal(found, np.array(expected))
+
+
+def test_the_critic_of_ppo_is_the_cost_to_go(dataset):
+    model = ppo(gamma=1.0)
+    config = WarmStartConfig(critic_epochs=30, critic_batch_size=512, slopes=5000)
+    found = warm_start(model, dataset, config, cloning=CLONING, reward_scale=0.1, progress=False)
+    assert len(found.cloning) == 4
+    assert found.value_error < 0.02
+    assert found.slope_error < 0.5
+    with th.no_grad():
+        values = model.policy.predict_values(th.as_tensor(dataset.observations)).numpy()[:, 0]
+    assert np.mean((values - 0.1 * dataset.returns) ** 2) < 0.02 * np.var(0.1 * dataset.returns)
+
+
+def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
+    """The slope of the value along the state, on scenarios that were not seen, with and without the costates."""
+    test = [sample_scenario("open", seed) for seed in range(900, 906)]
+    errors = []
+    for gradient in (True, False):
+        model = ppo(gamma=1.0)
+        config = WarmStartConfig(actor=False, critic_epochs=30, critic_batch_size=512, slopes=5000, gradient=gradient)
+        warm_start(model, dataset, config, progress=False)
+        squares = []
+        for scenario in test:
+            env = NavigateEnv(scenario=scenario)
+            env.reset()
+            costate = ExpertPolicy(env).costate()
+            step = np.diag([0.02, 0.02, 0.02])
+            states = np.concatenate([np.array(scenario.start) + step, np.array(scenario.start) - step])
+            seen = Observer().observe([scenario] * 6, states, np.zeros(6))
+            with th.no_grad():
+                values = model.policy.predict_values(th.as_tensor(seen)).numpy()[:, 0]
+            squares.append(((values[:3] - values[3:]) / 0.04 + costate) ** 2)
+        errors.append(np.mean(squares))
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
+    """At the expert's action the value; at others less, by what the Hamiltonian says."""
+    model = SAC("MlpPolicy", make_vec_env(n_envs=1, family="open"), policy_kwargs=small(), gamma=1.0, seed=0)
+    config = WarmStartConfig(actor=False, critic_epochs=30, critic_batch_size=512, slopes=5000)
+    found = warm_start(model, dataset, config, progress=False)
+    assert found.value_error < 0.05
+    states = model.critic.state_dict()
+    assert all(th.equal(value, states[name]) for name, value in model.critic_target.state_dict().items())
+
+
+def test_discounted_values_shrink():
+    from leapnav.training.warm_start import _discounting
+
+    # Ten steps of cost 1 each.
+    assert _discounting(np.array([0.5]), 0.9) * 10 == pytest.approx(sum(0.9**k for k in range(10)))
+    assert _discounting(np.array([0.5]), 1.0) == 1.0
+
+
+def test_parts_of_a_warm_start_can_be_left_out(dataset):
+    model = ppo()
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    warm_start(model, dataset, WarmStartConfig(critic=False), cloning=CLONING, progress=False)
+    changed = {name for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
+    assert any(name.startswith("action_net") for name in changed)
+    assert not any("value" in name for name in changed)
+    model = ppo()
+    warm_start(model, dataset, WarmStartConfig(actor=False, critic_epochs=1, slopes=50), progress=False)
+    changed = {name for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
+    assert changed
+    assert all("value" in name for name in changed)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"critic_epochs": 0}, "critic_epochs: .*0"), ({"gradient_weight": -1.0}, r"gradient_weight: .*-1\.0")],
+)
+def test_bad_settings_are_named(settings, message, dataset):
+    with pytest.raises(ValueError, match=message):
+        warm_start(ppo(), dataset, WarmStartConfig(**settings), progress=False)
+    with pytest.raises(ValueError, match="reward_scale: expected a positive number, got 0"):
+        warm_start(ppo(), dataset, reward_scale=0.0, progress=False)
+
+
+def test_the_divergence_from_the_anchor_is_that_of_two_gaussians():
+    env = NavigateEnv("open")
+    policy = AnchoredPolicy(
+        env.observation_space, env.action_space, lambda _: 1e-3, divergence_weight=2.0, entropy_weight=0.5, **small()
+    )
+    observations = th.as_tensor(np.stack([env.reset(seed=seed)[0] for seed in range(5)]))
+    actions = th.zeros(5, 2)
+    policy.drop_anchor()
+    entropy = policy.get_distribution(observations).entropy()
+    assert th.allclose(policy.evaluate_actions(observations, actions)[2], 0.5 * entropy)
+    before = policy.get_distribution(observations).distribution
+    with th.no_grad():
+        policy.action_net.bias += 0.3
+        policy.log_std += 0.2
+    now = policy.get_distribution(observations).distribution
+    divergence = th.distributions.kl_divergence(now, before).sum(dim=1)
+    found = policy.evaluate_actions(observations, actions)[2]
+    assert th.allclose(found, 0.5 * now.entropy().sum(dim=1) - 2.0 * divergence, atol=1e-5)
+    assert policy.divergence == pytest.approx(float(divergence.mean()), rel=1e-5)
+    # The anchor is no parameter that an optimiser would move.
+    moved = {id(p) for group in policy.optimizer.param_groups for p in group["params"]}
+    assert not any(id(p) in moved for p in policy.anchor.parameters())
+
+
+def test_a_divergence_holds_ppo_near_its_anchor():
+    distances = []
+    for weight in (0.0, 10.0):
+        venv = make_vec_env(n_envs=4, family="open", seed=0)
+        kwargs = {**small(), "log_std_init": -1.0}
+        model = PPO(
+            AnchoredPolicy,
+            venv,
+            n_steps=64,
+            batch_size=64,
+            ent_coef=1.0,
+            learning_rate=1e-3,
+            policy_kwargs=kwargs,
+            seed=0,
+        )
+        model.policy.drop_anchor()
+        model.policy.divergence_weight = weight
+        model.learn(1024)
+        observations = th.as_tensor(venv.reset())
+        with th.no_grad():
+            distances.append(float(model.policy._divergence(observations).mean()))
+    assert distances[1] < 0.3 * distances[0]
+
+
+def test_a_jump_start_begins_on_the_optimum_with_the_time_that_is_left():
+    bank = ScenarioBank.shipped("open", "train")
+    robots = make_vec_env(n_envs=8, family="open", split="fresh", seed=0)
+    venv = JumpStart(robots, [bank], share=0.9, probability=1.0, seed=0)
+    venv.reset()
+    names = {bank[i].name: i for i in range(len(bank))}
+    jumped = 0
+    for _ in range(500):
+        observations, _, dones, _ = venv.step(np.zeros((8, 2), np.float32))
+        for i in np.flatnonzero(dones):
+            scenario = robots.get_attr("scenario")[i]
+            number = names[scenario.name]
+            reference = bank.reference(number)
+            gone = bank[number].horizon - scenario.horizon
+            at = np.interp(gone, reference.times, reference.states[:, 0])
+            assert scenario.start[0] == pytest.approx(at, abs=1e-3)
+            assert observations[i, 4] == pytest.approx(scenario.horizon, abs=1e-4)
+            jumped += gone > 0
+    assert jumped > 5
+
+
+def test_without_a_share_nothing_jumps():
+    one = make_vec_env(n_envs=4, family="open", seed=0)
+    other = JumpStart(make_vec_env(n_envs=4, family="open", seed=0), [ScenarioBank.shipped("open", "train")], share=0.0)
+    np.testing.assert_array_equal(one.reset(), other.reset())
+    for _ in range(300):
+        found = [venv.step(np.zeros((4, 2), np.float32))[0] for venv in (one, other)]
+        np.testing.assert_array_equal(*found)
+
+
+def test_batches_hold_their_share_of_demonstrations(dataset):
+    venv = make_vec_env(n_envs=1, family="open")
+    arguments = {"dataset": dataset, "share": 0.25, "reward_scale": 0.1}
+    buffer = DemonstrationReplayBuffer(100, venv.observation_space, venv.action_space, **arguments)
+    blank = np.zeros((1, 41), np.float32)
+    buffer.add(blank, blank, np.zeros((1, 2)), np.array([7.0]), np.array([False]), [{}])
+    batch = buffer.sample(400)
+    assert (batch.rewards[:300] == 7.0).all()
+    demonstrated = batch.observations[300:].numpy()
+    rows = {row.tobytes(): i for i, row in enumerate(dataset.observations)}
+    for k in range(100):
+        i = rows[demonstrated[k].tobytes()]
+        assert batch.rewards[300 + k] == pytest.approx(0.1 * dataset.rewards[i], rel=1e-5)
+        ends = i + 1 == len(dataset) or dataset.episodes[i + 1] != dataset.episodes[i]
+        assert bool(batch.dones[300 + k]) == ends
+        if not ends:
+            np.testing.assert_array_equal(batch.next_observations[300 + k].numpy(), dataset.observations[i + 1])
+    assert batch.dones[300:].sum() < 20
+    with pytest.raises(ValueError, match="share: expected a number in"):
+        DemonstrationReplayBuffer(100, venv.observation_space, venv.action_space, dataset=dataset, share=1.0)
+    with pytest.raises(ValueError, match="VecNormalize"):
+        buffer.sample(8, env=VecNormalize(venv))
+
+
+def test_scaled_rewards_are_multiples():
+    one, other = (make_vec_env(n_envs=2, family="open", seed=0) for _ in range(2))
+    other = ScaledReward(other, 0.1)
+    one.reset(), other.reset()
+    for _ in range(5):
+        actions = np.full((2, 2), 0.3, np.float32)
+        assert other.step(actions)[1] == pytest.approx(0.1 * one.step(actions)[1])

@@ -1,0 +1,81 @@
+"""What the learning code needs of Stable-Baselines3's policies, whichever algorithm they belong to."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from torch import nn
+
+
+def policy_of(model: BaseAlgorithm | BasePolicy) -> BasePolicy:
+    """An algorithm's policy, or the policy itself.
+
+    Raises:
+        TypeError: it is neither, or a policy without a continuous action to fit.
+
+    """
+    policy = model.policy if isinstance(model, BaseAlgorithm) else model
+    if not isinstance(policy, BasePolicy):
+        raise TypeError(f"model: expected one of Stable-Baselines3 or its policy, got {type(model).__name__}")
+    if not isinstance(policy, ActorCriticPolicy) and not isinstance(getattr(policy, "actor", None), BasePolicy):
+        raise TypeError(f"model: expected a policy with an actor, got {type(policy).__name__}")
+    return policy
+
+
+def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
+    """The parameters that the mean action depends on."""
+    if isinstance(policy, ActorCriticPolicy):
+        modules = policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net
+        return [parameter for module in modules for parameter in module.parameters()]
+    return list(policy.actor.parameters())
+
+
+def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
+    """The action (B, m) that the policy takes deterministically, before it is clipped, with gradients."""
+    if isinstance(policy, ActorCriticPolicy):
+        features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
+        return policy.action_net(policy.mlp_extractor.forward_actor(features))
+    actor = policy.actor
+    if hasattr(actor, "get_action_dist_params"):  # SAC and its kin squash a Gaussian
+        return th.tanh(actor.get_action_dist_params(observations)[0])
+    return actor(observations)
+
+
+def set_noise(policy: BasePolicy, std: th.Tensor) -> None:
+    """Gives a stochastic policy's actions a standard deviation (m,), whatever is observed."""
+    with th.no_grad():
+        if isinstance(policy, ActorCriticPolicy):
+            policy.log_std.copy_(std.log())
+        elif isinstance(getattr(policy.actor, "log_std", None), nn.Linear):
+            # Of the Gaussian before it is squashed; near zero, where most actions are, that is nearly the same.
+            policy.actor.log_std.weight.zero_()
+            policy.actor.log_std.bias.copy_(std.log())
+
+
+def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
+    """Copies the mean action's weights between policies with the same network.
+
+    Raises:
+        ValueError: the networks differ.
+
+    """
+    pairs = list(zip(_actor_tensors(source), _actor_tensors(target), strict=False))
+    count = len(_actor_tensors(source)), len(_actor_tensors(target))
+    if count[0] != count[1] or any(a.shape != b.shape for a, b in pairs):
+        shapes = [[tuple(t.shape) for t in _actor_tensors(policy)] for policy in (source, target)]
+        raise ValueError(f"policy: its network has the shapes {shapes[0]}, the model's {shapes[1]}")
+    with th.no_grad():
+        for a, b in pairs:
+            b.copy_(a)
+
+
+def _actor_tensors(policy: BasePolicy) -> list[th.Tensor]:
+    """Weights from the observation to the mean action, in order."""
+    if isinstance(policy, ActorCriticPolicy):
+        return [p.data for p in actor_parameters(policy)]
+    noise = getattr(policy.actor, "log_std", None)
+    skipped = {id(p) for p in noise.parameters()} if isinstance(noise, nn.Module) else set()
+    return [p.data for p in policy.actor.parameters() if id(p) not in skipped]

@@ -1,0 +1,80 @@
+"""Demonstrations in the replay buffer of an off-policy learner."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from leapnav.training.dataset import Dataset
+
+
+class DemonstrationReplayBuffer(ReplayBuffer):
+    """A replay buffer of which a share of every batch is drawn from demonstrations, which are never overwritten.
+
+    For `SAC(..., replay_buffer_class=DemonstrationReplayBuffer, replay_buffer_kwargs={"dataset": ..., "share": 0.25})`,
+    after P. Ball, L. Smith, I. Kostrikov and S. Levine, "Efficient online reinforcement learning with offline data"
+    (ICML 2023), where the share is a half.
+
+    Args:
+        args, kwargs: of `ReplayBuffer`.
+        dataset: the demonstrations.
+        share: of a batch that is demonstrations; what the demonstrations lack, rewards, makes them unusable.
+        reward_scale: factor of the demonstrations' rewards, as that of the environment's.
+
+    Raises:
+        ValueError: no transition of the dataset has a reward, or the share is impossible.
+
+    """
+
+    def __init__(
+        self, *args: Any, dataset: Dataset, share: float = 0.25, reward_scale: float = 1.0, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        if not 0 < share < 1:
+            raise ValueError(f"share: expected a number in (0, 1), got {share!r}")
+        self.share = share
+        self.demonstrate(dataset, reward_scale)
+
+    def demonstrate(self, dataset: Dataset, reward_scale: float = 1.0) -> None:
+        """Draws from these demonstrations from now on; a buffer that was loaded from a file has none.
+
+        Raises:
+            ValueError: no transition of the dataset has a reward.
+
+        """
+        last = np.append(dataset.episodes[1:] != dataset.episodes[:-1], True)
+        following = np.arange(len(dataset)) + ~last  # after the last step nothing follows, so any observation does
+        usable = np.isfinite(dataset.rewards)
+        if not usable.any():
+            raise ValueError("dataset: no transition has a reward; demonstrations from `leapnav rollout` have")
+        self._demonstrated = (
+            dataset.observations[usable],
+            dataset.executed[usable],
+            dataset.observations[following][usable],
+            last[usable].astype(np.float32)[:, None],
+            (reward_scale * dataset.rewards[usable]).astype(np.float32)[:, None],
+        )
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """A batch, the demonstrations last.
+
+        Raises:
+            ValueError: there is a `VecNormalize`, whose running statistics the demonstrations do not have.
+
+        """
+        if env is not None:
+            raise ValueError("env: demonstrations cannot be normalised by a VecNormalize; scale the rewards instead")
+        count = round(self.share * batch_size)
+        driven = super().sample(batch_size - count)
+        chosen = np.random.randint(0, len(self._demonstrated[0]), size=count)  # noqa: NPY002 (as for the others)
+        demonstrated = [self.to_torch(column[chosen]) for column in self._demonstrated]
+        return ReplayBufferSamples(*(th.cat(pair) for pair in zip(driven[:5], demonstrated, strict=True)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A checkpoint need not hold the demonstrations again.
+        return {name: value for name, value in self.__dict__.items() if name != "_demonstrated"}
