@@ -1,7 +1,8 @@
 # `make demo` and `make test` work in a fresh clone; both set up .venv first.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py training/*.py))
+SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py \
+    training/*.py training/*.toml training/*.jinja training/shipped/*/*))
 
 .PHONY: demo test lint types bench clean
 .DELETE_ON_ERROR:

@@ -27,13 +27,14 @@ from leapnav.experts.problem import Path
 from leapnav.experts.solve import solve
 
 ENVIRONMENT = "leapnav/Navigate-v0"
+CONTROL_PERIOD = 0.05  # s, the environment's by default, in which demonstrations are driven
 # A recovery starts from a state of the optimum pushed by this much (m, m, rad; standard deviations).
 PUSH = np.array([0.15, 0.15, 0.3])
 PUSH_FADES = 0.5  # s over which the guess returns to the optimum
 LAST_PUSH = 1.0  # s before the horizon: later the robot could not recover
 PUSH_CLEARANCE = 0.02  # m
 # Of a dataset's environment. No episode is as long, but d3rlpy insists on a limit.
-MOST_STEPS = math.ceil(LONGEST_HORIZON / 0.05) + 1
+MOST_STEPS = math.ceil(LONGEST_HORIZON / CONTROL_PERIOD) + 1
 SCORED = 100  # scenarios that random actions are scored on
 # A pushed robot whose solution costs this much more than the rest of the optimum has left for another local optimum.
 RECOVERY_COST = (2.0, 1.0)  # factor, summand
@@ -63,7 +64,7 @@ class Demonstration:
     @property
     def path(self) -> Path:
         """The optimum at the control periods' ends, with costates."""
-        times = np.linspace(0.0, self.scenario.horizon, len(self.states))
+        times = np.minimum(CONTROL_PERIOD * np.arange(len(self.states)), self.scenario.horizon)
         return Path(times, self.states, self.costates)
 
     @property

@@ -23,10 +23,20 @@ from leapnav.experts.problem import Path
 FEEDBACKS = ("resolve", "gains", "none")
 FEWEST_ROBOTS = 8  # for which threads are worth their while
 TOO_LATE = 1.0  # s before the horizon from which on there is only one way to the goal
+AGAIN = 1.0  # s between searches for a better way
 
 
 class NoOptimumError(RuntimeError):
-    """The expert has no certified optimum of a scenario. The message names the scenario and the solver's status."""
+    """The expert has no certified optimum of a scenario. The message names the scenario and the solver's status.
+
+    Attributes:
+        scenario: which one.
+
+    """
+
+    def __init__(self, message: str, scenario: Scenario) -> None:
+        super().__init__(message)
+        self.scenario = scenario
 
 
 def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) -> np.ndarray:
@@ -65,6 +75,7 @@ class _Robot:
     feedback: Feedback
     gains: Gains | None
     promised: float = math.nan  # cost of the whole episode, as the last search had it
+    searched: float = -math.inf  # s, when that was
     label: tuple[float, np.ndarray] = (math.nan, np.full(3, math.nan))  # cost-to-go and costate of the last action
 
 
@@ -82,8 +93,9 @@ class ExpertPolicy:
             optimum of the episode's start, a hundred times cheaper and good near it. "none": the optimum of the start,
             whatever happens.
         reconsider: for "resolve": search anew, for a better way than the one that the robot is on, whenever the cost of
-            the episode, paid and to go, has grown by this share since the last search; None never does. A teacher
-            should: what is best must depend on where the robot is, not on how it came there.
+            the episode, paid and to go, has grown by this share since the last search, but not twice within a second;
+            None never does. A teacher should: what is best must depend on where the robot is, not on how it came there.
+            These searches, and those where a re-solve fails, then take the most promising ways only.
         workers: threads for many robots; None for one on each core.
 
     Raises:
@@ -211,7 +223,9 @@ class ExpertPolicy:
         if math.isnan(robot.promised):  # the first step
             robot.promised = total
         left = situation.scenario.horizon - situation.time
-        if total > (1 + share) * robot.promised and left > TOO_LATE:
+        due = situation.time >= robot.searched + AGAIN and left > TOO_LATE
+        if due and total > (1 + share) * robot.promised:
+            robot.searched = situation.time
             if robot.feedback.reconsider(situation.pose, situation.time):
                 total = situation.cost + robot.feedback.stored[0]
             robot.promised = total
@@ -230,12 +244,13 @@ class ExpertPolicy:
         if path is None:
             optimum = find_optimum(scenario)
             if not optimum.success:
-                raise NoOptimumError(f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}")
+                message = f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}"
+                raise NoOptimumError(message, scenario)
             path = Path(optimum.times, optimum.states, optimum.costates)
         try:
-            feedback = Feedback(scenario, path)
+            feedback = Feedback(scenario, path, quick=self._reconsider is not None)
         except ValueError as error:
-            raise NoOptimumError(str(error)) from None
+            raise NoOptimumError(str(error), scenario) from None
         limits = np.array([scenario.robot.max_speed, scenario.robot.max_turn_rate])
         gains = feedback.gains() if self._feedback == "gains" else None
         robot = _Robot(scenario, situation.time, limits, feedback, gains)

@@ -6,16 +6,17 @@ import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import gymnasium as gym
 from rich.console import Console
 
-from leapnav.experts.demonstrations import load_demonstrations
+from leapnav.envs.bank import ScenarioBank
+from leapnav.envs.navigation import NavigateEnv
 from leapnav.experts.rollouts import rollout
 from leapnav.training.cloning import behaviour_clone
 from leapnav.training.config import CloningConfig
-from leapnav.training.evaluation import evaluate
+from leapnav.training.contest import contest
+from leapnav.training.entrants import load_entrant
 from leapnav.training.policies import make_policy, save_policy
-from leapnav.training.reports import plot_gallery, print_scores, write_scores
+from leapnav.training.reports import plot_episodes, plot_scores, print_scores, write_scores
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,6 @@ class DemoSettings:
     training_seed: int = 0
     recoveries: int = 4
     test_scenarios: int = 200
-    test_seed: int = 1_000_000
     workers: int = 2
     cloning: CloningConfig = field(default_factory=CloningConfig)
 
@@ -47,37 +47,39 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
     record.write_text(now)
 
     console = Console()
-    training, test, policy_folder = out / "demonstrations", out / "references", out / "policy"
-    for folder, count, seed, recoveries in (
-        (training, settings.training_scenarios, settings.training_seed, settings.recoveries),
-        (test, settings.test_scenarios, settings.test_seed, 0),
-    ):
-        if any(folder.glob("**/metadata.json")):
-            console.print(f"Using {folder}")
-        else:
-            rollout(settings.family, count, folder, seed=seed, recoveries=recoveries, workers=settings.workers)
-    if (policy_folder / "policy.json").exists():
-        console.print(f"Using {policy_folder}")
+    demonstrations, folder = out / "demonstrations", out / "policy"
+    if any(demonstrations.glob("**/metadata.json")):
+        console.print(f"Using {demonstrations}")
     else:
-        env = gym.make("leapnav/Navigate-v0", family=settings.family)
+        rollout(
+            settings.family,
+            settings.training_scenarios,
+            demonstrations,
+            seed=settings.training_seed,
+            recoveries=settings.recoveries,
+            workers=settings.workers,
+        )
+    if (folder / "policy.json").exists():
+        console.print(f"Using {folder}")
+    else:
+        env = NavigateEnv(settings.family)
         policy = make_policy(env.observation_space, env.action_space, settings.cloning.seed)
-        behaviour_clone(policy, load_demonstrations(training), settings.cloning)
-        save_policy(policy, policy_folder, {"id": "leapnav/Navigate-v0"})
+        behaviour_clone(policy, demonstrations, settings.cloning)
+        save_policy(policy, folder)
 
-    references = load_demonstrations(test)
-    names = {"expert": "expert", str(policy_folder): "clone", "random": "random"}
-    scores, episodes = evaluate(list(names), references)
-    table = [type(row)(**{**row.__dict__, "policy": names[row.policy]}) for row in scores]
-    played = {names[name]: found for name, found in episodes.items()}
-    write_scores(table, played, out / "scores.json")
-    plot_gallery(references[:8], played["clone"][:8], out / "episodes.png")
-    print_scores(table, console)
+    entrants = [load_entrant(name) for name in ("expert", f"clone={folder}", "go-to-goal", "random")]
+    bank = ScenarioBank.shipped(settings.family, "test")
+    found = contest(entrants, [bank], count=settings.test_scenarios)
+    write_scores(found, out / "scores.json")
+    plot_scores(found, out / "scores.png")
+    plot_episodes([bank], found.runs["clone"][0].episodes, out / "episodes.png")
+    print_scores(found, console)
     console.print(f"Results in {out}:")
     for name, what in (
         ("demonstrations", "the training data, a Minari dataset"),
-        ("references", "the test scenarios with their optima, a Minari dataset"),
         ("policy", "the clone"),
         ("scores.json", "the table, and every episode"),
+        ("scores.png", "the table as a picture, and the performance profiles"),
         ("episodes.png", "test scenarios: the optimum dashed, the clone's path in blue, red where it failed"),
     ):
         console.print(f"  {name:<15} {what}", soft_wrap=True)

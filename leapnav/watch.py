@@ -20,7 +20,8 @@ class Watch:
     """Watch a policy drive beside the optimum (the orange line), in a window or as a video."""
 
     policy: str = "expert"
-    """Folder of a policy, or "expert", or "random"."""
+    """Folder of a policy or of a run, "expert", "random", "go-to-goal", or a family or "all" for a policy that ships
+    with leapnav."""
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     split: Literal["train", "test", "fresh"] = "test"
@@ -126,6 +127,6 @@ class Watch:
             print(f"{scenario}: {result} after {info['time']:.1f} s, cost {info['cost']:.3f}{optimum}")
 
     def _load(self, env: gym.Env[Any, Any]) -> Policy:
-        from leapnav.training.evaluation import load_entrant
+        from leapnav.training.entrants import make_entrant
 
-        return load_entrant(self.policy, env, seed=self.seed)
+        return make_entrant(self.policy, env, seed=self.seed)

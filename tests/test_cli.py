@@ -140,8 +140,12 @@ def test_missing_files_and_folders_are_named_before_the_work(scenario_file, tmp_
         ["solve", scenario_file[0], "--json", missing / "out.json"],
         ["solve", scenario_file[0], "--plot", missing / "out.png"],
         ["evaluate", missing],
-        ["evaluate", "expert", "--references", missing],
-        ["evaluate", "expert", "expert", "--references", missing],
+        ["evaluate", "expert", "--bank", missing],
+        ["evaluate", "expert", "expert", "--count", "1", "--family", "open"],
+        ["evaluate", "expert", "--family", "maze"],
+        ["evaluate", "expert", "--episodes-plot", missing / "out.png"],
+        ["report", missing],
+        ["report", tmp_path, "--out", missing / "report.html"],
         ["solve", scenario_file[0], "--plot", tmp_path],
         ["solve", scenario_file[0], "--plot", tmp_path / "nosuffix"],
         ["rollout", "--out", scenario_file[0] / "demos"],
@@ -151,11 +155,15 @@ def test_missing_files_and_folders_are_named_before_the_work(scenario_file, tmp_
         ["rollout", "--out", tmp_path / "out", "--count", "-3"],
         ["rollout", "--out", tmp_path],
         ["train", "bc", "--demos", missing, "--out", tmp_path / "policy"],
-        ["train", "bc", "--demos", missing, "--out", tmp_path],
+        ["train", "dagger", "--policy", missing, "--out", tmp_path / "policy"],
+        ["train", "ppo", "--family", "maze", "--out", tmp_path / "policy"],
+        ["train", "ppo", "--warm-start", missing, "--out", tmp_path / "policy"],
+        ["train", "ppo", "--resume", "--out", missing],
     ):
         code, line = failing(arguments, capsys)
         assert code == 2, arguments
         assert "missing" in line or "maze" in line or "-3" in line or str(tmp_path) in line or "policies" in line
+    assert not (tmp_path / "policy").exists()
 
 
 def test_a_plot_in_an_unknown_format_is_refused(scenario_file, tmp_path, capsys):
@@ -164,23 +172,37 @@ def test_a_plot_in_an_unknown_format_is_refused(scenario_file, tmp_path, capsys)
     assert "xyz" in line
 
 
-def test_rollout_train_and_evaluate_work_together(tmp_path, capsys):
-    demos, policy, table = tmp_path / "demos", tmp_path / "policy", tmp_path / "scores.json"
+def test_rollout_train_evaluate_and_report_work_together(tmp_path, capsys):
+    demos, run, table = tmp_path / "demos", tmp_path / "run", tmp_path / "scores.json"
     assert main(["rollout", "--family", "open", "--count", "6", "--workers", "1", "--out", str(demos)]) == 0
-    assert main(["train", "bc", "--demos", str(demos), "--out", str(policy), "--epochs", "2"]) == 0
-    arguments = ["evaluate", "expert", str(policy), "--references", str(demos), "--json", str(table)]
-    assert main([*arguments, "--plot", str(tmp_path / "plot.png")]) == 0
+    train = ["train", "bc", "--family", "open", "--demos", str(demos), "--out", str(run), "--cloning.epochs", "2"]
+    assert main([*train, "--hidden", "16", "16", "--evaluation-scenarios", "2"]) == 0
+    assert "open: success" in capsys.readouterr().out
+    arguments = ["evaluate", "expert", str(run), "go-to-goal", "--family", "open", "--count", "3", "--json", str(table)]
+    plots = ["--plot", str(tmp_path / "plot.png"), "--episodes-plot", str(tmp_path / "episodes.png")]
+    assert main([*arguments, *plots]) == 0
     rows = json.loads(table.read_text())["scores"]
-    assert [row["policy"] for row in rows] == ["expert", str(policy)]
+    assert [row["policy"] for row in rows] == ["expert", str(run), "go-to-goal"]
     assert rows[0]["success"]["value"] == 1.0
     assert (tmp_path / "plot.png").exists()
-    assert failing(["train", "bc", "--demos", demos, "--out", policy], capsys)[0] == 2
+    assert (tmp_path / "episodes.png").exists()
+    assert main(["report", str(run), "--count", "2", "--out", str(tmp_path / "report.html")]) == 0
+    assert "<svg" in (tmp_path / "report.html").read_text()
+    assert failing(train, capsys)[0] == 2
     assert failing(["rollout", "--count", "1", "--out", demos], capsys)[0] == 2
+    # What the run was made with need not be said again, and must not be said otherwise.
+    assert main(["train", "bc", "--out", str(run), "--resume"]) == 0
+    code, line = failing(["train", "bc", "--out", run, "--resume", "--seed", "5"], capsys)
+    assert code == 2
+    assert "seed: the run in" in line
 
 
-def test_evaluate_solves_its_own_references(capsys):
-    assert main(["evaluate", "expert", "--family", "open", "--count", "2", "--workers", "1"]) == 0
-    assert "expert" in capsys.readouterr().out
+def test_a_bank_of_ones_own_can_be_played(tmp_path, capsys):
+    bank = tmp_path / "mine.bank"
+    arguments = ["bank", "build", "--family", "open", "--count", "3", "--seed", "5", "--workers", "1"]
+    assert main([*arguments, "--out", str(bank)]) == 0
+    assert main(["evaluate", "expert", "--bank", str(bank)]) == 0
+    assert "3 scenarios" in capsys.readouterr().out
 
 
 def test_the_demo_runs_and_a_second_run_uses_what_is_there(tmp_path, capsys):
@@ -189,18 +211,21 @@ def test_the_demo_runs_and_a_second_run_uses_what_is_there(tmp_path, capsys):
     )
     run_demo(tmp_path, settings)
     weights = (tmp_path / "policy" / "weights.pt").stat().st_mtime_ns
-    scores = (tmp_path / "scores.json").read_text()
+    scores = [line for line in (tmp_path / "scores.json").read_text().splitlines() if "milliseconds" not in line]
     assert "clone" in capsys.readouterr().out
     assert (tmp_path / "episodes.png").exists()
     run_demo(tmp_path, settings)
     assert "Using" in capsys.readouterr().out
     assert (tmp_path / "policy" / "weights.pt").stat().st_mtime_ns == weights
-    assert (tmp_path / "scores.json").read_text() == scores
+    again = (tmp_path / "scores.json").read_text().splitlines()
+    assert [line for line in again if "milliseconds" not in line] == scores
     with pytest.raises(ValueError, match="other settings"):
         run_demo(tmp_path, DemoSettings())
 
 
-@pytest.mark.parametrize("command", [[], ["solve"], ["rollout"], ["train"], ["evaluate"], ["watch"], ["demo"]])
+@pytest.mark.parametrize(
+    "command", [[], ["solve"], ["rollout"], ["train"], ["train", "ppo"], ["evaluate"], ["report"], ["watch"], ["demo"]]
+)
 def test_every_command_has_help(command):
     done = subprocess.run(
         [sys.executable, "-m", "leapnav", *command, "--help"], capture_output=True, text=True, check=False

@@ -164,7 +164,7 @@ def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
 
 def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
     def config(out, **changes):
-        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, steps=20)}
+        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, failures=4, successes=1)}
         return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
 
     train_dagger(config(tmp_path / "straight"), progress=False)

@@ -28,6 +28,7 @@ from leapnav.training import (
 from leapnav.training.actors import copy_actor, mean_action
 from leapnav.training.cloning import Cloning
 from leapnav.training.symmetries import mirror, turn_round
+from leapnav.training.vec_env import ScaledReward
 
 QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)
 SMALL = (32, 32)
@@ -395,12 +396,19 @@ def test_dagger_labels_what_the_learner_sees(dataset, env, tmp_path):
     policy = fresh(env)
     behaviour_clone(policy, dataset, QUICK, progress=False)
     venv = make_vec_env(n_envs=4, family="open", split="fresh")
-    config = DAggerConfig(rounds=2, steps=60, expert_share=0.5)
+    config = DAggerConfig(rounds=2, failures=5, successes=2, expert_share=0.5)
     dagger = DAgger(
-        policy, ExpertPolicy(venv), venv, config, cloning=QUICK, dataset=dataset, folder=tmp_path / "rounds"
+        policy,
+        ExpertPolicy(venv, reconsider=0.1),
+        venv,
+        config,
+        cloning=QUICK,
+        dataset=dataset,
+        folder=tmp_path / "rounds",
     )
     rounds = dagger.run(progress=False)
     assert [done.number for done in rounds] == [1, 2]
+    assert all(done.episodes >= 5 for done in rounds)
     assert len(dagger.dataset) == len(dataset) + sum(done.samples for done in rounds)
     kept = Dataset.load(tmp_path / "rounds" / "round-001.npz")
     assert len(kept) == rounds[0].samples
@@ -424,7 +432,7 @@ def test_dagger_with_the_same_seed_is_the_same(dataset, env):
     for _ in range(2):
         policy = fresh(env)
         venv = make_vec_env(n_envs=2, family="open", split="fresh")
-        config = DAggerConfig(rounds=1, steps=20, seed=4)
+        config = DAggerConfig(rounds=1, failures=3, successes=0, seed=4)
         DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK).run(progress=False)
         weights.append(policy.parameters_to_vector())
     assert weights[0].tobytes() == weights[1].tobytes()
@@ -435,3 +443,16 @@ def test_bad_settings_of_dagger_are_named(settings, env):
     venv = make_vec_env(n_envs=1, family="open", split="fresh")
     with pytest.raises(ValueError, match=f"{next(iter(settings))}: "):
         DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(**settings))
+    with pytest.raises(TypeError, match="venv: expected one from"):
+        DAgger(fresh(env), ExpertPolicy(venv), ScaledReward(venv, 2.0))
+
+
+def test_dagger_labels_what_the_learner_failed_in_first(dataset, env):
+    """Where it always fails, all that is labelled are failures; the successes are a sample."""
+    venv = make_vec_env(n_envs=4, family="open", split="fresh", seed=0)
+    dagger = DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(rounds=1, failures=6, successes=3))
+    failed, succeeded, _ = dagger._drive("", False)
+    assert len(failed) >= 6
+    assert len(succeeded) == 0
+    labelled = dagger._label(failed[:2], 0, np.random.default_rng(0), "", False)
+    assert {Scenario.from_json(text) for text in labelled.scenarios} == set(failed[:2])

@@ -52,11 +52,11 @@ def test_an_observer_sees_what_the_environment_shows():
 
 def test_the_critic_of_ppo_is_the_cost_to_go(dataset):
     model = ppo(gamma=1.0)
-    config = WarmStartConfig(critic_epochs=30, critic_batch_size=512, slopes=5000)
+    config = WarmStartConfig(critic_epochs=90, critic_batch_size=512, slopes=5000)
     found = warm_start(model, dataset, config, cloning=CLONING, reward_scale=0.1, progress=False)
     assert len(found.cloning) == 4
     assert found.value_error < 0.02
-    assert found.slope_error < 0.5
+    assert found.slope_error < 0.3
     with th.no_grad():
         values = model.policy.predict_values(th.as_tensor(dataset.observations)).numpy()[:, 0]
     assert np.mean((values - 0.1 * dataset.returns) ** 2) < 0.02 * np.var(0.1 * dataset.returns)
@@ -68,7 +68,7 @@ def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
     errors = []
     for gradient in (True, False):
         model = ppo(gamma=1.0)
-        config = WarmStartConfig(actor=False, critic_epochs=30, critic_batch_size=512, slopes=5000, gradient=gradient)
+        config = WarmStartConfig(actor=False, critic_epochs=90, critic_batch_size=512, slopes=5000, gradient=gradient)
         warm_start(model, dataset, config, progress=False)
         squares = []
         for scenario in test:
@@ -88,7 +88,7 @@ def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
 def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
     """At the expert's action the value; at others less, by what the Hamiltonian says."""
     model = SAC("MlpPolicy", make_vec_env(n_envs=1, family="open"), policy_kwargs=small(), gamma=1.0, seed=0)
-    config = WarmStartConfig(actor=False, critic_epochs=30, critic_batch_size=512, slopes=5000)
+    config = WarmStartConfig(actor=False, critic_epochs=90, critic_batch_size=512, slopes=5000)
     found = warm_start(model, dataset, config, progress=False)
     assert found.value_error < 0.05
     states = model.critic.state_dict()
@@ -96,7 +96,7 @@ def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
 
 
 def test_discounted_values_shrink():
-    from leapnav.training.warm_start import _discounting
+    from leapnav.training.warmstart import _discounting
 
     # Ten steps of cost 1 each.
     assert _discounting(np.array([0.5]), 0.9) * 10 == pytest.approx(sum(0.9**k for k in range(10)))

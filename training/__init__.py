@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from leapnav.training.reinforcement import train_ppo, train_sac
     from leapnav.training.scores import Interval, Score, profile, score
     from leapnav.training.vec_env import NavigateVecEnv, make_vec_env
-    from leapnav.training.warm_start import WarmStart, warm_start
+    from leapnav.training.warmstart import WarmStart, warm_start
 
 __all__ = [
     "BCConfig",
@@ -86,7 +86,7 @@ _MODULES = {
     "reinforcement": ("train_ppo", "train_sac"),
     "scores": ("Interval", "Score", "profile", "score"),
     "vec_env": ("NavigateVecEnv", "make_vec_env"),
-    "warm_start": ("WarmStart", "warm_start"),
+    "warmstart": ("WarmStart", "warm_start"),
 }
 
 

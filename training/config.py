@@ -42,17 +42,21 @@ class CloningConfig:
 class DAggerConfig:
     """Settings of dataset aggregation."""
 
-    rounds: int = 16
-    """How often the learner drives and the expert labels what it sees."""
-    steps: int = 400
-    """Control periods of each robot in a round."""
-    expert_share: float = 0.5
-    """Share of the first round's episodes that the expert drives; the others the learner."""
+    rounds: int = 10
+    """How often the learner drives, the expert labels what it has seen, and the learner is fitted to all of it."""
+    failures: int = 250
+    """Episodes of each round that are labelled because the learner failed; it drives until it has failed so often."""
+    successes: int = 50
+    """Episodes of each round that are labelled though it succeeded."""
+    episodes: int = 6000
+    """Episodes that the learner drives in a round at most."""
+    expert_share: float = 0.25
+    """Share of the first round's labelled episodes in which the expert drives, the others the learner again."""
     expert_decay: float = 0.5
     """Factor of that share from round to round."""
     epochs: int = 1
     """Passes over all samples after each round but the last."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     """Peak of the learning rate after each round but the last."""
     forgiven: float = 0.5
     """s before the horizon from which on labels are dropped: there the expert corrects what the tolerance forgives,
@@ -73,7 +77,7 @@ class WarmStartConfig:
     """Fit the critic's gradient to the costate too."""
     critic_epochs: int = 3
     """Passes over the samples, for the critic."""
-    critic_learning_rate: float = 1e-3
+    critic_learning_rate: float = 3e-3
     """Peak of the critic's learning rate, which then falls to zero along a cosine."""
     critic_batch_size: int = 4096
     """Samples per gradient step, for the critic."""

@@ -1,8 +1,9 @@
 """DAgger: the learner drives, the expert says what it would have done there, and the learner fits all of it.
 
 S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
-learning" (AISTATS 2011). Who drives is drawn for each episode, not for each step: a robot that changes hands at every
-step would see what neither of the two leads to.
+learning" (AISTATS 2011), with two changes. Who drives is drawn for each episode, not for each step: a robot that
+changes hands at every step would see what neither of the two leads to. And labels are dear but driving is cheap, so the
+learner drives many scenarios and mostly the episodes in which it failed are labelled: the others have little to teach.
 """
 
 from __future__ import annotations
@@ -20,12 +21,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
+from leapnav.envs.families import sample_scenario
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.policy import ExpertPolicy, NoOptimumError
 from leapnav.training.actors import policy_of
 from leapnav.training.cloning import Cloning, check_observations
 from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.dataset import Dataset
+from leapnav.training.vec_env import NavigateVecEnv
 
 SEEDS_PER_ROUND = 1_000_000  # more than there are robots
 
@@ -37,13 +40,15 @@ class Round:
     Attributes:
         number: from 1 on.
         samples: labelled in this round.
-        success, collision: rates of the episodes that the learner drove to their end; NaN without any.
+        episodes: that the learner drove before.
+        success, collision: their rates.
         loss: validation loss of the fit after it.
 
     """
 
     number: int
     samples: int
+    episodes: int
     success: float
     collision: float
     loss: float
@@ -54,19 +59,19 @@ class DAgger:
 
     Args:
         model: an algorithm of Stable-Baselines3 or its policy, trained in place; best a clone already.
-        expert: an `ExpertPolicy` for `venv`.
-        venv: the robots, see `make_vec_env`; fresh scenarios (`split="fresh"`) teach most.
+        expert: an `ExpertPolicy` for `venv`; with `reconsider`, so that its labels depend on where the robot is alone.
+        venv: the robots, from `make_vec_env`; fresh scenarios (`split="fresh"`) teach most.
         config: settings.
         cloning: settings of the last fit, over all samples; its loss and its batches are those of the others too.
         dataset: what is there already: a `Dataset`, a folder, or demonstrations.
-        folder: where each round's samples are kept; rounds that are there already are not driven again. None keeps them
-            in memory.
+        folder: where each round's samples are kept; None keeps them in memory.
 
     Attributes:
         dataset: all samples so far.
         rounds: what each brought.
 
     Raises:
+        TypeError: the robots are none of leapnav's.
         ValueError: a setting is impossible, or observations do not fit.
 
     """
@@ -82,6 +87,8 @@ class DAgger:
         dataset: Dataset | str | os.PathLike[str] | Sequence[Any] | None = None,
         folder: str | os.PathLike[str] | None = None,
     ) -> None:
+        if not isinstance(venv, NavigateVecEnv):
+            raise TypeError(f"venv: expected one from leapnav.training.make_vec_env, got {type(venv).__name__}")
         self.config, self._cloning = config or DAggerConfig(), cloning or CloningConfig()
         _check(self.config)
         self._policy, self._expert, self._venv = policy_of(model), expert, venv
@@ -118,24 +125,30 @@ class DAgger:
 
     def run_round(self, *, progress: bool = True) -> Round:
         """Drives, labels and fits once."""
-        number = len(self.rounds)
-        path = None if self._folder is None else self._folder / f"round-{number + 1:03d}.npz"
-        samples, success, collision = self._drive(number, progress)
-        if path is not None:
-            samples.save(path)
+        number, config = len(self.rounds), self.config
+        rng = np.random.default_rng([config.seed, number])
+        name = f"Round {number + 1} of {config.rounds}"
+        self._venv.seed(config.seed + SEEDS_PER_ROUND * (number + 1))
+        failed, succeeded, collision = self._drive(name, progress)
+        count = len(failed) + len(succeeded)
+        chosen = failed[: config.failures]
+        chosen += [succeeded[i] for i in rng.permutation(len(succeeded))[: config.successes]]
+        samples = self._label([chosen[i] for i in rng.permutation(len(chosen))], number, rng, name, progress)
+        if self._folder is not None:
+            samples.save(self._folder / f"round-{number + 1:03d}.npz")
         self._parts.append(samples)
-        last = number + 1 == self.config.rounds
-        settings = self._cloning
-        if not last:
-            settings = replace(settings, epochs=self.config.epochs, learning_rate=self.config.learning_rate, patience=0)
-        fit = Cloning(self._policy, self.dataset, replace(settings, seed=settings.seed + number))
+        settings = replace(self._cloning, seed=self._cloning.seed + number)
+        if number + 1 < config.rounds:
+            settings = replace(settings, epochs=config.epochs, learning_rate=config.learning_rate, patience=0)
+        fit = Cloning(self._policy, self.dataset, settings)
         with tqdm(total=settings.epochs * fit.batches, desc="Fitting", unit="batch", disable=not progress) as bar:
             while not fit.finished:
                 fit.run_epoch(bar.update)
         fit.finish()
         validation = min(loss.validation for loss in fit.losses)
-        self.rounds.append(Round(number + 1, len(samples), success, collision, validation))
-        return self.rounds[-1]
+        done = Round(number + 1, len(samples), count, len(succeeded) / count, collision / count, validation)
+        self.rounds.append(done)
+        return done
 
     def restore(self, rounds: Sequence[Round]) -> None:
         """Takes up a run after these rounds, whose samples are in the folder; the model is the caller's business.
@@ -149,49 +162,74 @@ class DAgger:
             self._parts.append(Dataset.load(self._folder / f"round-{done.number:03d}.npz"))
             self.rounds.append(done)
 
-    def _drive(self, number: int, progress: bool) -> tuple[Dataset, float, float]:
-        """A round's samples, and how the learner's own episodes ended."""
-        config, count = self.config, self._venv.num_envs
-        rng = np.random.default_rng([config.seed, number])
-        share = config.expert_share * config.expert_decay**number
-        self._venv.seed(config.seed + SEEDS_PER_ROUND * (number + 1))
+    def _drive(self, name: str, progress: bool) -> tuple[list[Scenario], list[Scenario], int]:
+        """The scenarios in which the learner failed and those in which it succeeded, and how often it collided."""
+        failed, succeeded, collisions = list[Scenario](), list[Scenario](), 0
         observations = np.asarray(self._venv.reset())
-        guided = rng.random(count) < share
-        self._playing: list[Scenario | None] = [None] * count  # of each robot, and its number among the texts
-        self._episode, self._texts = np.zeros(count, dtype=int), list[str]()
-        columns: list[dict[str, np.ndarray]] = []
-        ends: list[tuple[bool, bool]] = []
-        desc = f"Round {number + 1} of {config.rounds}"
-        for _ in tqdm(range(config.steps), desc=desc, unit="step", disable=not progress):
-            try:
-                labels, _ = self._expert.predict(observations)
-            except NoOptimumError:  # of a fresh scenario: nobody has promised one
-                observations, guided = np.asarray(self._venv.reset()), rng.random(count) < share
-                continue
-            columns.append(self._labelled(observations, labels))
-            actions, _ = self._policy.predict(observations, deterministic=True)
-            actions = np.where(guided[:, None], labels, actions)
-            stepped, _, dones, infos = self._venv.step(actions)
-            observations = np.asarray(stepped)
-            for i in np.flatnonzero(dones).tolist():
-                if not guided[i]:
-                    ends.append((bool(infos[i]["is_success"]), bool(infos[i]["collision"])))
-                guided[i] = rng.random() < share
-        joined = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
-        samples = Dataset(**joined, scenarios=tuple(self._texts))
-        success, collision = np.mean(ends, axis=0).tolist() if ends else (math.nan, math.nan)
-        return samples, success, collision
+        playing = self._venv.get_attr("scenario")
+        with tqdm(total=self.config.failures, desc=f"{name}: driving", unit="failure", disable=not progress) as bar:
+            while len(failed) < self.config.failures and len(failed) + len(succeeded) < self.config.episodes:
+                actions, _ = self._policy.predict(observations, deterministic=True)
+                stepped, _, dones, infos = self._venv.step(actions)
+                observations = np.asarray(stepped)
+                for i in np.flatnonzero(dones).tolist():
+                    (succeeded if infos[i]["is_success"] else failed).append(playing[i])
+                    collisions += bool(infos[i]["collision"])
+                    bar.update(not infos[i]["is_success"])
+                if dones.any():
+                    playing = self._venv.get_attr("scenario")
+        return failed, succeeded, collisions
 
-    def _labelled(self, observations: np.ndarray, labels: np.ndarray) -> dict[str, np.ndarray]:
+    def _label(
+        self, scenarios: Sequence[Scenario], number: int, rng: np.random.Generator, name: str, progress: bool
+    ) -> Dataset:
+        """Drives scenarios once more, with the expert's labels."""
+        venv, count = self._venv, self._venv.num_envs
+        share = self.config.expert_share * self.config.expert_decay**number
+        waiting, guided = list(scenarios[::-1]), np.zeros(count, dtype=bool)
+        playing: list[tuple[int, Scenario] | None] = [None] * count  # of each robot: number and scenario
+        columns: list[dict[str, np.ndarray]] = []
+        texts: list[str] = []
+        observations = np.asarray(venv.reset())
+        idle = sample_scenario("open", 0)  # what robots without a task play: nobody looks, and its labels cost little
+        ended = np.ones(count, dtype=bool)
+        with tqdm(total=len(scenarios), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
+            while True:
+                for i in np.flatnonzero(ended).tolist():
+                    bar.update(playing[i] is not None)
+                    playing[i] = (len(texts), waiting.pop()) if waiting else None
+                    guided[i] = rng.random() < share
+                    if (task := playing[i]) is not None:
+                        texts.append(task[1].to_json())
+                if all(task is None for task in playing):
+                    break
+                if ended.any():
+                    observations = np.asarray(venv.restart(ended, [task[1] if task else idle for task in playing]))
+                try:
+                    labels, _ = self._expert.predict(observations)
+                except NoOptimumError as error:  # of a fresh scenario: nobody has promised one
+                    ended = np.array([task is not None and task[1] is error.scenario for task in playing])
+                    continue
+                costs, costates = self._expert.labels()
+                columns.append(self._labelled(observations, labels, costs, costates, playing))
+                actions, _ = self._policy.predict(observations, deterministic=True)
+                stepped, _, dones, _ = venv.step(np.where(guided[:, None], labels, actions))
+                observations = np.asarray(stepped)
+                ended = dones | ~np.isfinite(costs)  # out of reach of the goal there is nothing more to say
+        joined = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
+        return Dataset(**joined, scenarios=tuple(texts))
+
+    def _labelled(
+        self,
+        observations: np.ndarray,
+        labels: np.ndarray,
+        costs: np.ndarray,
+        costates: np.ndarray,
+        playing: Sequence[tuple[int, Scenario] | None],
+    ) -> dict[str, np.ndarray]:
         """What the expert says of the robots that can still reach their goals, and have time for it."""
-        costs, costates = self._expert.labels()
-        scenarios: list[Scenario] = self._venv.get_attr("scenario")
-        for i, scenario in enumerate(scenarios):
-            if scenario is not self._playing[i]:  # a new episode
-                self._playing[i], self._episode[i] = scenario, len(self._texts)
-                self._texts.append(scenario.to_json())
         times = np.array(self._venv.get_attr("time"))
-        left = np.array([scenario.horizon for scenario in scenarios]) - times
+        left = np.array([-math.inf if task is None else task[1].horizon for task in playing]) - times
         known = np.isfinite(costs) & (left >= self.config.forgiven)
         columns = {
             "observations": observations.copy(),
@@ -202,15 +240,17 @@ class DAgger:
             "times": times,
             "executed": labels,
             "rewards": np.full(len(labels), np.nan),  # what is driven is not what is labelled
-            "episodes": self._episode.copy(),
+            "episodes": np.array([-1 if task is None else task[0] for task in playing]),
         }
         return {name: values[known] for name, values in columns.items()}
 
 
 def _check(config: DAggerConfig) -> None:
-    for name in ("rounds", "steps", "epochs"):
+    for name in ("rounds", "failures", "episodes", "epochs"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name}: expected at least 1, got {getattr(config, name)!r}")
+    if config.successes < 0:
+        raise ValueError(f"successes: expected at least 0, got {config.successes!r}")
     for name in ("expert_share", "expert_decay"):
         if not 0 <= getattr(config, name) <= 1:
             raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(config, name)!r}")

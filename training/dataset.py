@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from leapnav.experts.demonstrations import ENVIRONMENT, Demonstration, open_dataset
+from leapnav.experts.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
 
 FORMAT = 1  # of the files
-CONTROL_PERIOD = 0.05  # s, that of the environment by default, in which demonstrations are driven
 
 
 @dataclass(frozen=True, eq=False)

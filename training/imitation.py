@@ -24,7 +24,7 @@ from leapnav.training.policies import load_policy, make_policy
 from leapnav.training.runs import Run
 from leapnav.training.vec_env import make_vec_env
 
-RECONSIDER = 0.03  # see `ExpertPolicy`: what the learner does is to be labelled by what is best from there
+RECONSIDER = 0.1  # see `ExpertPolicy`: what the learner does is to be labelled by what is best from there
 
 
 def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> list[Evaluation]:

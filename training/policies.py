@@ -150,14 +150,15 @@ def save_policy(
 
     """
     policy, folder = policy_of(model), Path(folder)
-    kind = next((name for name, type_ in _kinds().items() if type(policy) is type_), None)
+    kind = next((name for name, type_ in _kinds().items() if isinstance(policy, type_)), None)
     if kind is None or policy.features_extractor_class is not NavigationFeatures:
         raise ValueError(
             f"model: expected a policy made with policy_kwargs=leapnav.training.network(), got {type(policy).__name__}"
         )
     assert isinstance(policy.observation_space, spaces.Box)
     folder.mkdir(parents=True, exist_ok=True)
-    weights = policy.state_dict()
+    # The anchor of PPO's divergence belongs to the run, not to the policy.
+    weights = {name: value for name, value in policy.state_dict().items() if not name.startswith("anchor")}
     if half:
         weights = {name: value.half() for name, value in weights.items() if _is_of_actor(name)}
     description = {

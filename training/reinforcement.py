@@ -32,7 +32,7 @@ from leapnav.training.policies import load_policy, network
 from leapnav.training.replay import DemonstrationReplayBuffer
 from leapnav.training.runs import Run
 from leapnav.training.vec_env import ScaledReward, make_vec_env
-from leapnav.training.warm_start import warm_start
+from leapnav.training.warmstart import warm_start
 
 Config = PPOConfig | SACConfig
 

@@ -17,10 +17,11 @@ from tqdm.auto import tqdm
 
 from leapnav.envs.observer import Observer
 from leapnav.envs.scenario import Scenario
+from leapnav.experts.demonstrations import CONTROL_PERIOD
 from leapnav.training.actors import copy_actor, policy_of
 from leapnav.training.cloning import EpochLoss, behaviour_clone, check_observations
 from leapnav.training.config import CloningConfig, WarmStartConfig
-from leapnav.training.dataset import CONTROL_PERIOD, Dataset
+from leapnav.training.dataset import Dataset
 
 # The slope of the cost-to-go is fitted over this distance either way (m, m, rad; standard deviations of a random
 # direction): short beside what bends the cost-to-go, long beside a lidar's steps from one beam to the next.
