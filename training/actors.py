@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -25,12 +25,17 @@ def policy_of(model: BaseAlgorithm | BasePolicy) -> BasePolicy:
     return policy
 
 
+def _actor(policy: BasePolicy) -> Any:
+    """The actor of an off-policy algorithm, of whichever class."""
+    return policy.actor
+
+
 def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
     """The parameters that the mean action depends on."""
     if isinstance(policy, ActorCriticPolicy):
         modules = policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net
         return [parameter for module in modules for parameter in module.parameters()]
-    return list(policy.actor.parameters())
+    return list(_actor(policy).parameters())
 
 
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
@@ -38,7 +43,7 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     if isinstance(policy, ActorCriticPolicy):
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
         return policy.action_net(policy.mlp_extractor.forward_actor(features))
-    actor = policy.actor
+    actor = _actor(policy)
     if hasattr(actor, "get_action_dist_params"):  # SAC and its kin squash a Gaussian
         return th.tanh(actor.get_action_dist_params(observations)[0])
     return actor(observations)
@@ -49,10 +54,10 @@ def set_noise(policy: BasePolicy, std: th.Tensor) -> None:
     with th.no_grad():
         if isinstance(policy, ActorCriticPolicy):
             policy.log_std.copy_(std.log())
-        elif isinstance(getattr(policy.actor, "log_std", None), nn.Linear):
+        elif isinstance(getattr(_actor(policy), "log_std", None), nn.Linear):
             # Of the Gaussian before it is squashed; near zero, where most actions are, that is nearly the same.
-            policy.actor.log_std.weight.zero_()
-            policy.actor.log_std.bias.copy_(std.log())
+            _actor(policy).log_std.weight.zero_()
+            _actor(policy).log_std.bias.copy_(std.log())
 
 
 def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
@@ -76,6 +81,6 @@ def _actor_tensors(policy: BasePolicy) -> list[th.Tensor]:
     """Weights from the observation to the mean action, in order."""
     if isinstance(policy, ActorCriticPolicy):
         return [p.data for p in actor_parameters(policy)]
-    noise = getattr(policy.actor, "log_std", None)
+    noise = getattr(_actor(policy), "log_std", None)
     skipped = {id(p) for p in noise.parameters()} if isinstance(noise, nn.Module) else set()
-    return [p.data for p in policy.actor.parameters() if id(p) not in skipped]
+    return [p.data for p in _actor(policy).parameters() if id(p) not in skipped]

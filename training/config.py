@@ -280,8 +280,8 @@ def read_config(folder: Path) -> tuple[str, RunConfig]:
     if not record.is_file():
         raise FileNotFoundError(f"{record}: there is no run in this folder")
     try:
-        found = json.loads(record.read_text())["config"]
-        algorithm = {"tqc": "sac"}.get(found["algorithm"], found["algorithm"])
+        found: dict[str, Any] = json.loads(record.read_text())["config"]
+        algorithm = "sac" if found["algorithm"] == "tqc" else str(found["algorithm"])
         return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
             {name: value for name, value in found.items() if name != "algorithm" or algorithm == "sac"}
         )

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -269,7 +269,8 @@ def _time(entrant: Entrant, bank: ScenarioBank, settings: Mapping[str, Any]) -> 
 
 def _made(entrant: Entrant, env: Any, space: Any) -> Policy:
     """The policy for an environment."""
-    policy = entrant if hasattr(entrant, "predict") and not isinstance(entrant, type) else cast(Any, entrant)(env)
+    made: Any = entrant
+    policy: Policy = made if hasattr(made, "predict") and not isinstance(made, type) else made(env)
     learned = getattr(policy, "observation_space", None)
     if learned is not None and learned != space:
         raise ValueError(

@@ -161,6 +161,7 @@ def save_policy(
     weights = {name: value for name, value in policy.state_dict().items() if not name.startswith("anchor")}
     if half:
         weights = {name: value.half() for name, value in weights.items() if _is_of_actor(name)}
+    widths: Any = policy.net_arch
     description = {
         "format": FORMAT,
         "leapnav": leapnav.__version__,
@@ -168,8 +169,8 @@ def save_policy(
         "observation_low": policy.observation_space.low.tolist(),
         "observation_high": policy.observation_space.high.tolist(),
         "kind": kind,
-        "hidden": policy.net_arch["pi"],
-        "critic": policy.net_arch["vf"],
+        "hidden": widths["pi"],
+        "critic": widths["vf"],
         "actor_only": half,
         "training": dict(training or {}),
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch as th
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -256,10 +256,8 @@ class _Keeper(BaseCallback):
 
     def _write(self, folder: Path) -> None:
         self.model.save(folder / "model.zip", exclude=["replay_buffer_kwargs"])
-        if hasattr(self.model, "save_replay_buffer"):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                self.model.save_replay_buffer(folder / "replay_buffer.pkl")
+        if isinstance(self.model, OffPolicyAlgorithm):
+            self.model.save_replay_buffer(folder / "replay_buffer.pkl")
         with (folder / "robots.pkl").open("wb") as file:
             pickle.dump([part.state_dict() for part in _parts(self._venv)], file)
 

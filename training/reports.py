@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -154,7 +154,10 @@ def draw_profiles(axes: Axes, contest: Contest) -> None:
 
 
 def plot_episodes(
-    banks: Sequence[ScenarioBank], episodes: Sequence[Episode], path: str | os.PathLike[str], columns: int = 4
+    banks: Sequence[ScenarioBank],
+    episodes: Sequence[Episode],
+    path: str | os.PathLike[str] | IO[bytes],
+    columns: int = 4,
 ) -> None:
     """Writes a picture of a policy's best, median and worst episodes beside their optima.
 

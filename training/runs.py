@@ -203,12 +203,12 @@ class Run:
 
 
 def _generators() -> dict[str, Any]:
-    name, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 (Stable-Baselines3 draws from it)
-    assert name == "MT19937"
+    numpy_state: Any = np.random.get_state()  # noqa: NPY002 (Stable-Baselines3 draws from it)
+    _, keys, *rest = numpy_state
     return {
         "torch": th.get_rng_state(),
         "numpy": th.as_tensor(keys.astype(np.int64)),
-        "numpy_rest": [position, has_gauss, gauss],
+        "numpy_rest": rest,
         "python": list(random.getstate()),
     }
 

@@ -154,18 +154,17 @@ class _Critic:
     def __init__(self, policy: BasePolicy) -> None:
         self._policy = policy
         self.takes_actions = not isinstance(policy, ActorCriticPolicy)
-        modules: tuple[nn.Module, ...]
+        self._functions: Any = getattr(policy, "critic", None)
+        modules: tuple[nn.Module, ...] = (self._functions,)
         if isinstance(policy, ActorCriticPolicy):
             modules = policy.vf_features_extractor, policy.mlp_extractor.value_net, policy.value_net
-        else:
-            modules = (policy.critic,)
         self.parameters = [parameter for module in modules for parameter in module.parameters()]
 
     def values(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Estimates (B, n): of the one value network, of each Q function, or of their quantiles."""
         if isinstance(self._policy, ActorCriticPolicy):
             return self._policy.predict_values(observations)
-        found = self._policy.critic(observations, actions)
+        found = self._functions(observations, actions)
         if isinstance(found, tuple):
             return th.cat(found, dim=1)
         return found.flatten(start_dim=1)
@@ -176,9 +175,9 @@ class _Critic:
 
     def finish(self) -> None:
         """Makes a target network the same."""
-        target = getattr(self._policy, "critic_target", None)
+        target: Any = getattr(self._policy, "critic_target", None)
         if target is not None:
-            target.load_state_dict(self._policy.critic.state_dict())
+            target.load_state_dict(self._functions.state_dict())
 
 
 class _Slopes:
