@@ -40,6 +40,15 @@ def test_the_readme_s_examples_run_as_printed(block, output, tmp_path):
     assert re.fullmatch(output, done.stdout)
 
 
+def test_the_page_on_training_runs_as_printed(tmp_path):
+    """Its blocks build on each other."""
+    page = (ROOT / "docs" / "training.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "20 True\n1\n2 True\n"
+
+
 def test_the_readme_s_scenario_is_valid():
     (text,) = re.findall(r"```json\n(.*?)```", README, re.DOTALL)
     assert Scenario.from_json(text).obstacles
