@@ -19,6 +19,7 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 import leapnav
 from leapnav.envs.bank import ScenarioBank
@@ -141,6 +142,8 @@ def _curves(rows: dict[str, list[_Run]], families: Sequence[str]) -> list[dict[s
         for axes, measure in zip(panels, ("success", "soc"), strict=True):
             for number, (row, runs) in enumerate(rows.items()):
                 _draw_curve(axes, runs, axis, measure, CURVES[number % len(CURVES)], row)
+            if axis == "step":
+                axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.set(xlabel=label, ylabel={"success": "success rate", "soc": "SOC"}[measure], ylim=(-0.02, 1.02))
             axes.grid(alpha=0.3)
         panels[1].legend(frameon=False, fontsize=8)

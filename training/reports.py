@@ -32,10 +32,11 @@ COLUMNS = (
     ("success\n%", "success", 100, 1, 0),
     ("collision\n%", "collision", 100, 1, 0),
     ("SOC\n", "soc", 1, 3, 2),
-    ("SOC\nIQM", "soc_iqm", 1, 3, 3),
+    ("SOC\nIQM", "soc_iqm", 1, 3, 2),
     ("regret\n%, median", "regret", 100, 2, 2),
     ("clearance\nm, median", "clearance", 1, 2, 2),
 )
+ON_A_TERMINAL = 5  # columns, which have 80 characters; pages and files have all
 
 
 def print_scores(contest: Contest, console: Console | None = None) -> None:
@@ -49,12 +50,12 @@ def print_scores(contest: Contest, console: Console | None = None) -> None:
         padding=(0, 1, 0, 0),
         pad_edge=False,
     )
-    table.add_column("policy", min_width=6, overflow="fold")
-    for title, *_ in COLUMNS:
+    table.add_column("policy", min_width=10, overflow="fold")
+    for title, *_ in COLUMNS[:ON_A_TERMINAL]:
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("time\nms", justify="right", no_wrap=True)
     for row in scores:
-        cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS]
+        cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS[:ON_A_TERMINAL]]
         table.add_row(_name(row), *cells, f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-")
     console.print(table)
     if len(contest.families) > 1:
