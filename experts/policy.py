@@ -125,6 +125,11 @@ class ExpertPolicy:
         self._robots: list[_Robot | None] = [None] * sum(getattr(inner, "num_envs", 1) for inner in self._envs)
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """The arguments that make another expert like this one."""
+        return {"feedback": self._feedback, "reconsider": self._reconsider}
+
+    @property
     def searches(self) -> int:
         """How many new searches the robots' current episodes needed."""
         return sum(robot.feedback.searches for robot in self._robots if robot is not None)

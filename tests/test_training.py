@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import A2C, PPO, SAC, TD3
+from tqdm import tqdm
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.experts import ExpertPolicy
@@ -427,15 +428,19 @@ def test_dagger_labels_what_the_learner_sees(dataset, env, tmp_path):
         assert scenario.horizon - kept.times[i] >= config.forgiven
 
 
-def test_dagger_with_the_same_seed_is_the_same(dataset, env):
-    weights = []
-    for _ in range(2):
+def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, monkeypatch):
+    monkeypatch.setattr("leapnav.training.dagger.PORTION", 2)
+    found = []
+    for workers in (1, 1, 2):
         policy = fresh(env)
         venv = make_vec_env(n_envs=2, family="open", split="fresh")
-        config = DAggerConfig(rounds=1, failures=3, successes=0, seed=4)
-        DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK).run(progress=False)
-        weights.append(policy.parameters_to_vector())
-    assert weights[0].tobytes() == weights[1].tobytes()
+        config = DAggerConfig(rounds=1, failures=4, successes=0, seed=4)
+        dagger = DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK, workers=workers)
+        dagger.run(progress=False)
+        found.append((policy.parameters_to_vector().tobytes(), dagger.dataset.observations.tobytes()))
+    assert found[0] == found[1] == found[2]
+    with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
+        DAgger(fresh(env), ExpertPolicy(venv), venv, workers=0)
 
 
 @pytest.mark.parametrize("settings", [{"rounds": 0}, {"expert_share": 1.5}, {"learning_rate": -1.0}])
@@ -454,5 +459,5 @@ def test_dagger_labels_what_the_learner_failed_in_first(dataset, env):
     failed, succeeded, _ = dagger._drive("", False)
     assert len(failed) >= 6
     assert len(succeeded) == 0
-    labelled = dagger._label(failed[:2], 0, np.random.default_rng(0), "", False)
+    labelled = dagger._label(failed[:2], 0, np.random.default_rng(0), tqdm(disable=True))
     assert {Scenario.from_json(text) for text in labelled.scenarios} == set(failed[:2])

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
+from joblib import Parallel, delayed
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
@@ -23,6 +25,7 @@ from tqdm.auto import tqdm
 
 from leapnav.envs.families import sample_scenario
 from leapnav.envs.scenario import Scenario
+from leapnav.envs.vector import NavigateVectorEnv
 from leapnav.experts.policy import ExpertPolicy, NoOptimumError
 from leapnav.training.actors import policy_of
 from leapnav.training.cloning import Cloning, check_observations
@@ -31,6 +34,7 @@ from leapnav.training.dataset import Dataset
 from leapnav.training.vec_env import NavigateVecEnv
 
 SEEDS_PER_ROUND = 1_000_000  # more than there are robots
+PORTION = 32  # episodes that are labelled together
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ class DAgger:
         cloning: settings of the last fit, over all samples; its loss and its batches are those of the others too.
         dataset: what is there already: a `Dataset`, a folder, or demonstrations.
         folder: where each round's samples are kept; None keeps them in memory.
+        workers: processes that label; their number changes nothing in the samples.
 
     Attributes:
         dataset: all samples so far.
@@ -86,12 +91,15 @@ class DAgger:
         cloning: CloningConfig | None = None,
         dataset: Dataset | str | os.PathLike[str] | Sequence[Any] | None = None,
         folder: str | os.PathLike[str] | None = None,
+        workers: int = 1,
     ) -> None:
         if not isinstance(venv, NavigateVecEnv):
             raise TypeError(f"venv: expected one from leapnav.training.make_vec_env, got {type(venv).__name__}")
         self.config, self._cloning = config or DAggerConfig(), cloning or CloningConfig()
         _check(self.config)
-        self._policy, self._expert, self._venv = policy_of(model), expert, venv
+        if workers < 1:
+            raise ValueError(f"workers: expected at least 1, got {workers!r}")
+        self._policy, self._expert, self._venv, self._workers = policy_of(model), expert, venv, workers
         self._parts: list[Dataset] = [] if dataset is None else [Dataset.of(dataset)]
         if self._parts:
             check_observations(self._policy, self._parts[0])
@@ -133,7 +141,9 @@ class DAgger:
         count = len(failed) + len(succeeded)
         chosen = failed[: config.failures]
         chosen += [succeeded[i] for i in rng.permutation(len(succeeded))[: config.successes]]
-        samples = self._label([chosen[i] for i in rng.permutation(len(chosen))], number, rng, name, progress)
+        chosen = [chosen[i] for i in rng.permutation(len(chosen))]
+        with tqdm(total=len(chosen), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
+            samples = self._label(chosen, number, rng, bar)
         if self._folder is not None:
             samples.save(self._folder / f"round-{number + 1:03d}.npz")
         self._parts.append(samples)
@@ -180,69 +190,93 @@ class DAgger:
                     playing = self._venv.get_attr("scenario")
         return failed, succeeded, collisions
 
-    def _label(
-        self, scenarios: Sequence[Scenario], number: int, rng: np.random.Generator, name: str, progress: bool
-    ) -> Dataset:
+    def _label(self, scenarios: Sequence[Scenario], number: int, rng: np.random.Generator, bar: Any) -> Dataset:
         """Drives scenarios once more, with the expert's labels."""
-        venv, count = self._venv, self._venv.num_envs
         share = self.config.expert_share * self.config.expert_decay**number
-        waiting, guided = list(scenarios[::-1]), np.zeros(count, dtype=bool)
-        playing: list[tuple[int, Scenario] | None] = [None] * count  # of each robot: number and scenario
-        columns: list[dict[str, np.ndarray]] = []
-        texts: list[str] = []
-        observations = np.asarray(venv.reset())
-        idle = sample_scenario("open", 0)  # what robots without a task play: nobody looks, and its labels cost little
-        ended = np.ones(count, dtype=bool)
-        with tqdm(total=len(scenarios), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
-            while True:
-                for i in np.flatnonzero(ended).tolist():
-                    bar.update(playing[i] is not None)
-                    playing[i] = (len(texts), waiting.pop()) if waiting else None
-                    guided[i] = rng.random() < share
-                    if (task := playing[i]) is not None:
-                        texts.append(task[1].to_json())
-                if all(task is None for task in playing):
-                    break
-                if ended.any():
-                    observations = np.asarray(venv.restart(ended, [task[1] if task else idle for task in playing]))
-                try:
-                    labels, _ = self._expert.predict(observations)
-                except NoOptimumError as error:  # of a fresh scenario: nobody has promised one
-                    ended = np.array([task is not None and task[1] is error.scenario for task in playing])
-                    continue
-                costs, costates = self._expert.labels()
-                columns.append(self._labelled(observations, labels, costs, costates, playing))
-                actions, _ = self._policy.predict(observations, deterministic=True)
-                stepped, _, dones, _ = venv.step(np.where(guided[:, None], labels, actions))
-                observations = np.asarray(stepped)
-                ended = dones | ~np.isfinite(costs)  # out of reach of the goal there is nothing more to say
-        joined = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
-        return Dataset(**joined, scenarios=tuple(texts))
+        guided = rng.random(len(scenarios)) < share
+        # Always the same portions, so that the number of workers changes nothing.
+        portions = [
+            _Portion(scenarios[k : k + PORTION], guided[k : k + PORTION], self.config.forgiven)
+            for k in range(0, len(scenarios), PORTION)
+        ]
+        if self._workers == 1:
+            jobs = (_label(self._venv, self._expert, self._policy, portion) for portion in portions)
+        else:
+            run = delayed(_label_elsewhere)
+            tasks = (run(self._venv.venv, self._expert.settings, self._policy, portion) for portion in portions)
+            jobs = Parallel(self._workers, return_as="generator")(tasks)
+        parts = []
+        for part, portion in zip(jobs, portions, strict=True):
+            parts += [] if part is None else [part]
+            bar.update(len(portion.scenarios))
+        return Dataset.joined(parts)
 
-    def _labelled(
-        self,
-        observations: np.ndarray,
-        labels: np.ndarray,
-        costs: np.ndarray,
-        costates: np.ndarray,
-        playing: Sequence[tuple[int, Scenario] | None],
-    ) -> dict[str, np.ndarray]:
-        """What the expert says of the robots that can still reach their goals, and have time for it."""
-        times = np.array(self._venv.get_attr("time"))
+
+@dataclass(frozen=True)
+class _Portion:
+    """Scenarios to label, in which of them the expert drives, and how long before the horizon labels end (s)."""
+
+    scenarios: Sequence[Scenario]
+    guided: np.ndarray
+    forgiven: float
+
+
+def _label_elsewhere(
+    robots: NavigateVectorEnv, expert: dict[str, Any], policy: BasePolicy, portion: _Portion
+) -> Dataset | None:
+    """`_label` in another process, with robots and an expert of its own."""
+    th.set_num_threads(1)  # the processes share the cores
+    venv = NavigateVecEnv(robots)
+    return _label(venv, ExpertPolicy(venv, workers=1, **expert), policy, portion)
+
+
+def _label(venv: NavigateVecEnv, expert: ExpertPolicy, policy: BasePolicy, portion: _Portion) -> Dataset | None:
+    """The samples of a portion, None if there are none."""
+    count = venv.num_envs
+    waiting = list(enumerate(portion.scenarios))[::-1]
+    playing: list[tuple[int, Scenario] | None] = [None] * count  # of each robot: number and scenario
+    columns: list[dict[str, np.ndarray]] = []
+    observations = np.asarray(venv.reset())
+    idle = sample_scenario("open", 0)  # what robots without a task play: nobody looks, and its labels cost little
+    ended = np.ones(count, dtype=bool)
+    while True:
+        for i in np.flatnonzero(ended).tolist():
+            playing[i] = waiting.pop() if waiting else None
+        if all(task is None for task in playing):
+            break
+        if ended.any():
+            observations = np.asarray(venv.restart(ended, [task[1] if task else idle for task in playing]))
+        try:
+            labels, _ = expert.predict(observations)
+        except NoOptimumError as error:  # of a fresh scenario: nobody has promised one
+            ended = np.array([task is not None and task[1] is error.scenario for task in playing])
+            continue
+        costs, costates = expert.labels()
+        times = np.array(venv.get_attr("time"))
         left = np.array([-math.inf if task is None else task[1].horizon for task in playing]) - times
-        known = np.isfinite(costs) & (left >= self.config.forgiven)
-        columns = {
+        samples = {
             "observations": observations.copy(),
             "actions": labels,
             "returns": -costs,
             "costates": costates,
-            "states": np.array(self._venv.get_attr("pose")),
+            "states": np.array(venv.get_attr("pose")),
             "times": times,
             "executed": labels,
-            "rewards": np.full(len(labels), np.nan),  # what is driven is not what is labelled
+            "rewards": np.full(count, np.nan),  # what is driven is not what is labelled
             "episodes": np.array([-1 if task is None else task[0] for task in playing]),
         }
-        return {name: values[known] for name, values in columns.items()}
+        # Of the robots that can still reach their goals, and have time for it.
+        known = np.isfinite(costs) & (left >= portion.forgiven)
+        columns.append({name: values[known] for name, values in samples.items()})
+        guided = np.array([task is not None and portion.guided[task[0]] for task in playing])
+        actions, _ = policy.predict(observations, deterministic=True)
+        stepped, _, dones, _ = venv.step(np.where(guided[:, None], labels, actions))
+        observations = np.asarray(stepped)
+        ended = dones | ~np.isfinite(costs)  # out of reach of the goal there is nothing more to say
+    if not any(len(part["actions"]) for part in columns):
+        return None
+    joined = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
+    return Dataset(**joined, scenarios=tuple(scenario.to_json() for scenario in portion.scenarios))
 
 
 def _check(config: DAggerConfig) -> None:

@@ -99,6 +99,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
         cloning=replace(config.cloning, seed=config.seed),
         dataset=dataset,
         folder=run.folder / "rounds",
+        workers=workers,
     )
     found = run.load_checkpoint() if config.resume else None
     if found is not None:
