@@ -77,7 +77,7 @@ class Feedback:
     def _take(self, problem: OptimalControlProblem, path: Path, since: float) -> bool:
         """Stores the solution near a path of the task from time `since` on; False if there is none."""
         problem = problem.with_winding_of(path.states)
-        self._arrays = problem.arrays
+        before, self._arrays = getattr(self, "_arrays", problem.arrays), problem.arrays
         for spacing in SEGMENTS:
             segments = max(1, math.ceil(problem.horizon / spacing - 1e-9))
             times, nodes = start_nodes(problem, path, segments)
@@ -85,6 +85,7 @@ class Feedback:
             if found is not None:
                 self._stored = found
                 return True
+        self._arrays = before
         return False
 
     def update(self, state: np.ndarray, time: float) -> bool:
@@ -137,11 +138,11 @@ class Feedback:
             ValueError: there is no solution from there.
 
         """
-        stored = self._arrays, self._stored
+        stored = self._arrays, self._stored, self._patience
         try:
             found = self._resolve(np.array(state, dtype=float), time, tol)
         finally:
-            self._arrays, self._stored = stored
+            self._arrays, self._stored, self._patience = stored
         if found is None:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
         return float(found.costs.sum()), found.nodes[0, 3:].copy()

@@ -115,6 +115,8 @@ class ExpertPolicy:
     ) -> None:
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: expected one of {', '.join(FEEDBACKS)}, got {feedback!r}")
+        if reconsider is not None and feedback != "resolve":
+            raise ValueError(f"reconsider: expected None for feedback {feedback!r}, got {reconsider!r}")
         if reconsider is not None and not reconsider >= 0:
             raise ValueError(f"reconsider: expected a number >= 0 or None, got {reconsider!r}")
         self._reconsider = reconsider
@@ -123,6 +125,10 @@ class ExpertPolicy:
         self._feedback = feedback
         self._workers = workers or os.cpu_count() or 1
         self._robots: list[_Robot | None] = [None] * sum(getattr(inner, "num_envs", 1) for inner in self._envs)
+
+    def drives(self, env: Any) -> bool:
+        """Whether these are the robots of an environment."""
+        return all(one is other for one, other in zip(self._envs, _environments(env), strict=False))
 
     @property
     def settings(self) -> dict[str, Any]:

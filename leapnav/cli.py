@@ -107,8 +107,8 @@ class Rollout:
     """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     count: int = 100
     """How many scenarios."""
-    seed: int = 0
-    """Scenario i has seed SEED + i."""
+    seed: int = 1000
+    """Scenario i has seed SEED + i; at least 2, for those of 0 and 1 are in the banks that ship."""
     recoveries: int = 0
     """For each scenario, demonstrations that start from states pushed off its optimum."""
     noise: float = 0.0

@@ -25,7 +25,7 @@ class DemoSettings:
 
     family: str = "clutter"
     training_scenarios: int = 1000
-    training_seed: int = 0
+    training_seed: int = 1000
     recoveries: int = 4
     test_scenarios: int = 200
     workers: int = 2

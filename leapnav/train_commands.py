@@ -63,6 +63,7 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
         ValueError: the run to resume has a damaged configuration.
 
     """
+    arguments = [word.replace("_", "-") if word.startswith("--") and "=" not in word else word for word in arguments]
     family, out = _option(arguments, "--family") or "clutter", _option(arguments, "--out")
     warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
     defaults: dict[str, Any] = {

@@ -20,8 +20,7 @@ class Watch:
     """Watch a policy drive beside the optimum (the orange line), in a window or as a video."""
 
     policy: str = "expert"
-    """Folder of a policy or of a run, "expert", "random", "go-to-goal", or a family or "all" for a policy that ships
-    with leapnav."""
+    """Folder of a policy or of a run, "expert", "random" or "go-to-goal"."""
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     split: Literal["train", "test", "fresh"] = "test"

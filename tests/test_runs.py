@@ -26,6 +26,7 @@ from leapnav.training.config import (
 from leapnav.training.html_report import write_report
 from leapnav.training.imitation import train_bc, train_dagger
 from leapnav.training.reinforcement import train_ppo, train_sac
+from leapnav.training.vec_env import environment_seed
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
 COMMON = {"family": "open", "hidden": (16, 16), "evaluation_scenarios": 4}
@@ -119,8 +120,12 @@ elif name == "ppo":
     test_runs.train_ppo(test_runs.ppo(out, resume=resume), progress=False)
 elif name == "warm":
     test_runs.train_ppo(test_runs.warm(out, demos, resume=resume), progress=False)
-else:
-    test_runs.train_sac(test_runs.sac(out, warm_start=(demos,), cloning=test_runs.QUICK, resume=resume), progress=False)
+elif name == "sac":
+    config = test_runs.sac(out, warm_start=(demos,), reward="cost", cloning=test_runs.QUICK, resume=resume)
+    test_runs.train_sac(config, progress=False)
+else:  # killed while the actions are random
+    config = test_runs.sac(out, learning_starts=300, checkpoint_every=40, evaluate_every=1000, resume=resume)
+    test_runs.train_sac(config, progress=False)
 """
 
 
@@ -130,7 +135,7 @@ def warm(out, demos, **changes):
     return ppo(out, start=start, **{**extra, **changes})
 
 
-@pytest.mark.parametrize("name", ["bc", "ppo", "warm", "sac"])
+@pytest.mark.parametrize("name", ["bc", "ppo", "warm", "sac", "random sac"])
 def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
     """SIGKILL as soon as there is a checkpoint, and again after the next one."""
 
@@ -207,6 +212,44 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         train_ppo(ppo(tmp_path / "two", warm_start=(tmp_path / "clone", tmp_path / "policy")), progress=False)
     with pytest.raises(FileNotFoundError, match=r"warm_start: .*nowhere: no such folder"):
         train_ppo(ppo(tmp_path / "none", warm_start=(tmp_path / "nowhere",)), progress=False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"evaluate_every": 0}, r"evaluate_every: expected at least 1, got 0"),
+        ({"std": 0.0}, r"std: expected a positive number, got 0.0"),
+        ({"seed": -1}, r"seed: expected a number from 0"),
+        ({"family": "maze"}, r"family: expected one of .*got 'maze'"),
+        ({"hidden": (0,)}, r"hidden: expected widths of at least 1"),
+        ({"jump_start": 3.0}, r"jump_start: expected a number in \[0, 1\], got 3.0"),
+        ({"divergence": 0.1}, r"divergence: without a clone there is nothing to diverge from, got 0.1"),
+        ({"cloning": CloningConfig(epochs=0)}, r"cloning.epochs: expected a positive number, got 0"),
+        ({"cloning": CloningConfig(seed=3)}, r"cloning.seed: a run has one seed for all"),
+        ({"start": WarmStartConfig(slopes=0)}, r"start.slopes: expected a positive number, got 0"),
+        ({"ent_coef": -1.0}, r"ent_coef: expected a number >= 0"),
+    ],
+)
+def test_impossible_settings_are_told_before_anything_is_made(changes, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        train_ppo(ppo(tmp_path / "run", **changes), progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_demonstrations_have_one_reward_only(demos, tmp_path):
+    with pytest.raises(ValueError, match="reward: demonstrations have the rewards of 'cost', got 'shaped'"):
+        train_ppo(ppo(tmp_path / "run", warm_start=(demos,), reward="shaped"), progress=False)
+
+
+def test_no_training_run_meets_the_scenarios_of_the_banks():
+    """The banks' own seeds are 0 and 1, and NumPy's first stream of a seed is that of the seed alone."""
+    from leapnav.envs import ScenarioBank, sample_scenario
+
+    assert sample_scenario("clutter", 1).obstacles == ScenarioBank.shipped("clutter", "test")[0].obstacles
+    with pytest.raises(ValueError, match="seed: expected at least 2, got 1"):
+        rollout("clutter", 1, "nowhere", seed=1)
+    assert environment_seed(0) > 1_000_000
+    assert len({environment_seed(seed, stream) for seed in range(50) for stream in range(50)}) == 2500
 
 
 def test_tuned_settings_depend_on_the_family_and_the_warm_start():

@@ -91,6 +91,15 @@ def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
     config = WarmStartConfig(actor=False, critic_epochs=90, critic_batch_size=512, slopes=5000)
     found = warm_start(model, dataset, config, progress=False)
     assert found.value_error < 0.05
+    # What an action costs beside the expert's, as the first differences of the Q functions have it.
+    chosen = np.random.default_rng(0).integers(len(dataset), size=2000)
+    inputs, best = th.as_tensor(dataset.observations[chosen]), th.as_tensor(dataset.actions[chosen])
+    other = (best + th.tensor([0.6, 0.6]) * th.sign(-best)).clamp(-1, 1)
+    with th.no_grad():
+        costs = [th.stack(model.critic(inputs, actions)).mean(dim=0)[:, 0] for actions in (best, other)]
+    found = float((costs[0] - costs[1]).mean())
+    weights = th.as_tensor((dataset.weights * dataset.limits**2)[chosen])
+    assert found == pytest.approx(float(0.05 * 0.5 * (weights * (other - best) ** 2).sum(dim=1).mean()), rel=0.3)
     states = model.critic.state_dict()
     assert all(th.equal(value, states[name]) for name, value in model.critic_target.state_dict().items())
 

@@ -64,17 +64,29 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
     """Copies the mean action's weights between policies with the same network.
 
     Raises:
-        ValueError: the networks differ.
+        ValueError: the networks differ, or one of the policies squashes its actions and the other cuts them off.
 
     """
-    pairs = list(zip(_actor_tensors(source), _actor_tensors(target), strict=False))
-    count = len(_actor_tensors(source)), len(_actor_tensors(target))
-    if count[0] != count[1] or any(a.shape != b.shape for a, b in pairs):
-        shapes = [[tuple(t.shape) for t in _actor_tensors(policy)] for policy in (source, target)]
+    if isinstance(source, ActorCriticPolicy) != isinstance(target, ActorCriticPolicy):
+        raise ValueError(
+            f"policy: a {type(source).__name__} acts otherwise with the weights of a {type(target).__name__}, which "
+            "squashes its actions or does not; start from demonstrations instead"
+        )
+    tensors = _actor_tensors(source), _actor_tensors(target)
+    if [t.shape for t in tensors[0]] != [t.shape for t in tensors[1]]:
+        shapes = [[tuple(t.shape) for t in of_one] for of_one in tensors]
         raise ValueError(f"policy: its network has the shapes {shapes[0]}, the model's {shapes[1]}")
     with th.no_grad():
-        for a, b in pairs:
+        for a, b in zip(*tensors, strict=True):
             b.copy_(a)
+    update_target(target)
+
+
+def update_target(policy: BasePolicy) -> None:
+    """Makes the target actor, where an algorithm has one, the same as the actor."""
+    target: Any = getattr(policy, "actor_target", None)
+    if target is not None:
+        target.load_state_dict(_actor(policy).state_dict())
 
 
 def _actor_tensors(policy: BasePolicy) -> list[th.Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -16,8 +17,9 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from tqdm.auto import tqdm
 
+from leapnav.envs.observations import GOAL_ENTRIES
 from leapnav.experts.demonstrations import Demonstration
-from leapnav.training.actors import actor_parameters, mean_action, policy_of, set_noise
+from leapnav.training.actors import actor_parameters, mean_action, policy_of, set_noise, update_target
 from leapnav.training.config import CloningConfig
 from leapnav.training.dataset import Dataset
 from leapnav.training.symmetries import mirror, turn_round
@@ -86,6 +88,7 @@ class Cloning:
         policy: what is fitted, in place.
         dataset: what it is fitted to.
         config: settings.
+        stream: of the order of the samples and the twins; the split is the same for all.
 
     Attributes:
         losses: of the epochs so far.
@@ -95,13 +98,16 @@ class Cloning:
 
     """
 
-    def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig) -> None:
-        _check(config)
+    def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig, stream: int = 0) -> None:
+        check_cloning(config)
         check_observations(policy, dataset)
+        beams = dataset.observations.shape[1] - GOAL_ENTRIES
+        if config.augment and beams % 2:
+            raise ValueError(f"augment: turning round needs an even number of lidar beams, got {beams}")
         self.config, self.losses = config, []
         self._policy = policy
-        self._rng = th.Generator().manual_seed(config.seed)
-        train, held_out = _split(dataset, config.validation_share, self._rng)
+        self._rng = th.Generator().manual_seed(config.seed + stream)
+        train, held_out = _split(dataset, config.validation_share, config.seed)
         self._train, self._held_out = (_Samples(dataset, chosen, policy.device) for chosen in (train, held_out))
         self._scale = _scale(self._train, config.loss)
         parameters = actor_parameters(policy)
@@ -129,6 +135,10 @@ class Cloning:
                 decay = 0.5 * (1 + math.cos(math.pi * self._step / (config.epochs * self.batches)))
                 group["lr"] = config.learning_rate * min(1.0, (self._step + 1) / WARM_UP) * decay
             loss = self._loss(self._train.twins(chosen, self._rng) if config.augment else self._train.at(chosen))
+            if not th.isfinite(loss):
+                raise ValueError(
+                    f"learning_rate: the fit diverged in epoch {len(self.losses) + 1} at {config.learning_rate!r}"
+                )
             self._optimiser.zero_grad()
             loss.backward()
             th.nn.utils.clip_grad_norm_(actor_parameters(self._policy), LARGEST_NORM)
@@ -138,7 +148,8 @@ class Cloning:
             on_batch()
         self._policy.set_training_mode(False)
         found = EpochLoss(len(self.losses) + 1, summed / len(self._train), self._validation())
-        if self._best is None or not found.validation >= self._best[0]:  # NaN: the last epoch is the best
+        # Without anything held out the last epoch is the best.
+        if self._best is None or found.validation < self._best[0] or not len(self._held_out):
             self._best = (found.validation, copy.deepcopy(self._policy.state_dict()))
         self.losses.append(found)
         return found
@@ -154,6 +165,7 @@ class Cloning:
                 for part in samples.parts(EVALUATION_BATCH)
             ]
         set_noise(self._policy, (th.stack(squares).sum(dim=0) / len(samples)).sqrt().clamp(min=SMALLEST_STD))
+        update_target(self._policy)
 
     def state_dict(self) -> dict[str, Any]:
         """All that the rest of the fit depends on, besides policy, dataset and settings: tensors and numbers only."""
@@ -195,7 +207,7 @@ class _Samples:
     """What the losses need, as tensors: observations, actions, slopes and weights, see `_hamiltonian_loss`."""
 
     def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
-        columns = dataset.observations, dataset.actions, _slopes(dataset), dataset.weights * dataset.limits**2
+        columns = dataset.observations, dataset.actions, action_slopes(dataset), dataset.weights * dataset.limits**2
         self._columns = tuple(th.as_tensor(np.asarray(c[chosen], dtype=np.float32), device=device) for c in columns)
 
     def __len__(self) -> int:
@@ -245,7 +257,7 @@ def _hamiltonian_loss(error: th.Tensor, slopes: th.Tensor, weights: th.Tensor) -
     return 0.5 * weights * error.square() + functional.relu(slopes * error)
 
 
-def _slopes(dataset: Dataset) -> np.ndarray:
+def action_slopes(dataset: Dataset) -> np.ndarray:
     """dH/du (N, 2) at the expert's actions, in units of the actions; zero unless a limit cuts them off."""
     heading = dataset.states[:, 2]
     costates = dataset.costates
@@ -266,12 +278,16 @@ def _scale(samples: _Samples, loss: str) -> th.Tensor:
     return (1.0 / _hamiltonian_loss(error, slopes, weights).sum(dim=1).mean()).clamp(max=1e6).repeat(2)
 
 
-def _split(dataset: Dataset, share: float, rng: th.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (N,) of the training and the validation samples; no obstacle course is in both."""
-    courses, number = np.unique(dataset.courses, return_inverse=True)
-    order = th.randperm(len(courses), generator=rng).numpy()
-    held_out = np.isin(number, order[: int(share * len(courses))])
-    return ~held_out, held_out
+def _split(dataset: Dataset, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (N,) of the training and the validation samples; no obstacle course is in both.
+
+    Which courses are held out hangs on what they are, so that those of a dataset that grows mostly stay the same.
+    """
+    courses = dataset.course_texts
+    drawn = {text: hashlib.blake2b(f"{seed} {text}".encode()).digest() for text in set(courses)}
+    held_out = set(sorted(drawn, key=drawn.__getitem__)[: int(share * len(drawn))])
+    mask = np.array([text in held_out for text in courses])[dataset.episodes]
+    return ~mask, mask
 
 
 def check_observations(policy: BasePolicy, dataset: Dataset) -> None:
@@ -287,7 +303,13 @@ def check_observations(policy: BasePolicy, dataset: Dataset) -> None:
         raise ValueError(f"dataset: its observations have {width} numbers, the policy's {expected}")
 
 
-def _check(config: CloningConfig) -> None:
+def check_cloning(config: CloningConfig) -> None:
+    """Checks the settings of a fit.
+
+    Raises:
+        ValueError: one is impossible; the message names it and its value.
+
+    """
     for name in ("epochs", "batch_size", "learning_rate"):
         if not (math.isfinite(getattr(config, name)) and getattr(config, name) > 0):
             raise ValueError(f"{name}: expected a positive number, got {getattr(config, name)!r}")

@@ -82,7 +82,8 @@ class WarmStartConfig:
     critic_batch_size: int = 4096
     """Samples per gradient step, for the critic."""
     gradient_weight: float = 0.3
-    """Of the error of the gradient, beside that of the value, each in units of its spread."""
+    """Of the error of the gradient by the state, and for Q functions by the action, beside that of the value; each in
+    units of its spread."""
     slopes: int = 200_000
     """How many samples the gradient is fitted at."""
     seed: int = 0
@@ -147,7 +148,7 @@ class DAggerRunConfig(RunConfig):
     """How many scenarios are demonstrated if none are given."""
     policy: Path | None = None
     """A policy that is the first learner instead of a new clone."""
-    n_envs: int = 128
+    n_envs: int = 64
     """Robots that drive at once."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
     """Settings of the first clone and of the last fit; its seed is the run's."""
@@ -174,7 +175,7 @@ class _LearnerConfig(RunConfig):
     """Factor of the rewards."""
     warm_start: tuple[Path, ...] = ()
     """Demonstrations (folders that `leapnav rollout` wrote) and at most one policy (a run's folder) to start from: the
-    actor is a clone of the demonstrations, or the policy's; the critic is fitted to the demonstrations."""
+    actor is a clone of the demonstrations, or the policy's; the critic is fitted to the demonstrations, if any."""
     start: WarmStartConfig = field(default_factory=WarmStartConfig)
     """Settings of the warm start; its seed is the run's."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
@@ -247,7 +248,7 @@ class SACConfig(_LearnerConfig):
     buffer_size: int = 500_000
     """Transitions that are remembered."""
     learning_starts: int = 5_000
-    """Steps before the first gradient step; without a warm start the actions are random until then."""
+    """Steps of random actions before the first gradient step; a warm start's defaults have none."""
     ent_coef: str = "auto_0.01"
     """Weight of the entropy: a number, or "auto" with the first value."""
     demonstrations: float = 0.25

@@ -31,9 +31,8 @@ from leapnav.training.actors import policy_of
 from leapnav.training.cloning import Cloning, check_observations
 from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.dataset import Dataset
-from leapnav.training.vec_env import NavigateVecEnv
+from leapnav.training.vec_env import NavigateVecEnv, environment_seed
 
-SEEDS_PER_ROUND = 1_000_000  # more than there are robots
 PORTION = 32  # episodes that are labelled together
 
 
@@ -45,7 +44,7 @@ class Round:
         number: from 1 on.
         samples: labelled in this round.
         episodes: that the learner drove before.
-        success, collision: their rates.
+        success, collision: their rates; a little pessimistic, for episodes in play at the last failure do not count.
         loss: validation loss of the fit after it.
 
     """
@@ -95,8 +94,10 @@ class DAgger:
     ) -> None:
         if not isinstance(venv, NavigateVecEnv):
             raise TypeError(f"venv: expected one from leapnav.training.make_vec_env, got {type(venv).__name__}")
+        if not expert.drives(venv):
+            raise ValueError("expert: expected one for venv; make it with ExpertPolicy(venv)")
         self.config, self._cloning = config or DAggerConfig(), cloning or CloningConfig()
-        _check(self.config)
+        check_dagger(self.config)
         if workers < 1:
             raise ValueError(f"workers: expected at least 1, got {workers!r}")
         self._policy, self._expert, self._venv, self._workers = policy_of(model), expert, venv, workers
@@ -136,21 +137,25 @@ class DAgger:
         number, config = len(self.rounds), self.config
         rng = np.random.default_rng([config.seed, number])
         name = f"Round {number + 1} of {config.rounds}"
-        self._venv.seed(config.seed + SEEDS_PER_ROUND * (number + 1))
+        self._venv.seed(environment_seed(config.seed, number))
         failed, succeeded, collision = self._drive(name, progress)
         count = len(failed) + len(succeeded)
         chosen = failed[: config.failures]
         chosen += [succeeded[i] for i in rng.permutation(len(succeeded))[: config.successes]]
+        if not chosen:
+            raise ValueError(
+                f"successes: expected at least 1, got {config.successes}: the learner did not fail in {count} episodes"
+            )
         chosen = [chosen[i] for i in rng.permutation(len(chosen))]
         with tqdm(total=len(chosen), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
             samples = self._label(chosen, number, rng, bar)
         if self._folder is not None:
             samples.save(self._folder / f"round-{number + 1:03d}.npz")
         self._parts.append(samples)
-        settings = replace(self._cloning, seed=self._cloning.seed + number)
+        settings = self._cloning
         if number + 1 < config.rounds:
             settings = replace(settings, epochs=config.epochs, learning_rate=config.learning_rate, patience=0)
-        fit = Cloning(self._policy, self.dataset, settings)
+        fit = Cloning(self._policy, self.dataset, settings, stream=number + 1)
         with tqdm(total=settings.epochs * fit.batches, desc="Fitting", unit="batch", disable=not progress) as bar:
             while not fit.finished:
                 fit.run_epoch(bar.update)
@@ -261,8 +266,8 @@ def _label(venv: NavigateVecEnv, expert: ExpertPolicy, policy: BasePolicy, porti
             "costates": costates,
             "states": np.array(venv.get_attr("pose")),
             "times": times,
-            "executed": labels,
-            "rewards": np.full(count, np.nan),  # what is driven is not what is labelled
+            "executed": np.full(labels.shape, np.nan, np.float32),  # what is driven is not what is labelled
+            "rewards": np.full(count, np.nan),
             "episodes": np.array([-1 if task is None else task[0] for task in playing]),
         }
         # Of the robots that can still reach their goals, and have time for it.
@@ -279,7 +284,13 @@ def _label(venv: NavigateVecEnv, expert: ExpertPolicy, policy: BasePolicy, porti
     return Dataset(**joined, scenarios=tuple(scenario.to_json() for scenario in portion.scenarios))
 
 
-def _check(config: DAggerConfig) -> None:
+def check_dagger(config: DAggerConfig) -> None:
+    """Checks the settings of dataset aggregation.
+
+    Raises:
+        ValueError: one is impossible; the message names it and its value.
+
+    """
     for name in ("rounds", "failures", "episodes", "epochs"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name}: expected at least 1, got {getattr(config, name)!r}")

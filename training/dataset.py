@@ -15,6 +15,7 @@ import numpy as np
 from leapnav.experts.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
 
 FORMAT = 1  # of the files
+EPISODES_ONLY = ("family", "split", "bank", "scenario")  # arguments that change what is played, not what is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class Dataset:
         costates (N, 3): gradient of the cost-to-go by x, y and heading; NaN where unknown.
         states (N, 3): x, y (m), heading (rad).
         times (N,): s since the start of the episode.
-        executed (N, 2): the actions that were driven, float32.
+        executed (N, 2): the actions that were driven, float32; NaN where unknown.
         rewards (N,): for them; NaN where unknown.
         episodes (N,): int64, the sample's place in `scenarios`.
         scenarios: of the episodes, as JSON.
@@ -57,6 +58,9 @@ class Dataset:
             found = getattr(self, name).shape
             if found != (count, *shape):
                 raise ValueError(f"dataset: {name}: expected the shape {(count, *shape)}, got {found}")
+        for name in ("observations", "actions"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"dataset: {name}: expected finite numbers")
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -80,12 +84,10 @@ class Dataset:
         """Weights of the cost (N, 2), for speed and turn rate."""
         return self._of_tasks([[task["cost"][name] for name in _WEIGHTS] for task in self._tasks])
 
-    @property
-    def courses(self) -> np.ndarray:
-        """Numbers (N,), the same for samples with the same obstacles and goal."""
-        numbers: dict[str, int] = {}
-        texts = [json.dumps([task["obstacles"], task["goal"]]) for task in self._tasks]
-        return self._of_tasks([numbers.setdefault(text, len(numbers)) for text in texts])
+    @cached_property
+    def course_texts(self) -> list[str]:
+        """Obstacles and goal of each of `scenarios`, as JSON."""
+        return [json.dumps([task["obstacles"], task["goal"]]) for task in self._tasks]
 
     def _of_tasks(self, values: list[Any]) -> np.ndarray:
         return np.array(values)[self.episodes]
@@ -135,6 +137,13 @@ class Dataset:
         environment = dataset.env_spec.id if dataset.env_spec is not None else None
         if environment != ENVIRONMENT:
             raise ValueError(f"{folder}: a dataset of {environment}; leapnav learns from {ENVIRONMENT}")
+        assert dataset.env_spec is not None  # it has an id
+        known = set(EPISODES_ONLY)
+        differing = [f"{k}={v!r}" for k, v in (dataset.env_spec.kwargs or {}).items() if k not in known]
+        if differing:
+            raise ValueError(
+                f"{folder}: a dataset of {environment} with {', '.join(differing)}; leapnav learns from its defaults"
+            )
         metadata = dataset.storage.get_episode_metadata(dataset.episode_indices)
         return cls._stack(
             _from_episode(folder, episode, info)

@@ -42,8 +42,8 @@ def load_entrant(name: str, *, seed: int = 0) -> NamedEntrant:
     """A policy by its name.
 
     Args:
-        name: "expert", "random", "go-to-goal", a family or "all" for a policy that ships with leapnav, or the folder of
-            a policy or a run; with "LABEL=" before it, all of the same label are runs of one method.
+        name: "expert", "random", "go-to-goal", or the folder of a policy or a run; with "LABEL=" before it, all of the
+            same label are runs of one method.
         seed: of the random policy.
 
     Raises:

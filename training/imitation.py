@@ -15,6 +15,7 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.experts.policy import ExpertPolicy
 from leapnav.experts.rollouts import rollout
 from leapnav.training.actors import copy_actor
+from leapnav.training.checks import check_config
 from leapnav.training.cloning import Cloning
 from leapnav.training.config import BCConfig, DAggerRunConfig
 from leapnav.training.dagger import DAgger, Round
@@ -22,8 +23,9 @@ from leapnav.training.dataset import Dataset
 from leapnav.training.evaluation import Evaluation
 from leapnav.training.policies import load_policy, make_policy
 from leapnav.training.runs import Run
-from leapnav.training.vec_env import make_vec_env
+from leapnav.training.vec_env import environment_seed, make_vec_env
 
+DEMONSTRATIONS = 1_000_000  # stream of a run's seed, after those of DAgger's rounds
 RECONSIDER = 0.1  # see `ExpertPolicy`: what the learner does is to be labelled by what is best from there
 
 
@@ -42,7 +44,8 @@ def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> li
         FileNotFoundError, FileExistsError, ValueError: see `Run` and `Dataset.of`.
 
     """
-    given = Dataset.of(config.demos) if config.demos else None  # what is wrong is found before the folder is made
+    check_config(config)  # what is wrong is found before the folder is made
+    given = Dataset.of(config.demos) if config.demos else None
     run = Run("bc", config)
     dataset = given or demonstrations(run, config.scenarios, workers, progress)
     policy = new_policy(config.seed, config.hidden)
@@ -70,13 +73,13 @@ def clone(
             run.logger.record("loss/validation", loss.validation)
             evaluations = run.evaluate(policy, samples)
             show(bar, evaluations, loss=f"{loss.validation:.4f}")
-            run.save_policy(policy, samples)
+            run.save_policy(policy)
             state = {"policy": policy.state_dict(), "fit": fit.state_dict()}
             run.save_checkpoint(lambda folder, state=state: th.save(state, folder / "fit.pt"), {"epochs": loss.epoch})
     fit.finish()
     samples = len(fit.losses) * fit.batches * config.cloning.batch_size
     evaluations = run.evaluate(policy, samples, final=True)
-    run.save_policy(policy, samples)
+    run.save_policy(policy)
     return evaluations
 
 
@@ -85,6 +88,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
 
     Args, returns and errors are those of `train_bc`.
     """
+    check_config(config)
     given = Dataset.of(config.demos) if config.demos else None
     first = None if config.policy is None else load_policy(config.policy)
     run = Run("dagger", config)
@@ -124,10 +128,10 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
         evaluations = run.evaluate(policy, samples)
         if progress:
             tqdm.write(f"round {done.number}: {describe(evaluations)}")
-        run.save_policy(policy, samples)
+        run.save_policy(policy)
         _save_round(run, policy, dagger)
     evaluations = run.evaluate(policy, sum(one.samples for one in dagger.rounds), final=True)
-    run.save_policy(policy, sum(one.samples for one in dagger.rounds))
+    run.save_policy(policy)
     return evaluations
 
 
@@ -148,7 +152,7 @@ def demonstrations(run: Run, count: int, workers: int, progress: bool) -> Datase
 
 def demonstration_seed(seed: int) -> int:
     """The first scenario's seed of a run's own demonstrations: those of other seeds are other scenarios."""
-    return int(np.random.SeedSequence(seed).generate_state(1)[0])
+    return environment_seed(seed, DEMONSTRATIONS)
 
 
 def new_policy(seed: int, hidden: Sequence[int]) -> ActorCriticPolicy:

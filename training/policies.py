@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
@@ -18,14 +20,12 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 import leapnav
-from leapnav.envs.families import FAMILIES
 from leapnav.envs.observations import GOAL_ENTRIES
 from leapnav.envs.settings import Settings
 from leapnav.experts.demonstrations import ENVIRONMENT
 from leapnav.training.actors import policy_of
 
 FORMAT = 2
-SHIPPED = Path(__file__).parent / "shipped"
 HIDDEN = (256, 256, 256)
 ROBOT_RADIUS = 0.25  # m, the scale on which a near obstacle matters
 
@@ -174,14 +174,13 @@ def save_policy(
         "actor_only": half,
         "training": dict(training or {}),
     }
-    # The weights first: a folder with a description has all.
-    for name, write in (
-        ("weights.pt", lambda path: th.save(weights, path)),
-        ("policy.json", lambda path: path.write_text(json.dumps(description, indent=1) + "\n")),
-    ):
-        partial = folder / f".{name}.partial"
-        write(partial)
-        partial.replace(folder / name)
+    partial = folder / ".weights.pt.partial"
+    th.save(weights, partial)
+    description["sha256"] = hashlib.sha256(partial.read_bytes()).hexdigest()
+    partial.replace(folder / "weights.pt")
+    partial = folder / ".policy.json.partial"
+    partial.write_text(json.dumps(description, indent=1) + "\n")
+    partial.replace(folder / "policy.json")
 
 
 def read_description(folder: str | Path) -> dict[str, Any]:
@@ -205,7 +204,14 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         environment = description["environment"]["id"]
         if environment != ENVIRONMENT:
             raise ValueError(f"{path}: a policy for {environment}; this leapnav has {ENVIRONMENT}")
-        for name, type_ in (("kind", str), ("hidden", list), ("critic", list), ("actor_only", bool)):
+        for name, type_ in (
+            ("kind", str),
+            ("hidden", list),
+            ("critic", list),
+            ("actor_only", bool),
+            ("training", dict),
+            ("sha256", str),
+        ):
             if not isinstance(description[name], type_):
                 raise TypeError(f"{name} is {description[name]!r}")
         if description["kind"] not in _KINDS:
@@ -216,11 +222,10 @@ def read_description(folder: str | Path) -> dict[str, Any]:
 
 
 def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
-    """Reads a policy that `save_policy` wrote; nothing of the file is executed. Or one that ships with leapnav.
+    """Reads a policy that `save_policy` wrote; nothing of the file is executed.
 
     Args:
-        folder: the folder, or the name of a family for the policy that ships with leapnav, or "all" for the one that
-            drives in all of them.
+        folder: of the policy, or of the run that made it.
         env: if given, the environment that the policy is to drive, single or vector; it must show what the policy
             observes.
 
@@ -232,7 +237,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         ValueError: the files are broken, of another format or for other observations; the message says which.
 
     """
-    folder = _located(folder)
+    folder = Path(folder)
     description = read_description(folder)
     try:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
@@ -252,9 +257,16 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
     if env is not None:
         _check_environment(folder, description, observation_space, env)
     try:
-        weights = th.load(folder / "weights.pt", weights_only=True, map_location="cpu")
+        content = (folder / "weights.pt").read_bytes()
+        if hashlib.sha256(content).hexdigest() != description["sha256"]:
+            raise ValueError("damaged, or of another policy")
+        weights = th.load(io.BytesIO(content), weights_only=True, map_location="cpu")
         if description["actor_only"]:
-            weights = {**policy.state_dict(), **{name: value.float() for name, value in weights.items()}}
+            own = policy.state_dict()
+            missing = sorted({name for name in own if _is_of_actor(name)} ^ set(weights))
+            if missing:
+                raise ValueError(f"{missing[0]} is missing or unknown")
+            weights = {**own, **{name: value.float() for name, value in weights.items()}}
         policy.load_state_dict(weights)
     except FileNotFoundError:
         raise
@@ -264,22 +276,19 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
     return policy
 
 
-def _located(folder: str | Path) -> Path:
-    """A policy's folder; a family's name means the policy that ships, unless there is such a folder."""
-    path = Path(folder)
-    if not path.exists() and str(folder) in (*FAMILIES, "all"):
-        return SHIPPED / str(folder)
-    return path
-
-
 def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
     """Refuses an environment that shows something else than the policy has learned to see."""
-    inner: Any = env.unwrapped
+    inner: Any = env
+    while hasattr(inner, "venv"):  # Stable-Baselines3's wrappers, and leapnav's adapter
+        inner = inner.venv
+    inner = inner.unwrapped
     trained, given = description["environment"], _plain(inner.settings)
     differing = [
-        f"{name}={trained.get(name)!r} (here {given[name]!r})" for name in OBSERVED if trained.get(name) != given[name]
+        f"{name}={trained.get(name)!r} (here {given.get(name)!r})"
+        for name in OBSERVED
+        if trained.get(name) != given.get(name)
     ]
-    if differing or getattr(env, "single_observation_space", env.observation_space) != space:
+    if differing or getattr(inner, "single_observation_space", inner.observation_space) != space:
         of_what = ", ".join(differing) or "other bounds"
         raise ValueError(f"{folder}: the policy observes another environment than this one: {of_what}")
 

@@ -23,6 +23,7 @@ from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.families import ALL, FAMILIES
 from leapnav.training.actors import copy_actor, set_noise
 from leapnav.training.anchored import AnchoredPolicy
+from leapnav.training.checks import check_config
 from leapnav.training.config import PPOConfig, SACConfig
 from leapnav.training.dataset import Dataset
 from leapnav.training.evaluation import Evaluation
@@ -31,7 +32,7 @@ from leapnav.training.jump_start import JumpStart
 from leapnav.training.policies import load_policy, network
 from leapnav.training.replay import DemonstrationReplayBuffer
 from leapnav.training.runs import Run
-from leapnav.training.vec_env import ScaledReward, make_vec_env
+from leapnav.training.vec_env import ScaledReward, environment_seed, make_vec_env
 from leapnav.training.warmstart import warm_start
 
 Config = PPOConfig | SACConfig
@@ -110,10 +111,18 @@ def _train(
     algorithm: str, config: Config, make: Callable[[VecEnv, Dataset | None], BaseAlgorithm], progress: bool
 ) -> list[Evaluation]:
     # What can be wrong is found before the folder is made.
+    check_config(config)
     demos, start = _start(config.warm_start)
+    if demos and config.reward != "cost":
+        raise ValueError(f"reward: demonstrations have the rewards of 'cost', got {config.reward!r}")
+    if isinstance(config, PPOConfig) and config.divergence > 0 and not (config.warm_start and config.start.actor):
+        raise ValueError(f"divergence: without a clone there is nothing to diverge from, got {config.divergence!r}")
     dataset = Dataset.of(demos) if demos else None
     venv = _robots(config)
     model = make(venv, dataset)
+    venv.seed(environment_seed(config.seed))  # Stable-Baselines3 has given it the model's
+    if start is not None and config.start.actor:
+        copy_actor(start, model.policy)
     run = Run(algorithm, config)
     found = run.load_checkpoint() if config.resume else None
     if found is None:
@@ -129,7 +138,7 @@ def _train(
         model.learn(remaining, callback=callback, reset_num_timesteps=found is None)
     callback.bar.close()
     evaluations = run.evaluate(model.policy, model.num_timesteps, final=True)
-    run.save_policy(model.policy, model.num_timesteps)
+    run.save_policy(model.policy)
     return evaluations
 
 
@@ -148,7 +157,6 @@ def _robots(config: Config) -> VecEnv:
     """The training environment: fresh scenarios without end."""
     robots = make_vec_env(
         n_envs=config.n_envs,
-        seed=config.seed,
         family=config.family,
         split="fresh",
         reward=config.reward,
@@ -175,8 +183,6 @@ def _warm_start(
             reward_scale=config.reward_scale,
             progress=progress,
         )
-    elif policy is not None and config.start.actor:
-        copy_actor(policy, model.policy)
     if isinstance(config, PPOConfig) and isinstance(model.policy, AnchoredPolicy):
         set_noise(model.policy, th.full((2,), config.std))
         model.policy.drop_anchor()
@@ -193,7 +199,9 @@ def _load(kind: Any, folder: Path, venv: VecEnv, dataset: Dataset | None, config
             assert dataset is not None  # as the configuration, which is the same, says
             model.replay_buffer.demonstrate(dataset, config.reward_scale)
     with (folder / "robots.pkl").open("rb") as file:
-        states = pickle.load(file)
+        states, actions = pickle.load(file)
+    # Loading has seeded it anew; before learning starts an off-policy algorithm draws its actions from it.
+    model.action_space.np_random.bit_generator.state = actions
     for part, state in zip(_parts(venv), states, strict=True):
         part.load_state_dict(state)
     return model
@@ -241,7 +249,7 @@ class _Keeper(BaseCallback):
         step, config = self.num_timesteps, self._config
         if step // config.evaluate_every > self._evaluated // config.evaluate_every or self._evaluated < 0:
             show(self.bar, self._run.evaluate(self.model.policy, step))
-            self._run.save_policy(self.model.policy, step)
+            self._run.save_policy(self.model.policy)
             self._evaluated = step
         if step // config.checkpoint_every > self._kept // config.checkpoint_every:
             self._kept = step
@@ -259,7 +267,8 @@ class _Keeper(BaseCallback):
         if isinstance(self.model, OffPolicyAlgorithm):
             self.model.save_replay_buffer(folder / "replay_buffer.pkl")
         with (folder / "robots.pkl").open("wb") as file:
-            pickle.dump([part.state_dict() for part in _parts(self._venv)], file)
+            actions = self.model.action_space.np_random.bit_generator.state
+            pickle.dump(([part.state_dict() for part in _parts(self._venv)], actions), file)
 
 
 def _fading(first: float, until: float, done: float) -> float:

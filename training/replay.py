@@ -49,7 +49,7 @@ class DemonstrationReplayBuffer(ReplayBuffer):
         """
         last = np.append(dataset.episodes[1:] != dataset.episodes[:-1], True)
         following = np.arange(len(dataset)) + ~last  # after the last step nothing follows, so any observation does
-        usable = np.isfinite(dataset.rewards)
+        usable = np.isfinite(dataset.rewards) & np.isfinite(dataset.executed).all(axis=1)
         if not usable.any():
             raise ValueError("dataset: no transition has a reward; demonstrations from `leapnav rollout` have")
         self._demonstrated = (

@@ -162,7 +162,8 @@ def plot_episodes(
 ) -> None:
     """Writes a picture of a policy's best, median and worst episodes beside their optima.
 
-    Best and median are by regret, among the successes; the worst are failures, collisions first, as far as there are.
+    Best and median are by cost over that of the optimum, among the successes; the worst are failures, collisions first,
+    as far as there are.
     """
     rows = extremes(episodes, columns)
     figure = Figure(figsize=(3.1 * columns, 3.3 * len(rows)), layout="constrained")

@@ -24,6 +24,7 @@ from stable_baselines3.common.policies import BasePolicy
 import leapnav
 from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.families import ALL, FAMILIES
+from leapnav.training.checks import check_config
 from leapnav.training.config import RunConfig
 from leapnav.training.evaluation import Entrant, Evaluation, evaluate
 from leapnav.training.policies import save_policy
@@ -39,7 +40,7 @@ class Run:
     | File | Content |
     |---|---|
     | `config.json` | algorithm, configuration, versions |
-    | `policy.json`, `weights.pt` | the policy, see `load_policy`; during the run that of the last checkpoint |
+    | `policy.json`, `weights.pt` | the policy, see `load_policy`; during the run that of the last evaluation |
     | `evaluations.jsonl` | a line for each evaluation: step, seconds, each family's success, collision, SOC, regret |
     | `tensorboard/` | logs |
     | `checkpoint/` | what the run goes on from; a pickle is among its files, so resume only runs that you trust |
@@ -56,11 +57,13 @@ class Run:
     Raises:
         FileExistsError: the folder is not empty, and the run is not to be resumed.
         FileNotFoundError: there is nothing to resume.
-        ValueError: the folder holds a run of another configuration; the message names the setting and both values.
+        ValueError: a setting is impossible, or the folder holds a run of another configuration; the message names the
+            setting and both values.
 
     """
 
     def __init__(self, algorithm: str, config: RunConfig) -> None:
+        check_config(config)
         self.algorithm, self.config, self.folder = algorithm, config, Path(config.out)
         self._plain = {"algorithm": algorithm, **_plain(asdict(config))}
         record = self.folder / "config.json"
@@ -130,11 +133,11 @@ class Run:
     def _write_evaluations(self) -> None:
         _write(self.folder / "evaluations.jsonl", "".join(json.dumps(line) + "\n" for line in self.evaluations))
 
-    def save_policy(self, model: BaseAlgorithm | BasePolicy, step: int) -> None:
+    def save_policy(self, model: BaseAlgorithm | BasePolicy) -> None:
         """Writes the policy, with what the run is, so that runs that differ in their seed alone can be told."""
         # What the run is, not where it lies or how it is watched.
         training = {name: value for name, value in self._plain.items() if name not in (*FREE, "evaluation_scenarios")}
-        save_policy(model, self.folder, training={**training, "trained_steps": step})
+        save_policy(model, self.folder, training=training)
 
     def save_checkpoint(self, write: Callable[[Path], None], progress: Mapping[str, Any]) -> None:
         """Replaces the checkpoint; a run that is killed meanwhile has the old one or the new one.

@@ -19,7 +19,9 @@ def mirror(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.T
     """Left and right exchanged: observations (B, d), actions (B, 2)."""
     ranges = observations[:, GOAL_ENTRIES:]
     ranges = th.cat([ranges[:, :1], ranges[:, 1:].flip(1)], dim=1)
-    return th.cat([observations[:, :GOAL_ENTRIES] * _MIRROR, ranges], dim=1), actions * th.tensor([1.0, -1.0])
+    return th.cat([observations[:, :GOAL_ENTRIES] * _MIRROR.to(ranges.device), ranges], dim=1), actions * th.tensor(
+        [1.0, -1.0], device=actions.device
+    )
 
 
 def turn_round(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -28,4 +30,6 @@ def turn_round(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, 
     if ranges.shape[1] % 2:
         raise ValueError(f"turning round needs an even number of lidar beams, got {ranges.shape[1]}")
     ranges = ranges.roll(ranges.shape[1] // 2, dims=1)
-    return th.cat([observations[:, :GOAL_ENTRIES] * _TURN, ranges], dim=1), actions * th.tensor([-1.0, 1.0])
+    return th.cat([observations[:, :GOAL_ENTRIES] * _TURN.to(ranges.device), ranges], dim=1), actions * th.tensor(
+        [-1.0, 1.0], device=actions.device
+    )

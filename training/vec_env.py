@@ -64,6 +64,15 @@ def make_vec_env(
     return wrapped
 
 
+def environment_seed(seed: int, stream: int = 0) -> int:
+    """A seed for the robots of a training run, the next ones following.
+
+    Runs with seeds that follow each other would share most of their robots' scenarios, and those with the smallest ones
+    would meet the first scenarios of the banks that ship.
+    """
+    return int(np.random.SeedSequence([seed, stream]).generate_state(1)[0])
+
+
 class NavigateVecEnv(VecEnv):
     """Adapts a `NavigateVectorEnv` to Stable-Baselines3's interface.
 

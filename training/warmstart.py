@@ -19,7 +19,7 @@ from leapnav.envs.observer import Observer
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.demonstrations import CONTROL_PERIOD
 from leapnav.training.actors import copy_actor, policy_of
-from leapnav.training.cloning import EpochLoss, behaviour_clone, check_observations
+from leapnav.training.cloning import EpochLoss, action_slopes, behaviour_clone, check_observations
 from leapnav.training.config import CloningConfig, WarmStartConfig
 from leapnav.training.dataset import Dataset
 
@@ -27,7 +27,7 @@ from leapnav.training.dataset import Dataset
 # direction): short beside what bends the cost-to-go, long beside a lidar's steps from one beam to the next.
 REACH = np.array([0.02, 0.02, 0.02])
 STEEPEST = 10.0  # of the slopes' spread; at the goal's end the costate grows without bound
-ACTION_NOISE = 0.3  # standard deviation of the actions, round the expert's, at which a Q function is fitted
+ACTION_NOISE = 0.5  # standard deviation of the actions, round the expert's, whose cost a Q function is fitted to
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,9 @@ def warm_start(
 
     """
     config = config or WarmStartConfig()
-    _check(config, reward_scale)
+    check_warm_start(config)
+    if not (math.isfinite(reward_scale) and reward_scale > 0):
+        raise ValueError(f"reward_scale: expected a positive number, got {reward_scale!r}")
     samples, target = Dataset.of(dataset), policy_of(model)
     check_observations(target, samples)
     losses: list[EpochLoss] = []
@@ -94,11 +96,15 @@ def _fit_critic(
 ) -> tuple[float, float]:
     """Mean squared errors of values and slopes in the last epoch, in units of their variance."""
     device, rng = policy.device, np.random.default_rng(config.seed)
-    dataset = dataset[np.isfinite(dataset.returns) & np.isfinite(dataset.costates).all(axis=1)]
+    known = np.isfinite(dataset.returns) & np.isfinite(dataset.costates).all(axis=1)
+    if not known.any():
+        raise ValueError("dataset: no sample has a cost-to-go and a costate; start.critic needs them")
+    dataset = dataset[known]
     shrinking = reward_scale * _discounting(dataset.observations[:, 4], gamma)
     values = _tensor(shrinking * dataset.returns, device)
     observations, actions = _tensor(dataset.observations, device), _tensor(dataset.actions, device)
-    hamiltonian = [_tensor(column, device) for column in (dataset.weights * dataset.limits**2, shrinking)]
+    columns = dataset.weights * dataset.limits**2, action_slopes(dataset), shrinking
+    curvature, slope, shrunk = (_tensor(column, device) for column in columns)
     critic = _Critic(policy)
     optimiser = th.optim.AdamW(critic.parameters, lr=config.critic_learning_rate)
     generator = th.Generator().manual_seed(config.seed)
@@ -113,15 +119,17 @@ def _fit_critic(
                 for group in optimiser.param_groups:
                     group["lr"] = config.critic_learning_rate * 0.5 * (1 + math.cos(math.pi * step / total))
                 inputs, target, taken = observations[chosen], values[chosen], actions[chosen]
-                if critic.takes_actions:
-                    # The expert's for half of them, else some near it.
-                    noise = ACTION_NOISE * th.randn(taken.shape, generator=generator).to(device)
-                    noise[: len(noise) // 2] = 0.0
-                    error = (taken + noise).clamp(-1.0, 1.0) - taken
-                    loss_rate = 0.5 * (hamiltonian[0][chosen] * error.square()).sum(dim=1)
-                    target, taken = target - CONTROL_PERIOD * hamiltonian[1][chosen] * loss_rate, taken + error
-                value_loss = critic.error(inputs, taken, target) / spread
+                estimates = critic.values(inputs, taken)
+                value_loss = (estimates - target[:, None]).square().mean() / spread
                 loss = value_loss
+                if critic.takes_actions:
+                    # What other actions cost is little beside the values, so it has a loss of its own.
+                    noise = ACTION_NOISE * th.randn(taken.shape, generator=generator).to(device)
+                    error = (taken + noise).clamp(-1.0, 1.0) - taken
+                    dearer = (0.5 * curvature[chosen] * error.square() + slope[chosen] * error).sum(dim=1)
+                    cost = CONTROL_PERIOD * shrunk[chosen] * dearer
+                    difference = estimates - critic.values(inputs, taken + error) - cost[:, None]
+                    loss = loss + config.gradient_weight * difference.square().mean() / cost.square().mean()
                 if slopes is not None:
                     slope_loss = slopes.loss(critic, config.critic_batch_size // 4, generator)
                     loss = loss + config.gradient_weight * slope_loss
@@ -169,10 +177,6 @@ class _Critic:
             return th.cat(found, dim=1)
         return found.flatten(start_dim=1)
 
-    def error(self, observations: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """Mean squared error."""
-        return (self.values(observations, actions) - target[:, None]).square().mean()
-
     def finish(self) -> None:
         """Makes a target network the same."""
         target: Any = getattr(self._policy, "critic_target", None)
@@ -211,11 +215,15 @@ class _Slopes:
         return (above - below - self._rise[chosen][:, None]).square().mean() / self._spread
 
 
-def _check(config: WarmStartConfig, reward_scale: float) -> None:
+def check_warm_start(config: WarmStartConfig) -> None:
+    """Checks the settings of a warm start.
+
+    Raises:
+        ValueError: one is impossible; the message names it and its value.
+
+    """
     for name in ("critic_epochs", "critic_batch_size", "critic_learning_rate", "slopes"):
         if not (math.isfinite(getattr(config, name)) and getattr(config, name) > 0):
             raise ValueError(f"{name}: expected a positive number, got {getattr(config, name)!r}")
     if not (math.isfinite(config.gradient_weight) and config.gradient_weight >= 0):
         raise ValueError(f"gradient_weight: expected a number >= 0, got {config.gradient_weight!r}")
-    if not (math.isfinite(reward_scale) and reward_scale > 0):
-        raise ValueError(f"reward_scale: expected a positive number, got {reward_scale!r}")
