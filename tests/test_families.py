@@ -40,5 +40,13 @@ def test_clutter_is_6_to_12_discs_and_open_is_empty():
 
 
 def test_an_unknown_family_is_named():
-    with pytest.raises(ValueError, match="family: expected one of open, clutter, polygons, rooms, slalom, got 'maze'"):
+    known = "open, clutter, polygons, rooms, slalom or all"
+    with pytest.raises(ValueError, match=f"family: expected one of {known}, got 'maze'"):
         sample_scenario("maze", 0)
+
+
+def test_all_families_together_are_drawn_evenly():
+    drawn = [sample_scenario("all", seed).name.split("-")[0] for seed in range(300)]
+    assert set(drawn) == set(FAMILIES)
+    assert all(drawn.count(family) > 40 for family in FAMILIES)
+    assert sample_scenario("all", 5) == sample_scenario("all", 5)
