@@ -47,7 +47,7 @@ def print_scores(contest: Contest, console: Console | None = None) -> None:
     table = Table(
         title=f"{scores[0].episodes} scenarios; brackets: 95 % bootstrap interval over {resampled}",
         box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
+        padding=0,
         pad_edge=False,
     )
     table.add_column("policy", min_width=10, overflow="fold")
