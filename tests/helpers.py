@@ -10,8 +10,11 @@ from scipy.integrate import solve_ivp
 from leapnav.envs import Scenario
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem
 from leapnav.experts import Path as Guess
+from leapnav.training import CloningConfig, make_policy
 
 DATA = Path(__file__).parent / "data"
+QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)  # a fit that is not to be good
+SMALL = (32, 32)  # a network, too
 
 
 def best_known() -> list[tuple[Scenario, float]]:
@@ -74,3 +77,8 @@ def shooting_guess(problem, costate):
     start = np.concatenate([np.asarray(problem.start, dtype=float), costate])
     z = solve_ivp(flow, (0.0, problem.horizon), start, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12).y.T
     return Guess(times, z[:, :n], z[:, n:])
+
+
+def fresh(env, seed=0, hidden=SMALL):
+    """A small policy that has learned nothing."""
+    return make_policy(env.observation_space, env.action_space, seed, hidden)

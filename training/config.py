@@ -160,17 +160,6 @@ class DAggerRunConfig(RunConfig):
 class _LearnerConfig(RunConfig):
     """What the runs of reinforcement learning have in common."""
 
-    total_timesteps: int
-    """Control periods of all robots together."""
-    n_envs: int
-    """Robots that drive at once."""
-    learning_rate: float
-    """At first; it falls to zero along a line."""
-    gamma: float
-    """Discount factor. The horizon is finite and observed, so 1 is possible, and the critic's values are minus the
-    costs to go then."""
-    reward: Literal["cost", "shaped"]
-    """Reward of the environment; "shaped" tells on the way how near the goal is."""
     reward_scale: float = 0.1
     """Factor of the rewards."""
     warm_start: tuple[Path, ...] = ()

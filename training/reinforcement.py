@@ -126,7 +126,7 @@ def _train(
     run = Run(algorithm, config)
     found = run.load_checkpoint() if config.resume else None
     if found is None:
-        _warm_start(model, config, dataset, start, progress)
+        _warm_start(model, config, dataset, copied=start is not None, progress=progress)
     else:
         model = _load(type(model), found[0], venv, dataset, config)
     model.set_logger(run.logger)
@@ -170,16 +170,14 @@ def _robots(config: Config) -> VecEnv:
     return ScaledReward(venv, config.reward_scale)
 
 
-def _warm_start(
-    model: BaseAlgorithm, config: Config, dataset: Dataset | None, policy: BasePolicy | None, progress: bool
-) -> None:
+def _warm_start(model: BaseAlgorithm, config: Config, dataset: Dataset | None, *, copied: bool, progress: bool) -> None:
+    """What is left of a warm start when a policy's actor may have been copied already."""
     if dataset is not None:
         warm_start(
             model,
             dataset,
-            replace(config.start, seed=config.seed),
+            replace(config.start, seed=config.seed, actor=config.start.actor and not copied),
             cloning=replace(config.cloning, seed=config.seed),
-            policy=policy if config.start.actor else None,
             reward_scale=config.reward_scale,
             progress=progress,
         )

@@ -1,0 +1,190 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch as th
+from helpers import QUICK, SMALL, fresh
+from stable_baselines3 import A2C, PPO, SAC, TD3
+
+from leapnav.envs import sample_scenario
+from leapnav.training import CloningConfig, Dataset, behaviour_clone, evaluate, network
+from leapnav.training.actors import copy_actor, mean_action
+from leapnav.training.cloning import Cloning
+
+
+def test_cloning_learns(clone, env):
+    policy, losses = clone
+    assert losses[-1].training < 0.1 * losses[0].training
+    assert losses[-1].validation < 0.3  # of what the mean action loses
+    learned = evaluate(policy, "open", count=20, timed=False, progress=False)
+    before = evaluate(fresh(env), "open", count=20, timed=False, progress=False)
+    assert np.mean([e.episode_return for e in learned]) > np.mean([e.episode_return for e in before]) + 10
+
+
+def test_the_noise_of_a_clone_is_the_error_that_remains(clone):
+    assert th.all(clone[0].log_std.exp() < 0.2)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3])
+def test_the_actors_of_all_algorithms_can_be_cloned(algorithm, dataset, env):
+    model = algorithm("MlpPolicy", env, policy_kwargs=network(SMALL), seed=0, device="cpu")
+    losses = behaviour_clone(model, dataset, CloningConfig(epochs=6, batch_size=256), progress=False)
+    assert losses[-1].training < 0.5 * losses[0].training
+    inputs = th.as_tensor(dataset.observations[:50])
+    with th.no_grad():
+        expected = mean_action(model.policy, inputs).clamp(-1, 1).numpy()
+    found, _ = model.predict(dataset.observations[:50], deterministic=True)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_model_without_an_actor_is_refused(dataset):
+    with pytest.raises(TypeError, match="expected one of Stable-Baselines3 or its policy, got int"):
+        behaviour_clone(3, dataset, QUICK)
+
+
+def test_the_same_seed_gives_the_same_weights(dataset, env):
+    weights = []
+    for _ in range(2):
+        policy = fresh(env, seed=3)
+        behaviour_clone(policy, dataset[:2000], QUICK, progress=False)
+        weights.append(policy.parameters_to_vector())
+        th.rand(5)  # the global generator plays no part
+    assert weights[0].tobytes() == weights[1].tobytes()
+
+
+def test_making_and_cloning_leave_the_global_generators_alone(dataset, env):
+    th.manual_seed(0)
+    np.random.seed(0)
+    torch_before, numpy_before = th.get_rng_state().clone(), np.random.get_state()[1].copy()
+    behaviour_clone(fresh(env), dataset[:1000], QUICK, progress=False)
+    assert th.equal(torch_before, th.get_rng_state())
+    assert np.array_equal(numpy_before, np.random.get_state()[1])
+
+
+def test_no_course_is_in_both_training_and_validation(dataset):
+    from leapnav.training.cloning import _split
+
+    train, held_out = _split(dataset, 0.25, 0)
+    assert train.sum() + held_out.sum() == len(dataset)
+    assert held_out.any()
+    courses = np.array(dataset.course_texts)[dataset.episodes]
+    assert not set(courses[train]) & set(courses[held_out])
+    # Of fewer courses those are held out that were before, but for the share's rounding.
+    fewer = dataset.episodes < 60
+    again = _split(dataset[fewer], 0.25, 0)[1]
+    assert len(set(courses[fewer][again]) - set(courses[held_out])) <= 3
+
+
+def test_cloning_stops_early_and_keeps_the_best_epoch(dataset, env):
+    policy = fresh(env)
+    # A learning rate at which the loss soon rises.
+    config = CloningConfig(epochs=50, patience=2, batch_size=64, learning_rate=0.05, validation_share=0.3)
+    fit = Cloning(policy, dataset[:1500], config)
+    while not fit.finished:
+        fit.run_epoch()
+    validation = [loss.validation for loss in fit.losses]
+    assert len(validation) < 50
+    assert min(validation[:-2]) <= min(validation[-2:])
+    fit.finish()
+    assert fit._validation() == pytest.approx(min(validation), rel=1e-5)
+
+
+def test_a_fit_that_was_put_aside_goes_on_to_the_same_bits(dataset, env):
+    config = CloningConfig(epochs=4, batch_size=256)
+    straight, first, second = fresh(env), fresh(env), fresh(env, seed=9)
+    behaviour_clone(straight, dataset, config, progress=False)
+    begun = Cloning(first, dataset, config)
+    begun.run_epoch()
+    begun.run_epoch()
+    state, weights = begun.state_dict(), first.state_dict()
+    resumed = Cloning(second, dataset, config)
+    second.load_state_dict(weights)
+    resumed.load_state_dict(state)
+    while not resumed.finished:
+        resumed.run_epoch()
+    resumed.finish()
+    assert second.parameters_to_vector().tobytes() == straight.parameters_to_vector().tobytes()
+
+
+def test_the_hamiltonian_loss_is_what_an_error_costs():
+    """H(q, lambda, u) - H(q, lambda, u*), written out, for optima inside the robot's limits and on them."""
+    from leapnav.training.cloning import _hamiltonian_loss, action_slopes
+
+    rng = np.random.default_rng(0)
+    count, limits, weights = 200, np.array([2.0, 3.0]), np.array([1.0, 0.5])
+    heading, costates = rng.uniform(-4, 4, count), 3 * rng.normal(size=(count, 3))
+    p = np.stack([np.cos(heading) * costates[:, 0] + np.sin(heading) * costates[:, 1], costates[:, 2]], axis=1)
+    best = np.clip(-p / weights, -limits, limits)
+    assert (np.abs(best) == limits).any()
+    taken = np.clip(best + rng.normal(size=best.shape), -limits, limits)
+    extra = (0.5 * weights * (taken**2 - best**2) + p * (taken - best)).sum(axis=1)
+    dataset = Dataset(
+        observations=np.zeros((count, 41), np.float32),
+        actions=best / limits,
+        returns=np.zeros(count),
+        costates=costates,
+        states=np.stack([np.zeros(count), np.zeros(count), heading], axis=1),
+        times=np.zeros(count),
+        executed=best / limits,
+        rewards=np.zeros(count),
+        episodes=np.zeros(count, dtype=int),
+        scenarios=(sample_scenario("open", 1).to_json(),),
+    )
+    error = th.as_tensor((taken - best) / limits)
+    loss = _hamiltonian_loss(error, th.as_tensor(action_slopes(dataset)), th.as_tensor(weights * limits**2))
+    assert loss.sum(dim=1).numpy() == pytest.approx(extra, abs=1e-9)
+
+
+def test_cloning_by_the_hamiltonian_learns(dataset, env):
+    losses = behaviour_clone(
+        fresh(env), dataset, CloningConfig(epochs=8, batch_size=256, loss="hamiltonian"), progress=False
+    )
+    assert losses[-1].validation < 0.3 < losses[0].validation
+
+
+def test_ppo_can_go_on_from_a_clone(clone, env):
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, policy_kwargs=network())
+    copy_actor(clone[0], model.policy)
+    observation, _ = env.reset(seed=0)
+    assert model.predict(observation, deterministic=True)[0] == pytest.approx(
+        clone[0].predict(observation, deterministic=True)[0], abs=1e-6
+    )
+    model.learn(64)
+    with pytest.raises(ValueError, match="its network has the shapes"):
+        copy_actor(clone[0], fresh(env))
+    squashing = SAC("MlpPolicy", env, policy_kwargs=network(), device="cpu")
+    with pytest.raises(ValueError, match="which squashes its actions or does not"):
+        copy_actor(clone[0], squashing.policy)
+
+
+def test_the_target_actor_of_td3_is_cloned_too(dataset, env):
+    model = TD3("MlpPolicy", env, policy_kwargs=network(SMALL), seed=0, device="cpu")
+    behaviour_clone(model, dataset, QUICK, progress=False)
+    target = model.actor_target.state_dict()
+    assert all(th.equal(value, target[name]) for name, value in model.actor.state_dict().items())
+
+
+def test_a_fit_that_diverges_says_so(dataset, env):
+    config = CloningConfig(epochs=3, batch_size=64, learning_rate=1e30)
+    with pytest.raises(ValueError, match="learning_rate: the fit diverged in epoch"):
+        behaviour_clone(fresh(env), dataset, config, progress=False)
+    with pytest.raises(ValueError, match="dataset: actions: expected finite numbers"):
+        replace(dataset, actions=np.full_like(dataset.actions, np.nan))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"epochs": 0}, "epochs: .*0"),
+        ({"batch_size": -1}, "batch_size: .*-1"),
+        ({"validation_share": 1.0}, "validation_share"),
+        ({"learning_rate": math.inf}, "learning_rate: .*inf"),
+        ({"seed": 10**20}, "seed: "),
+        ({"patience": -1}, "patience: .*-1"),
+        ({"loss": "l3"}, "loss: expected action or hamiltonian, got 'l3'"),
+    ],
+)
+def test_bad_settings_are_named(settings, message, dataset, env):
+    with pytest.raises(ValueError, match=message):
+        behaviour_clone(fresh(env), dataset, CloningConfig(**settings), progress=False)

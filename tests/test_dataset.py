@@ -1,0 +1,100 @@
+import json
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from helpers import QUICK, fresh
+
+from leapnav.envs import NavigateEnv, Scenario, sample_scenario
+from leapnav.experts.demonstrations import load_demonstrations
+from leapnav.training import Dataset, behaviour_clone
+from leapnav.training.symmetries import mirror, turn_round
+
+
+def test_a_dataset_is_the_same_from_a_folder_and_from_demonstrations(demonstrated, dataset):
+    demonstrations = load_demonstrations(demonstrated)
+    other = Dataset.of(demonstrations)
+    assert len(dataset) == len(other) == sum(len(d.actions) for d in demonstrations)
+    for name in ("observations", "actions", "returns", "costates", "states", "times", "executed", "rewards"):
+        np.testing.assert_allclose(getattr(dataset, name), getattr(other, name), atol=1e-9, err_msg=name)
+    assert dataset.course_texts == other.course_texts
+    assert (dataset.limits == [2.0, 3.0]).all()
+    assert (dataset.weights == [1.0, 0.5]).all()
+    first = demonstrations[0]
+    np.testing.assert_allclose(dataset.returns[: len(first.actions)], -first.cost_to_go[:-1])
+
+
+def test_datasets_are_joined_saved_and_loaded(dataset, tmp_path):
+    parts = dataset[:100], dataset[100:300]
+    joined = Dataset.joined(parts)
+    np.testing.assert_array_equal(joined.observations, dataset.observations[:300])
+    scenarios = [joined.scenarios[i] for i in joined.episodes]
+    assert scenarios == [dataset.scenarios[i] for i in dataset.episodes[:300]]
+    joined.save(tmp_path / "part.npz")
+    loaded = Dataset.load(tmp_path / "part.npz")
+    np.testing.assert_array_equal(loaded.costates, joined.costates)
+    assert loaded.scenarios == joined.scenarios
+    (tmp_path / "part.npz").write_bytes((tmp_path / "part.npz").read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"part\.npz: not a dataset's file"):
+        Dataset.load(tmp_path / "part.npz")
+
+
+def test_datasets_that_cannot_be_learned_from_are_refused(demonstrated, dataset, tmp_path, env, monkeypatch):
+    import shutil
+
+    with pytest.raises(ValueError, match="expected at least one"):
+        Dataset.of([])
+    with pytest.raises(FileNotFoundError, match="expected one Minari dataset"):
+        Dataset.of(tmp_path)
+    other = tmp_path / "other"
+    shutil.copytree(demonstrated, other)
+    metadata = next(other.glob("**/metadata.json"))
+    content = json.loads(metadata.read_text())
+    content["env_spec"] = content["env_spec"].replace("Navigate-v0", "Navigate-v1")
+    metadata.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"a dataset of leapnav/Navigate-v1; leapnav learns from leapnav/Navigate-v0"):
+        Dataset.of(other)
+    fewer = gym.make("leapnav/Navigate-v0", lidar_beams=16)
+    with pytest.raises(ValueError, match="its observations have 41 numbers, the policy's 25"):
+        behaviour_clone(fresh(fewer), dataset, QUICK, progress=False)
+
+
+def test_mirroring_and_turning_round_are_symmetries_of_the_environment():
+    fields = sample_scenario("clutter", 5).to_dict()
+
+    def mirrored(pose):
+        return [10.0 - pose[0], pose[1], math.pi - pose[2]]
+
+    def turned(pose):
+        return [pose[0], pose[1], pose[2] + math.pi]
+
+    twins = {
+        mirror: {
+            **fields,
+            "start": mirrored(fields["start"]),
+            "goal": mirrored(fields["goal"]),
+            "obstacles": [
+                {"circle": {**o["circle"], "center": [10.0 - o["circle"]["center"][0], o["circle"]["center"][1]]}}
+                for o in fields["obstacles"]
+            ],
+        },
+        turn_round: {**fields, "start": turned(fields["start"]), "goal": turned(fields["goal"])},
+    }
+    for transform, twin_fields in twins.items():
+        env = NavigateEnv(scenario=Scenario.from_dict(fields))
+        twin = NavigateEnv(scenario=Scenario.from_dict(twin_fields))
+        observation, twin_observation = env.reset()[0], twin.reset()[0]
+        for step in range(20):
+            action = np.array([0.2, 0.3 * math.cos(step)], np.float32)
+            inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None])
+            assert inputs[0].numpy() == pytest.approx(twin_observation, abs=1e-4)
+            observation, reward, *_ = env.step(action)
+            twin_observation, twin_reward, *_ = twin.step(targets[0].numpy())
+            assert twin_reward == pytest.approx(reward, rel=1e-6)
+
+
+def test_an_odd_number_of_beams_cannot_be_turned_round():
+    with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
+        turn_round(th.zeros(1, 12), th.zeros(1, 2))

@@ -1,0 +1,107 @@
+import hashlib
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from helpers import SMALL
+from stable_baselines3 import PPO, SAC
+
+from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
+from leapnav.training.vec_env import ScaledReward
+
+
+def test_the_features_have_the_promised_size_and_are_finite(env):
+    features = NavigationFeatures(env.observation_space)
+    for seed in range(5):
+        observation, _ = env.reset(seed=seed)
+        found = features(th.as_tensor(observation)[None])
+        assert found.shape == (1, features.features_dim)
+        assert th.isfinite(found).all()
+    low, high = env.observation_space.low, env.observation_space.high
+    assert th.isfinite(features(th.as_tensor(np.stack([low, high, np.zeros_like(low)])))).all()
+
+
+def test_policies_are_checked_against_the_robots_of_stable_baselines3(clone, tmp_path):
+    save_policy(clone[0], tmp_path)
+    load_policy(tmp_path, ScaledReward(make_vec_env(n_envs=2, family="open"), 0.1))
+    with pytest.raises(ValueError, match="lidar_beams=32"):
+        load_policy(tmp_path, make_vec_env(n_envs=2, family="open", lidar_beams=16))
+
+
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_a_saved_policy_acts_the_same(algorithm, env, tmp_path):
+    model = algorithm("MlpPolicy", env, policy_kwargs=network(SMALL), seed=0, device="cpu")
+    save_policy(model, tmp_path / "policy")
+    loaded = load_policy(tmp_path / "policy", env)
+    for seed in range(5):
+        observation, _ = env.reset(seed=seed)
+        assert np.array_equal(
+            model.predict(observation, deterministic=True)[0], loaded.predict(observation, deterministic=True)[0]
+        )
+
+
+def test_half_precision_keeps_the_actor(clone, env, tmp_path):
+    save_policy(clone[0], tmp_path / "whole")
+    save_policy(clone[0], tmp_path / "half", half=True)
+    sizes = [(tmp_path / name / "weights.pt").stat().st_size for name in ("whole", "half")]
+    assert sizes[1] < 0.3 * sizes[0]
+    loaded = load_policy(tmp_path / "half", env)
+    observation, _ = env.reset(seed=0)
+    assert loaded.predict(observation, deterministic=True)[0] == pytest.approx(
+        clone[0].predict(observation, deterministic=True)[0], abs=0.01
+    )
+
+
+def test_a_policy_with_another_network_is_not_saved(env, tmp_path):
+    with pytest.raises(ValueError, match=r"policy_kwargs=leapnav\.training\.network\(\)"):
+        save_policy(PPO("MlpPolicy", env), tmp_path)
+
+
+def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
+    save_policy(clone[0], tmp_path)
+    with pytest.raises(ValueError, match=r"observes another environment than this one: lidar_beams=32 \(here 16\)"):
+        load_policy(tmp_path, gym.make("leapnav/Navigate-v0", lidar_beams=16))
+    with pytest.raises(ValueError, match=r"actuation='velocity' \(here 'motor'\)"):
+        load_policy(tmp_path, gym.make("leapnav/Navigate-v0", actuation="motor"))
+    weights = (tmp_path / "weights.pt").read_bytes()
+    half = len(weights) // 2
+    for damaged in (weights[:1000], weights[:half] + bytes([weights[half] ^ 255]) + weights[half + 1 :]):
+        (tmp_path / "weights.pt").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"weights\.pt: not this policy's weights: damaged"):
+            load_policy(tmp_path)
+    (tmp_path / "weights.pt").unlink()
+    with pytest.raises(FileNotFoundError):
+        load_policy(tmp_path)
+    description = json.loads((tmp_path / "policy.json").read_text())
+    faults = [
+        ({**description, "format": 99}, "format: expected 2, got 99"),
+        ({}, "not a policy's description"),
+        ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
+        ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, tqc, got 'dqn'"),
+        ({**description, "hidden": ["wide"]}, "not a policy's description"),
+        ({**description, "observation_low": [0.0]}, "not a policy's description"),
+    ]
+    for content, message in faults:
+        (tmp_path / "policy.json").write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=message):
+            load_policy(tmp_path)
+
+
+def test_loading_a_policy_executes_nothing(clone, tmp_path):
+    import os
+    import pickle
+
+    class Evil:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "executed"),)
+
+    save_policy(clone[0], tmp_path)
+    (tmp_path / "weights.pt").write_bytes(pickle.dumps(Evil()))
+    description = json.loads((tmp_path / "policy.json").read_text())
+    description["sha256"] = hashlib.sha256((tmp_path / "weights.pt").read_bytes()).hexdigest()
+    (tmp_path / "policy.json").write_text(json.dumps(description))
+    with pytest.raises(ValueError, match="not this policy's weights"):
+        load_policy(tmp_path)
+    assert not (tmp_path / "executed").exists()
