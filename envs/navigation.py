@@ -316,11 +316,6 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return x, y, heading
 
     @property
-    def cost(self) -> float:
-        """J so far."""
-        return float(self._fleet.state[0, driving.COST])
-
-    @property
     def time(self) -> float:
         """Seconds since the start of the episode."""
         return float(self._fleet.state[0, driving.TIME])

@@ -278,11 +278,6 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self.settings.control_period
 
     @property
-    def costs(self) -> np.ndarray:
-        """J so far (num_envs,) of each robot's episode."""
-        return self._fleet.state[:, driving.COST].copy()
-
-    @property
     def times(self) -> np.ndarray:
         """Seconds (num_envs,) since the start of each robot's episode."""
         return self._fleet.state[:, driving.TIME].copy()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,13 +12,11 @@ from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario, ScenarioError
 from leapnav.experts.extremal import CONVERGED
 from leapnav.experts.integrator import CONTROL, FLOW, constant, matrix, propagate, vector
-from leapnav.experts.lattice import Lattice
 from leapnav.experts.multiple_shooting import flags, newton
 from leapnav.experts.nodes import start_nodes
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem import OptimalControlProblem, Path
 from leapnav.experts.single_shooting import MARGIN
-from leapnav.experts.solve import solve
 
 # Seconds between the nodes, at most: fewer are quicker, but past an obstacle the flow may be too sensitive for that.
 SEGMENTS = (0.5, 0.25, 0.125)
@@ -30,8 +27,6 @@ ITERATIONS = 8  # of Newton's method: what takes more is nearer to another solut
 PAUSE = 0.5  # s after a search in vain before the next one
 SMALLEST_STEP = 1 / 16  # of the way to a state that Newton's method does not reach at once
 FAR = 0.05  # m or rad off the path from which on a re-solve is looked at closely
-WAYS, QUICKLY = 2, 15  # that are looked at for a better one, and iterations for each
-BETTER = 1e-3  # by which a better way is cheaper, relative
 SAMPLING = 0.05  # s between the points at which a path's clearance is looked at
 GAIN_STEP = 0.05  # s between the points of the gains
 STIFFEST = 0.25  # s before the horizon from which the gains stay as they are: they grow without bound
@@ -55,8 +50,7 @@ class Feedback:
     Args:
         scenario: the task.
         path: its optimum, or one nearly so, with costates.
-        quick: search among the most promising ways only, where a search is needed: a tenth of the time, but it may find
-            nothing where there is something.
+        quick: where a search is needed, let it not be thorough, see `find_optimum`.
 
     Attributes:
         searches: how often a new search was needed.
@@ -103,33 +97,6 @@ class Feedback:
         if found is not None:
             self._stored = found
         return found is not None
-
-    def reconsider(self, state: np.ndarray, time: float) -> bool:
-        """Looks at the most promising ways from a state at a time, and stores one that is cheaper than what is stored.
-
-        Unlike a full search it takes the lattice's first paths only, which mostly are the best.
-
-        Returns:
-            Whether there was one.
-
-        """
-        return self._look_round(state, time, (1 - BETTER) * float(self._stored.costs.sum()))
-
-    def _look_round(self, state: np.ndarray, time: float, limit: float) -> bool:
-        """Stores the cheapest of the most promising ways whose cost is below a limit; False if there is none."""
-        task = self._task(state, time)
-        if task is None:
-            return False
-        self.searches += 1
-        better = False
-        for candidate in islice(Lattice(task).candidates(), WAYS):
-            path = Path(candidate.times, candidate.poses)
-            found = solve(task, "multiple_shooting", guess=path, max_iterations=QUICKLY)
-            if not found.success or found.cost >= limit:
-                continue
-            if self._take(found.problem, Path(found.times, found.states, found.costates), time):
-                limit, better = found.cost, True
-        return better
 
     def value(self, state: np.ndarray, time: float, tol: float = 1e-9) -> tuple[float, np.ndarray]:
         """Cost-to-go and its gradient, the costate (3,), at a state and time; what is stored stays.
@@ -249,16 +216,11 @@ class Feedback:
         """Stores the best optimum from a state and time, by a new search; False if there is none."""
         if time < self._patience:
             return False
-        if self._quick:
-            found = self._look_round(state, time, math.inf)
-            if not found:
-                self._patience = time + PAUSE
-            return found
         self.searches += 1
         scenario = self._task(state, time)
         if scenario is None:
             return False
-        optimum = find_optimum(scenario)
+        optimum = find_optimum(scenario, thorough=not self._quick)
         path = Path(optimum.times, optimum.states, optimum.costates)
         if optimum.success and self._take(optimum.problem, path, time):
             return True

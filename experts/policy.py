@@ -22,8 +22,6 @@ from leapnav.experts.problem import Path
 
 FEEDBACKS = ("resolve", "gains", "none")
 FEWEST_ROBOTS = 8  # for which threads are worth their while
-TOO_LATE = 1.0  # s before the horizon from which on there is only one way to the goal
-AGAIN = 1.0  # s between searches for a better way
 
 
 class NoOptimumError(RuntimeError):
@@ -61,7 +59,6 @@ class _Situation:
     bank: ScenarioBank | None
     pose: np.ndarray
     time: float
-    cost: float
     period: float
 
 
@@ -74,8 +71,6 @@ class _Robot:
     limits: np.ndarray
     feedback: Feedback
     gains: Gains | None
-    promised: float = math.nan  # cost of the whole episode, as the last search had it
-    searched: float = -math.inf  # s, when that was
     label: tuple[float, np.ndarray] = (math.nan, np.full(3, math.nan))  # cost-to-go and costate of the last action
 
 
@@ -92,15 +87,13 @@ class ExpertPolicy:
             step before, or found by a new search where that fails. "gains": neighbouring-extremal gains along the
             optimum of the episode's start, a hundred times cheaper and good near it. "none": the optimum of the start,
             whatever happens.
-        reconsider: for "resolve": search anew, for a better way than the one that the robot is on, whenever the cost of
-            the episode, paid and to go, has grown by this share since the last search, but not twice within a second;
-            None never does. A teacher should: what is best must depend on where the robot is, not on how it came there.
-            These searches, and those where a re-solve fails, then take the most promising ways only.
+        quick: search the most promising ways only, see `find_optimum`: for a teacher, who looks for many optima and can
+            do without some of them.
         workers: threads for many robots; None for one on each core.
 
     Raises:
         TypeError: the environment is none of leapnav's.
-        ValueError: there is no such feedback, or `reconsider` is negative.
+        ValueError: there is no such feedback.
 
     """
 
@@ -110,16 +103,12 @@ class ExpertPolicy:
         references: Mapping[Scenario, Path] | None = None,
         *,
         feedback: Literal["resolve", "gains", "none"] = "resolve",
-        reconsider: float | None = None,
+        quick: bool = False,
         workers: int | None = None,
     ) -> None:
         if feedback not in FEEDBACKS:
             raise ValueError(f"feedback: expected one of {', '.join(FEEDBACKS)}, got {feedback!r}")
-        if reconsider is not None and feedback != "resolve":
-            raise ValueError(f"reconsider: expected None for feedback {feedback!r}, got {reconsider!r}")
-        if reconsider is not None and not reconsider >= 0:
-            raise ValueError(f"reconsider: expected a number >= 0 or None, got {reconsider!r}")
-        self._reconsider = reconsider
+        self._quick = quick
         self._envs = _environments(env)
         self._references = dict(references or {})
         self._feedback = feedback
@@ -133,7 +122,7 @@ class ExpertPolicy:
     @property
     def settings(self) -> dict[str, Any]:
         """The arguments that make another expert like this one."""
-        return {"feedback": self._feedback, "reconsider": self._reconsider}
+        return {"feedback": self._feedback, "quick": self._quick}
 
     @property
     def searches(self) -> int:
@@ -222,24 +211,9 @@ class ExpertPolicy:
         else:
             if self._feedback == "resolve":
                 solved = robot.feedback.update(situation.pose, situation.time)
-                if solved and self._reconsider is not None:
-                    self._look_round(robot, situation, self._reconsider)
                 robot.label = robot.feedback.stored if solved else (math.nan, np.full(3, math.nan))
             control = robot.feedback.control(situation.time + ahead)
         return control / robot.limits
-
-    def _look_round(self, robot: _Robot, situation: _Situation, share: float) -> None:
-        """Searches anew if the episode has become dearer than the last search promised."""
-        total = situation.cost + robot.feedback.stored[0]
-        if math.isnan(robot.promised):  # the first step
-            robot.promised = total
-        left = situation.scenario.horizon - situation.time
-        due = situation.time >= robot.searched + AGAIN and left > TOO_LATE
-        if due and total > (1 + share) * robot.promised:
-            robot.searched = situation.time
-            if robot.feedback.reconsider(situation.pose, situation.time):
-                total = situation.cost + robot.feedback.stored[0]
-            robot.promised = total
 
     def _robot(self, i: int, situation: _Situation) -> _Robot:
         """What is known of a robot's episode; a new one is looked up or solved."""
@@ -253,13 +227,13 @@ class ExpertPolicy:
             reference = situation.bank.reference(situation.index)
             path = Path(reference.times, reference.states.astype(float), reference.costates.astype(float))
         if path is None:
-            optimum = find_optimum(scenario)
+            optimum = find_optimum(scenario, thorough=not self._quick)
             if not optimum.success:
                 message = f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}"
                 raise NoOptimumError(message, scenario)
             path = Path(optimum.times, optimum.states, optimum.costates)
         try:
-            feedback = Feedback(scenario, path, quick=self._reconsider is not None)
+            feedback = Feedback(scenario, path, quick=self._quick)
         except ValueError as error:
             raise NoOptimumError(str(error), scenario) from None
         limits = np.array([scenario.robot.max_speed, scenario.robot.max_turn_rate])
@@ -274,11 +248,10 @@ class ExpertPolicy:
         for env in self._envs:
             period, bank = env.control_period, env.bank
             if isinstance(env, NavigateEnv):
-                pose, time, cost = np.array(env.pose), env.time, env.cost
-                found.append(_Situation(env.scenario, env.index, bank, pose, time, cost, period))
+                found.append(_Situation(env.scenario, env.index, bank, np.array(env.pose), env.time, period))
             else:
-                rows = zip(env.scenarios, env.indices, env.poses, env.times.tolist(), env.costs.tolist(), strict=True)
-                found += [_Situation(scene, i, bank, pose, time, cost, period) for scene, i, pose, time, cost in rows]
+                rows = zip(env.scenarios, env.indices, env.poses, env.times.tolist(), strict=True)
+                found += [_Situation(scenario, i, bank, pose, time, period) for scenario, i, pose, time in rows]
         return found
 
     def _each(self, function: Callable[[int, _Situation], Any], situations: list[_Situation]) -> list[Any]:

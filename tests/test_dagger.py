@@ -1,23 +1,24 @@
 import numpy as np
 import pytest
 from helpers import QUICK, fresh
-from tqdm import tqdm
 
-from leapnav.envs import NavigateEnv, Scenario
+from leapnav.envs import NavigateEnv, Scenario, sample_scenario
+from leapnav.envs.settings import Settings
 from leapnav.experts import ExpertPolicy
 from leapnav.training import DAgger, DAggerConfig, Dataset, behaviour_clone, make_vec_env
+from leapnav.training.dagger import _Episode, _label, _takeovers
 from leapnav.training.vec_env import ScaledReward
 
 
-def test_dagger_labels_what_the_learner_sees(dataset, env, tmp_path):
-    """The labels are the expert's at the learner's states, with value and costate; rounds are kept on disk."""
+def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tmp_path):
+    """The samples are the optimum's from states of the learner, with value and costate; rounds are kept on disk."""
     policy = fresh(env)
     behaviour_clone(policy, dataset, QUICK, progress=False)
     venv = make_vec_env(n_envs=4, family="open", split="fresh")
-    config = DAggerConfig(rounds=2, failures=5, successes=2, expert_share=0.5)
+    config = DAggerConfig(rounds=2, failures=4, lead=1.0)
     dagger = DAgger(
         policy,
-        ExpertPolicy(venv, reconsider=0.1),
+        ExpertPolicy(venv, quick=True),
         venv,
         config,
         cloning=QUICK,
@@ -26,10 +27,11 @@ def test_dagger_labels_what_the_learner_sees(dataset, env, tmp_path):
     )
     rounds = dagger.run(progress=False)
     assert [done.number for done in rounds] == [1, 2]
-    assert all(done.episodes >= 5 for done in rounds)
+    assert all(done.episodes >= 4 for done in rounds)
     assert len(dagger.dataset) == len(dataset) + sum(done.samples for done in rounds)
     kept = Dataset.load(tmp_path / "rounds" / "round-001.npz")
-    assert len(kept) == rounds[0].samples
+    assert len(kept) == rounds[0].samples > 0
+    assert kept.times.max() < config.lead
     for i in (0, len(kept) // 2, len(kept) - 1):
         scenario = Scenario.from_json(kept.scenarios[kept.episodes[i]])
         rest = scenario.model_copy(
@@ -42,16 +44,44 @@ def test_dagger_labels_what_the_learner_sees(dataset, env, tmp_path):
         assert expert.predict(observation)[0] == pytest.approx(kept.actions[i], abs=2e-2)
         assert -expert.value() == pytest.approx(kept.returns[i], rel=1e-4)
         assert expert.costate() == pytest.approx(kept.costates[i], abs=1e-2 * max(1, np.abs(kept.costates[i]).max()))
-        assert scenario.horizon - kept.times[i] >= config.forgiven
+
+
+def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
+    scenario = sample_scenario("clutter", 7)
+    poses = np.linspace(scenario.start, scenario.goal, 100)
+    rng = np.random.default_rng(0)
+    crash = _takeovers(_Episode(scenario, poses, success=False, collision=True), 0.05, rng)
+    assert len(crash) > 5
+    left = [rest.horizon for rest in crash]
+    assert left == sorted(left, reverse=True)
+    for rest in crash:
+        step = round((scenario.horizon - rest.horizon) / 0.05)
+        assert rest.start == tuple(poses[step])
+        assert 0.2 <= 5.0 - step * 0.05 <= 10.0
+        assert (rest.goal, rest.obstacles) == (scenario.goal, scenario.obstacles)
+    assert len(_takeovers(_Episode(scenario, poses, success=True, collision=False), 0.05, rng)) == 1
+    late = np.linspace(scenario.start, scenario.goal, round(scenario.horizon / 0.05))
+    for rest in _takeovers(_Episode(scenario, late, success=False, collision=True), 0.05, rng):
+        assert rest.horizon >= 1.0
+
+
+def test_where_the_expert_cannot_save_an_episode_it_takes_over_no_later():
+    """The scenarios of an episode after the first one without an optimum are not tried."""
+    solvable = sample_scenario("open", 7)
+    hopeless = solvable.model_copy(update={"horizon": 1.0})
+    settings = Settings()
+    found = _label(settings, {"quick": True}, [[solvable, hopeless, solvable], [solvable]], 0.5)
+    assert [len(part) for part in found] == [10, 10]
+    assert _label(settings, {"quick": True}, [[hopeless, solvable]], 0.5) == []
 
 
 def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, monkeypatch):
-    monkeypatch.setattr("leapnav.training.dagger.PORTION", 2)
+    monkeypatch.setattr("leapnav.training.dagger.PORTION", 1)
     found = []
     for workers in (1, 1, 2):
         policy = fresh(env)
         venv = make_vec_env(n_envs=2, family="open", split="fresh")
-        config = DAggerConfig(rounds=1, failures=4, successes=0, seed=4)
+        config = DAggerConfig(rounds=1, episodes=3, lead=0.5, seed=4)
         dagger = DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK, workers=workers)
         dagger.run(progress=False)
         found.append((policy.parameters_to_vector().tobytes(), dagger.dataset.observations.tobytes()))
@@ -60,7 +90,9 @@ def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, mo
         DAgger(fresh(env), ExpertPolicy(venv), venv, workers=0)
 
 
-@pytest.mark.parametrize("settings", [{"rounds": 0}, {"expert_share": 1.5}, {"learning_rate": -1.0}])
+@pytest.mark.parametrize(
+    "settings", [{"rounds": 0}, {"failures": 0}, {"successes": -1.0}, {"learning_rate": -1.0}, {"lead": 0.0}]
+)
 def test_bad_settings_of_dagger_are_named(settings, env):
     venv = make_vec_env(n_envs=1, family="open", split="fresh")
     with pytest.raises(ValueError, match=f"{next(iter(settings))}: "):
@@ -69,14 +101,3 @@ def test_bad_settings_of_dagger_are_named(settings, env):
         DAgger(fresh(env), ExpertPolicy(make_vec_env(n_envs=1, family="open")), venv)
     with pytest.raises(TypeError, match="venv: expected one from"):
         DAgger(fresh(env), ExpertPolicy(venv), ScaledReward(venv, 2.0))
-
-
-def test_dagger_labels_what_the_learner_failed_in_first(dataset, env):
-    """Where it always fails, all that is labelled are failures; the successes are a sample."""
-    venv = make_vec_env(n_envs=4, family="open", split="fresh", seed=0)
-    dagger = DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(rounds=1, failures=6, successes=3))
-    failed, succeeded, _ = dagger._drive("", False)
-    assert len(failed) >= 6
-    assert len(succeeded) == 0
-    labelled = dagger._label(failed[:2], 0, np.random.default_rng(0), tqdm(disable=True))
-    assert {Scenario.from_json(text) for text in labelled.scenarios} == set(failed[:2])

@@ -8,6 +8,7 @@ import torch as th
 from helpers import QUICK, fresh
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
+from leapnav.envs.settings import Settings
 from leapnav.experts.demonstrations import load_demonstrations
 from leapnav.training import Dataset, behaviour_clone
 from leapnav.training.symmetries import mirror, turn_round
@@ -98,3 +99,18 @@ def test_mirroring_and_turning_round_are_symmetries_of_the_environment():
 def test_an_odd_number_of_beams_cannot_be_turned_round():
     with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
         turn_round(th.zeros(1, 12), th.zeros(1, 2))
+
+
+def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):
+    """What another lidar would have shown at the demonstrations' states; files keep which it was."""
+    found = Dataset.of(demonstrated)
+    seen = found.observed(Settings(lidar_beams=64))
+    assert seen.observations.shape == (len(found), 9 + 64)
+    # Every other of 64 beams is one of the 32.
+    assert seen.observations[:, 9::2] == pytest.approx(found.observations[:, 9:], abs=1e-4)
+    assert seen.observations[:, :9] == pytest.approx(found.observations[:, :9], abs=1e-4)
+    assert found.observed(found.settings) is found
+    seen.save(tmp_path / "seen.npz")
+    assert Dataset.load(tmp_path / "seen.npz").settings == Settings(lidar_beams=64)
+    with pytest.raises(ValueError, match="datasets: lidar_beams: expected the same for all, got 32 and 64"):
+        Dataset.joined([found, seen])

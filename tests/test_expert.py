@@ -192,33 +192,3 @@ def test_a_scenario_without_an_optimum_is_named():
     observation, _ = env.reset()
     with pytest.raises(NoOptimumError, match="NO_PATH"):
         ExpertPolicy(env).predict(observation)
-
-
-def test_a_reconsidering_expert_finds_the_better_way():
-    """Driven to the other side by someone else, it takes the way that is best from there, not back to its own."""
-    better = 0
-    for index in range(6):
-        bank = ScenarioBank.shipped("clutter", "test")
-        costs = []
-        for reconsider in (None, 0.05):
-            env = NavigateEnv(bank=bank)
-            expert = ExpertPolicy(env, reconsider=reconsider)
-            observation, _ = env.reset(options={"index": index})
-            # Somebody turns the robot on the spot by 2 rad, which makes other ways cheaper.
-            for _ in range(20):
-                expert.predict(observation)
-                observation, _, done, _, _ = env.step(np.array([0.0, 2.0 / 3.0], np.float32))
-                assert not done
-            for _ in range(30):
-                action, _ = expert.predict(observation)
-                observation, *_ = env.step(action)
-            expert.predict(observation)
-            costs.append(expert.value())
-            cost, costate = expert.labels()
-            assert cost[0] == pytest.approx(costs[-1], rel=1e-5)
-            assert costate[0] == pytest.approx(expert.costate(), abs=1e-3)
-        assert costs[1] < costs[0] * 1.01
-        better += costs[1] < 0.99 * costs[0]
-    assert better >= 1
-    with pytest.raises(ValueError, match="reconsider: expected a number >= 0 or None, got -1"):
-        ExpertPolicy(NavigateEnv("open"), reconsider=-1)

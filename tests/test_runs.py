@@ -29,7 +29,7 @@ from leapnav.training.reinforcement import train_ppo, train_sac
 from leapnav.training.vec_env import environment_seed
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
-COMMON = {"family": "open", "hidden": (16, 16), "evaluation_scenarios": 4}
+COMMON = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 4}
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_run_leaves_its_configuration_policy_and_evaluations(demos, tmp_path):
     record = json.loads((config.out / "config.json").read_text())
     assert record["versions"]["torch"] == th.__version__
     assert list((config.out / "tensorboard").glob("events*"))
-    assert load_policy(config.out).observation_space.shape == (41,)
+    assert load_policy(config.out).observation_space.shape == (25,)
 
 
 def test_a_folder_is_used_once_and_resumed_with_the_same_settings_only(demos, tmp_path):
@@ -160,7 +160,7 @@ def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
 
 def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
     def config(out, **changes):
-        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, failures=4, successes=1)}
+        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, failures=4, lead=0.5)}
         return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
 
     train_dagger(config(tmp_path / "straight"), progress=False)
@@ -187,7 +187,7 @@ def test_sac_and_tqc_train_and_their_policies_load(tmp_path):
         config = sac(tmp_path / algorithm, algorithm=algorithm)
         train_sac(config, progress=False)
         policy = load_policy(config.out)
-        assert policy.predict(np.zeros((2, 41), np.float32), deterministic=True)[0].shape == (2, 2)
+        assert policy.predict(np.zeros((2, 25), np.float32), deterministic=True)[0].shape == (2, 2)
 
 
 def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
@@ -196,7 +196,7 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         config = ppo(tmp_path / name, warm_start=given, total_timesteps=256, reward="cost", learning_rate=1e-9)
         train_ppo(config, progress=False)
         one, other = (load_policy(folder) for folder in (tmp_path / "clone", tmp_path / name))
-        inputs = np.random.default_rng(0).uniform(0, 3, (20, 41)).astype(np.float32)
+        inputs = np.random.default_rng(0).uniform(0, 3, (20, 25)).astype(np.float32)
         found = [policy.predict(inputs, deterministic=True)[0] for policy in (one, other)]
         np.testing.assert_allclose(*found, atol=1e-4)
     with pytest.raises(ValueError, match="warm_start: expected at most one policy"):

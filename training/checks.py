@@ -7,6 +7,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from leapnav.envs.families import check_family
+from leapnav.envs.settings import Settings
 from leapnav.training.cloning import check_cloning
 from leapnav.training.config import CloningConfig, DAggerConfig, RunConfig, WarmStartConfig
 from leapnav.training.dagger import check_dagger
@@ -43,6 +44,9 @@ def check_config(config: RunConfig) -> None:
         raise ValueError(f"hidden: expected widths of at least 1, got {config.hidden!r}")
     if not 0 <= config.seed < 2**32:
         raise ValueError(f"seed: expected a number from 0 to 2^32 - 1, got {config.seed!r}")
+    if not (config.lidar_beams > 0 and config.lidar_beams % 2 == 0):
+        raise ValueError(f"lidar_beams: expected an even number from 2 on, got {config.lidar_beams!r}")
+    Settings(**config.environment)
     for field in fields(config):
         value = getattr(config, field.name)
         if is_dataclass(value):

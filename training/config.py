@@ -17,7 +17,7 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(files("leapnav.training").joinpath("de
 class CloningConfig:
     """Settings of behaviour cloning."""
 
-    epochs: int = 20
+    epochs: int = 12
     """Passes over the samples, at most."""
     patience: int = 5
     """Stop after so many epochs without a lower validation loss; 0: never. The best epoch's weights are kept."""
@@ -42,27 +42,24 @@ class CloningConfig:
 class DAggerConfig:
     """Settings of dataset aggregation."""
 
-    rounds: int = 10
-    """How often the learner drives, the expert labels what it has seen, and the learner is fitted to all of it."""
-    failures: int = 250
-    """Episodes of each round that are labelled because the learner failed; it drives until it has failed so often."""
-    successes: int = 50
-    """Episodes of each round that are labelled though it succeeded."""
-    episodes: int = 6000
+    rounds: int = 8
+    """How often the learner drives, the expert takes over, and the learner is fitted to all that the expert did."""
+    failures: int = 300
+    """Failed episodes after which a round's driving ends; in each the expert takes over a dozen times."""
+    episodes: int = 15_000
     """Episodes that the learner drives in a round at most."""
-    expert_share: float = 0.25
-    """Share of the first round's labelled episodes in which the expert drives, the others the learner again."""
-    expert_decay: float = 0.5
-    """Factor of that share from round to round."""
-    epochs: int = 1
+    successes: float = 1.0
+    """For each failed episode so many others in which the expert takes over, once each."""
+    lead: float = 3.0
+    """s for which the expert drives; then it is where demonstrations lead anyway."""
+    epochs: int = 2
     """Passes over all samples after each round but the last."""
+    last_epochs: int = 8
+    """Passes over all samples after the last round."""
     learning_rate: float = 1e-3
-    """Peak of the learning rate after each round but the last."""
-    forgiven: float = 0.5
-    """s before the horizon from which on labels are dropped: there the expert corrects what the tolerance forgives,
-    ever more violently, and the demonstrations show how to arrive."""
+    """Peak of the learning rate after each round, which then falls to zero along a cosine."""
     seed: int = 0
-    """Of the scenarios and of who drives."""
+    """Of the scenarios and of when the expert takes over."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +101,16 @@ class RunConfig:
     """Go on with the run that the folder holds."""
     hidden: tuple[int, ...] = (256, 256, 256)
     """Widths of the actor's and the critic's hidden layers."""
+    lidar_beams: int = 128
+    """Beams of the robot's lidar. Demonstrations were seen with those of the environment's defaults, and are seen anew
+    with these: with 32 many a gap looks wide enough that is not."""
     evaluation_scenarios: int = 100
     """Scenarios of each family's test split that an evaluation on the way plays; the last one plays all."""
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        """The arguments of the environment that what is observed depends on."""
+        return {"lidar_beams": self.lidar_beams}
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool = False, **changes: Any) -> Self:
@@ -148,10 +153,10 @@ class DAggerRunConfig(RunConfig):
     """How many scenarios are demonstrated if none are given."""
     policy: Path | None = None
     """A policy that is the first learner instead of a new clone."""
-    n_envs: int = 64
+    n_envs: int = 256
     """Robots that drive at once."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
-    """Settings of the first clone and of the last fit; its seed is the run's."""
+    """Settings of the first clone, and of the loss and the batches of all fits; its seed is the run's."""
     dagger: DAggerConfig = field(default_factory=DAggerConfig)
     """Settings of the aggregation; its seed is the run's."""
 

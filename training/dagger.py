@@ -1,9 +1,12 @@
-"""DAgger: the learner drives, the expert says what it would have done there, and the learner fits all of it.
+"""DAgger: the learner drives, the expert takes over, and the learner fits what the expert did from there.
 
 S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
-learning" (AISTATS 2011), with two changes. Who drives is drawn for each episode, not for each step: a robot that
-changes hands at every step would see what neither of the two leads to. And labels are dear but driving is cheap, so the
-learner drives many scenarios and mostly the episodes in which it failed are labelled: the others have little to teach.
+learning" (AISTATS 2011), with two changes. Control passes from the learner to the expert once in an episode, not at
+random in each step (as in S. Ross and D. Bagnell, "Reinforcement and imitation learning via interactive no-regret
+learning", 2014): the expert then needs one search, not one for each state, and what it drives is optimal from where it
+took over. And driving is cheap, so the learner drives many scenarios, and mostly the episodes in which it failed are
+gone back to: the others have little to teach. There the expert takes over earlier and later, until it is too late: most
+of what ends in a collision was decided seconds before.
 """
 
 from __future__ import annotations
@@ -16,16 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 from joblib import Parallel, delayed
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
-from leapnav.envs.families import sample_scenario
+from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenario import Scenario
-from leapnav.envs.vector import NavigateVectorEnv
+from leapnav.envs.settings import Settings
 from leapnav.experts.policy import ExpertPolicy, NoOptimumError
 from leapnav.training.actors import policy_of
 from leapnav.training.cloning import Cloning, check_observations
@@ -33,7 +35,11 @@ from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.dataset import Dataset
 from leapnav.training.vec_env import NavigateVecEnv, environment_seed
 
-PORTION = 32  # episodes that are labelled together
+PORTION = 16  # episodes that are labelled together
+# s before the end of a failed episode at which the expert takes over, closer where it matters more.
+BEFORE = np.array([8.0, 6.5, 5.0, 4.0, 3.25, 2.5, 2.0, 1.5, 1.1, 0.8, 0.5, 0.3])
+SPREAD = 0.2  # of these times, relative
+TOO_LATE = 1.0  # s before the horizon from which on nobody takes over
 
 
 @dataclass(frozen=True)
@@ -62,10 +68,10 @@ class DAgger:
 
     Args:
         model: an algorithm of Stable-Baselines3 or its policy, trained in place; best a clone already.
-        expert: an `ExpertPolicy` for `venv`; with `reconsider`, so that its labels depend on where the robot is alone.
+        expert: an `ExpertPolicy` for `venv`; with `quick=True` best: the tasks that it cannot solve are the dearest.
         venv: the robots, from `make_vec_env`; fresh scenarios (`split="fresh"`) teach most.
         config: settings.
-        cloning: settings of the last fit, over all samples; its loss and its batches are those of the others too.
+        cloning: settings of the fits' loss and batches.
         dataset: what is there already: a `Dataset`, a folder, or demonstrations.
         folder: where each round's samples are kept; None keeps them in memory.
         workers: processes that label; their number changes nothing in the samples.
@@ -138,30 +144,34 @@ class DAgger:
         rng = np.random.default_rng([config.seed, number])
         name = f"Round {number + 1} of {config.rounds}"
         self._venv.seed(environment_seed(config.seed, number))
-        failed, succeeded, collision = self._drive(name, progress)
-        count = len(failed) + len(succeeded)
-        chosen = failed[: config.failures]
-        chosen += [succeeded[i] for i in rng.permutation(len(succeeded))[: config.successes]]
-        if not chosen:
-            raise ValueError(
-                f"successes: expected at least 1, got {config.successes}: the learner did not fail in {count} episodes"
-            )
-        chosen = [chosen[i] for i in rng.permutation(len(chosen))]
-        with tqdm(total=len(chosen), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
-            samples = self._label(chosen, number, rng, bar)
-        if self._folder is not None:
-            samples.save(self._folder / f"round-{number + 1:03d}.npz")
-        self._parts.append(samples)
-        settings = self._cloning
-        if number + 1 < config.rounds:
-            settings = replace(settings, epochs=config.epochs, learning_rate=config.learning_rate, patience=0)
+        episodes = self._drive(name, progress)
+        failed = [episode for episode in episodes if not episode.success]
+        succeeded = [episode for episode in episodes if episode.success]
+        count = max(1, round(config.successes * len(failed)))
+        chosen = failed + [succeeded[i] for i in rng.permutation(len(succeeded))[:count]]
+        turns = [_takeovers(episode, self._venv.venv.settings.control_period, rng) for episode in chosen]
+        turns = [turns[i] for i in rng.permutation(len(turns)) if turns[i]]
+        with tqdm(total=len(turns), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
+            samples = self._label(turns, bar)
+        if samples is not None:
+            if self._folder is not None:
+                samples.save(self._folder / f"round-{number + 1:03d}.npz")
+            self._parts.append(samples)
+        epochs = config.epochs if number + 1 < config.rounds else config.last_epochs
+        settings = replace(self._cloning, epochs=epochs, learning_rate=config.learning_rate, patience=0)
         fit = Cloning(self._policy, self.dataset, settings, stream=number + 1)
         with tqdm(total=settings.epochs * fit.batches, desc="Fitting", unit="batch", disable=not progress) as bar:
             while not fit.finished:
                 fit.run_epoch(bar.update)
         fit.finish()
-        validation = min(loss.validation for loss in fit.losses)
-        done = Round(number + 1, len(samples), count, len(succeeded) / count, collision / count, validation)
+        done = Round(
+            number=number + 1,
+            samples=0 if samples is None else len(samples),
+            episodes=len(episodes),
+            success=len(succeeded) / len(episodes),
+            collision=sum(episode.collision for episode in episodes) / len(episodes),
+            loss=min(loss.validation for loss in fit.losses),
+        )
         self.rounds.append(done)
         return done
 
@@ -174,114 +184,111 @@ class DAgger:
         """
         assert self._folder is not None
         for done in rounds:
-            self._parts.append(Dataset.load(self._folder / f"round-{done.number:03d}.npz"))
             self.rounds.append(done)
+            if done.samples == 0:
+                continue
+            self._parts.append(Dataset.load(self._folder / f"round-{done.number:03d}.npz"))
 
-    def _drive(self, name: str, progress: bool) -> tuple[list[Scenario], list[Scenario], int]:
-        """The scenarios in which the learner failed and those in which it succeeded, and how often it collided."""
-        failed, succeeded, collisions = list[Scenario](), list[Scenario](), 0
+    def _drive(self, name: str, progress: bool) -> list[_Episode]:
+        """The episodes that the learner drives in a round."""
+        count = self._venv.num_envs
         observations = np.asarray(self._venv.reset())
         playing = self._venv.get_attr("scenario")
+        paths: list[list[np.ndarray]] = [[] for _ in range(count)]
+        episodes: list[_Episode] = []
+        failures = 0
         with tqdm(total=self.config.failures, desc=f"{name}: driving", unit="failure", disable=not progress) as bar:
-            while len(failed) < self.config.failures and len(failed) + len(succeeded) < self.config.episodes:
+            while failures < self.config.failures and len(episodes) < self.config.episodes:
+                for path, pose in zip(paths, self._venv.venv.poses, strict=True):
+                    path.append(pose)
                 actions, _ = self._policy.predict(observations, deterministic=True)
                 stepped, _, dones, infos = self._venv.step(actions)
                 observations = np.asarray(stepped)
                 for i in np.flatnonzero(dones).tolist():
-                    (succeeded if infos[i]["is_success"] else failed).append(playing[i])
-                    collisions += bool(infos[i]["collision"])
-                    bar.update(not infos[i]["is_success"])
+                    success, collision = bool(infos[i]["is_success"]), bool(infos[i]["collision"])
+                    episodes.append(_Episode(playing[i], np.array(paths[i]), success, collision))
+                    paths[i] = []
+                    failures += not success
+                    bar.update(not success)
                 if dones.any():
                     playing = self._venv.get_attr("scenario")
-        return failed, succeeded, collisions
+        return episodes
 
-    def _label(self, scenarios: Sequence[Scenario], number: int, rng: np.random.Generator, bar: Any) -> Dataset:
-        """Drives scenarios once more, with the expert's labels."""
-        share = self.config.expert_share * self.config.expert_decay**number
-        guided = rng.random(len(scenarios)) < share
+    def _label(self, turns: Sequence[Sequence[Scenario]], bar: Any) -> Dataset | None:
+        """What the expert does where it takes over, None if it can do nothing anywhere."""
         # Always the same portions, so that the number of workers changes nothing.
-        portions = [
-            _Portion(scenarios[k : k + PORTION], guided[k : k + PORTION], self.config.forgiven)
-            for k in range(0, len(scenarios), PORTION)
-        ]
-        if self._workers == 1:
-            jobs = (_label(self._venv, self._expert, self._policy, portion) for portion in portions)
-        else:
-            run = delayed(_label_elsewhere)
-            tasks = (run(self._venv.venv, self._expert.settings, self._policy, portion) for portion in portions)
-            jobs = Parallel(self._workers, return_as="generator")(tasks)
-        parts = []
-        for part, portion in zip(jobs, portions, strict=True):
-            parts += [] if part is None else [part]
-            bar.update(len(portion.scenarios))
-        return Dataset.joined(parts)
+        portions = [turns[k : k + PORTION] for k in range(0, len(turns), PORTION)]
+        settings, run = self._venv.venv.settings, delayed(_label)
+        tasks = (run(settings, self._expert.settings, portion, self.config.lead) for portion in portions)
+        parts: list[Dataset] = []
+        for found, portion in zip(Parallel(self._workers, return_as="generator")(tasks), portions, strict=True):
+            parts += found
+            bar.update(len(portion))
+        return Dataset.joined(parts) if parts else None
 
 
 @dataclass(frozen=True)
-class _Portion:
-    """Scenarios to label, in which of them the expert drives, and how long before the horizon labels end (s)."""
+class _Episode:
+    """What the learner drove: the poses (K, 3) before its K actions."""
 
-    scenarios: Sequence[Scenario]
-    guided: np.ndarray
-    forgiven: float
-
-
-def _label_elsewhere(
-    robots: NavigateVectorEnv, expert: dict[str, Any], policy: BasePolicy, portion: _Portion
-) -> Dataset | None:
-    """`_label` in another process, with robots and an expert of its own."""
-    th.set_num_threads(1)  # the processes share the cores
-    venv = NavigateVecEnv(robots)
-    return _label(venv, ExpertPolicy(venv, workers=1, **expert), policy, portion)
+    scenario: Scenario
+    poses: np.ndarray
+    success: bool
+    collision: bool
 
 
-def _label(venv: NavigateVecEnv, expert: ExpertPolicy, policy: BasePolicy, portion: _Portion) -> Dataset | None:
-    """The samples of a portion, None if there are none."""
-    count = venv.num_envs
-    waiting = list(enumerate(portion.scenarios))[::-1]
-    playing: list[tuple[int, Scenario] | None] = [None] * count  # of each robot: number and scenario
-    columns: list[dict[str, np.ndarray]] = []
-    observations = np.asarray(venv.reset())
-    idle = sample_scenario("open", 0)  # what robots without a task play: nobody looks, and its labels cost little
-    ended = np.ones(count, dtype=bool)
-    while True:
-        for i in np.flatnonzero(ended).tolist():
-            playing[i] = waiting.pop() if waiting else None
-        if all(task is None for task in playing):
+def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> list[Scenario]:
+    """The rests of an episode, from where the expert takes over, the longest first."""
+    end, horizon = len(episode.poses) * period, episode.scenario.horizon
+    if episode.success:
+        times = rng.uniform(0.0, end, 1)
+    elif episode.collision:
+        times = end - BEFORE * rng.uniform(1 - SPREAD, 1 + SPREAD, len(BEFORE))
+    else:
+        times = np.sort(rng.uniform(0.0, end, len(BEFORE)))
+    steps = np.unique((times / period).round().astype(int))
+    found = []
+    for step in steps[(steps > 0) & (steps < len(episode.poses))].tolist():
+        if horizon - step * period < TOO_LATE:
             break
-        if ended.any():
-            observations = np.asarray(venv.restart(ended, [task[1] if task else idle for task in playing]))
+        rest = {"start": tuple(episode.poses[step].tolist()), "horizon": round(horizon - step * period, 9)}
+        found.append(episode.scenario.model_copy(update=rest))
+    return found
+
+
+def _label(
+    settings: Settings, expert: dict[str, Any], turns: Sequence[Sequence[Scenario]], lead: float
+) -> list[Dataset]:
+    """What an expert does in the first seconds of scenarios: of several of one episode until it cannot save it."""
+    arguments = {name: value for name, value in vars(settings).items() if name != "goal_conditioned"}
+    env = NavigateEnv(split="fresh", **arguments)
+    driver = ExpertPolicy(env, workers=1, **expert)
+    found = []
+    for scenarios in turns:
+        for scenario in scenarios:
+            samples = _demonstrated(env, driver, scenario, lead)
+            if samples is None:
+                break
+            found.append(samples)
+    return found
+
+
+def _demonstrated(env: NavigateEnv, driver: ExpertPolicy, scenario: Scenario, lead: float) -> Dataset | None:
+    """The samples of the first seconds that the expert drives, None if it has no optimum."""
+    observation, info = env.reset(options={"scenario": scenario})
+    rows: list[tuple[Any, ...]] = []
+    done = False
+    while not done and env.time < lead - 1e-9:
         try:
-            labels, _ = expert.predict(observations)
-        except NoOptimumError as error:  # of a fresh scenario: nobody has promised one
-            ended = np.array([task is not None and task[1] is error.scenario for task in playing])
-            continue
-        costs, costates = expert.labels()
-        times = np.array(venv.get_attr("time"))
-        left = np.array([-math.inf if task is None else task[1].horizon for task in playing]) - times
-        samples = {
-            "observations": observations.copy(),
-            "actions": labels,
-            "returns": -costs,
-            "costates": costates,
-            "states": np.array(venv.get_attr("pose")),
-            "times": times,
-            "executed": np.full(labels.shape, np.nan, np.float32),  # what is driven is not what is labelled
-            "rewards": np.full(count, np.nan),
-            "episodes": np.array([-1 if task is None else task[0] for task in playing]),
-        }
-        # Of the robots that can still reach their goals, and have time for it.
-        known = np.isfinite(costs) & (left >= portion.forgiven)
-        columns.append({name: values[known] for name, values in samples.items()})
-        guided = np.array([task is not None and portion.guided[task[0]] for task in playing])
-        actions, _ = policy.predict(observations, deterministic=True)
-        stepped, _, dones, _ = venv.step(np.where(guided[:, None], labels, actions))
-        observations = np.asarray(stepped)
-        ended = dones | ~np.isfinite(costs)  # out of reach of the goal there is nothing more to say
-    if not any(len(part["actions"]) for part in columns):
-        return None
-    joined = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
-    return Dataset(**joined, scenarios=tuple(scenario.to_json() for scenario in portion.scenarios))
+            action, _ = driver.predict(observation)
+        except NoOptimumError:
+            return None
+        cost, costate = driver.labels()
+        before = observation, action, -cost[0], costate[0], info["pose"], info["time"]
+        observation, reward, done, _, info = env.step(action)
+        rows.append((*before, action, reward))
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    return Dataset(*columns, np.zeros(len(rows), dtype=int), (scenario.to_json(),), settings=env.settings)
 
 
 def check_dagger(config: DAggerConfig) -> None:
@@ -291,13 +298,11 @@ def check_dagger(config: DAggerConfig) -> None:
         ValueError: one is impossible; the message names it and its value.
 
     """
-    for name in ("rounds", "failures", "episodes", "epochs"):
+    for name in ("rounds", "failures", "episodes", "epochs", "last_epochs"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name}: expected at least 1, got {getattr(config, name)!r}")
-    if config.successes < 0:
-        raise ValueError(f"successes: expected at least 0, got {config.successes!r}")
-    for name in ("expert_share", "expert_decay"):
-        if not 0 <= getattr(config, name) <= 1:
-            raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(config, name)!r}")
-    if not (math.isfinite(config.learning_rate) and config.learning_rate > 0):
-        raise ValueError(f"learning_rate: expected a positive number, got {config.learning_rate!r}")
+    if not (math.isfinite(config.successes) and config.successes >= 0):
+        raise ValueError(f"successes: expected a number >= 0, got {config.successes!r}")
+    for name in ("learning_rate", "lead"):
+        if not (math.isfinite(getattr(config, name)) and getattr(config, name) > 0):
+            raise ValueError(f"{name}: expected a positive number, got {getattr(config, name)!r}")

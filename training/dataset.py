@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from leapnav.envs.observer import Observer
+from leapnav.envs.scenario import Scenario
+from leapnav.envs.settings import Settings
 from leapnav.experts.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
 
-FORMAT = 1  # of the files
+FORMAT = 2  # of the files
 EPISODES_ONLY = ("family", "split", "bank", "scenario")  # arguments that change what is played, not what is seen
 
 
@@ -33,6 +36,7 @@ class Dataset:
         rewards (N,): for them; NaN where unknown.
         episodes (N,): int64, the sample's place in `scenarios`.
         scenarios: of the episodes, as JSON.
+        settings: of the environment that the observations are of.
 
     Raises:
         ValueError: there are no samples, or the shapes do not fit.
@@ -49,6 +53,7 @@ class Dataset:
     rewards: np.ndarray
     episodes: np.ndarray
     scenarios: tuple[str, ...]
+    settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
         count = len(self.observations)
@@ -67,7 +72,21 @@ class Dataset:
 
     def __getitem__(self, chosen: np.ndarray | slice) -> Dataset:
         """The samples that an index array, a mask or a slice chooses."""
-        return Dataset(**{name: getattr(self, name)[chosen] for name in _COLUMNS}, scenarios=self.scenarios)
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
+
+    def observed(self, settings: Settings) -> Dataset:
+        """The same samples as robots with other sensors would have observed them, undisturbed.
+
+        Args:
+            settings: of their environment.
+
+        """
+        if settings == self.settings:
+            return self
+        found = [Scenario.from_json(text) for text in self.scenarios]
+        scenarios = [found[episode] for episode in self.episodes.tolist()]
+        observations = Observer(settings).observe(scenarios, self.states, self.times)
+        return replace(self, observations=observations, settings=settings)
 
     @cached_property
     def _tasks(self) -> list[dict[str, Any]]:
@@ -97,16 +116,22 @@ class Dataset:
         """Several datasets as one.
 
         Raises:
-            ValueError: there are none, or their observations differ in length.
+            ValueError: there are none, or they were observed in different environments.
 
         """
-        widths = sorted({part.observations.shape[1] for part in parts})
-        if len(widths) != 1:
-            raise ValueError(f"datasets: expected some with observations of one length, got lengths {widths}")
+        if not parts:
+            raise ValueError("datasets: expected at least one, got none")
+        for part in parts[1:]:
+            if part.settings == parts[0].settings:
+                continue
+            for name, value in asdict(part.settings).items():
+                if value != (first := asdict(parts[0].settings)[name]):
+                    raise ValueError(f"datasets: {name}: expected the same for all, got {first!r} and {value!r}")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
         offsets = np.cumsum([0, *(len(part.scenarios) for part in parts[:-1])])
         columns["episodes"] = np.concatenate([p.episodes + o for p, o in zip(parts, offsets, strict=True)])
-        return cls(**columns, scenarios=tuple(text for part in parts for text in part.scenarios))
+        scenarios = tuple(text for part in parts for text in part.scenarios)
+        return cls(**columns, scenarios=scenarios, settings=parts[0].settings)
 
     @classmethod
     def of(cls, source: Dataset | str | os.PathLike[str] | Sequence[Any]) -> Dataset:
@@ -169,7 +194,8 @@ class Dataset:
         partial = target.with_name(f".{target.name}.partial")
         columns: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
         with partial.open("wb") as file:
-            np.savez(file, format=FORMAT, scenarios=np.array(self.scenarios), **columns)
+            settings = json.dumps(asdict(self.settings))
+            np.savez(file, format=FORMAT, settings=settings, scenarios=np.array(self.scenarios), **columns)
         partial.replace(target)
 
     @classmethod
@@ -186,7 +212,9 @@ class Dataset:
                 found = int(file["format"])
                 if found != FORMAT:
                     raise ValueError(f"format {found}, this leapnav reads {FORMAT}")
-                return cls(**{name: file[name] for name in _COLUMNS}, scenarios=tuple(file["scenarios"].tolist()))
+                settings = Settings(**json.loads(str(file["settings"])))
+                columns = {name: file[name] for name in _COLUMNS}
+                return cls(**columns, scenarios=tuple(file["scenarios"].tolist()), settings=settings)
         except FileNotFoundError:
             raise
         except Exception as error:  # zipfile, zlib and numpy raise many kinds for a broken file

@@ -12,12 +12,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm.auto import tqdm
 
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.settings import Settings
 from leapnav.experts.policy import ExpertPolicy
 from leapnav.experts.rollouts import rollout
 from leapnav.training.actors import copy_actor
 from leapnav.training.checks import check_config
 from leapnav.training.cloning import Cloning
-from leapnav.training.config import BCConfig, DAggerRunConfig
+from leapnav.training.config import BCConfig, DAggerRunConfig, RunConfig
 from leapnav.training.dagger import DAgger, Round
 from leapnav.training.dataset import Dataset
 from leapnav.training.evaluation import Evaluation
@@ -26,7 +27,6 @@ from leapnav.training.runs import Run
 from leapnav.training.vec_env import environment_seed, make_vec_env
 
 DEMONSTRATIONS = 1_000_000  # stream of a run's seed, after those of DAgger's rounds
-RECONSIDER = 0.1  # see `ExpertPolicy`: what the learner does is to be labelled by what is best from there
 
 
 def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> list[Evaluation]:
@@ -47,8 +47,8 @@ def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> li
     check_config(config)  # what is wrong is found before the folder is made
     given = Dataset.of(config.demos) if config.demos else None
     run = Run("bc", config)
-    dataset = given or demonstrations(run, config.scenarios, workers, progress)
-    policy = new_policy(config.seed, config.hidden)
+    dataset = (given or demonstrations(run, config.scenarios, workers, progress)).observed(settings_of(config))
+    policy = new_policy(config)
     return clone(run, policy, dataset, config, progress)
 
 
@@ -90,14 +90,14 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     """
     check_config(config)
     given = Dataset.of(config.demos) if config.demos else None
-    first = None if config.policy is None else load_policy(config.policy)
+    first = None if config.policy is None else load_policy(config.policy, robot_of(config))
     run = Run("dagger", config)
-    dataset = given or demonstrations(run, config.scenarios, workers, progress)
-    policy = new_policy(config.seed, config.hidden)
-    venv = make_vec_env(n_envs=config.n_envs, family=config.family, split="fresh")
+    dataset = (given or demonstrations(run, config.scenarios, workers, progress)).observed(settings_of(config))
+    policy = new_policy(config)
+    venv = make_vec_env(n_envs=config.n_envs, family=config.family, split="fresh", **config.environment)
     dagger = DAgger(
         policy,
-        ExpertPolicy(venv, reconsider=RECONSIDER),
+        ExpertPolicy(venv, quick=True),
         venv,
         replace(config.dagger, seed=config.seed),
         cloning=replace(config.cloning, seed=config.seed),
@@ -155,10 +155,20 @@ def demonstration_seed(seed: int) -> int:
     return environment_seed(seed, DEMONSTRATIONS)
 
 
-def new_policy(seed: int, hidden: Sequence[int]) -> ActorCriticPolicy:
-    """A policy for the environment with its defaults."""
-    env = NavigateEnv(split="fresh")
-    return make_policy(env.observation_space, env.action_space, seed, hidden)
+def robot_of(config: RunConfig) -> NavigateEnv:
+    """An environment like those that a run learns in."""
+    return NavigateEnv(config.family, split="fresh", **config.environment)
+
+
+def settings_of(config: RunConfig) -> Settings:
+    """What a run's robots observe."""
+    return robot_of(config).settings
+
+
+def new_policy(config: RunConfig) -> ActorCriticPolicy:
+    """A policy for a run's robots."""
+    env = robot_of(config)
+    return make_policy(env.observation_space, env.action_space, config.seed, config.hidden)
 
 
 def show(bar: Any, evaluations: Sequence[Evaluation], **more: Any) -> None:

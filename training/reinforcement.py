@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from leapnav.training.checks import check_config
 from leapnav.training.config import PPOConfig, SACConfig
 from leapnav.training.dataset import Dataset
 from leapnav.training.evaluation import Evaluation
-from leapnav.training.imitation import show
+from leapnav.training.imitation import robot_of, settings_of, show
 from leapnav.training.jump_start import JumpStart
 from leapnav.training.policies import load_policy, network
 from leapnav.training.replay import DemonstrationReplayBuffer
@@ -112,12 +112,12 @@ def _train(
 ) -> list[Evaluation]:
     # What can be wrong is found before the folder is made.
     check_config(config)
-    demos, start = _start(config.warm_start)
+    demos, start = _start(config)
     if demos and config.reward != "cost":
         raise ValueError(f"reward: demonstrations have the rewards of 'cost', got {config.reward!r}")
     if isinstance(config, PPOConfig) and config.divergence > 0 and not (config.warm_start and config.start.actor):
         raise ValueError(f"divergence: without a clone there is nothing to diverge from, got {config.divergence!r}")
-    dataset = Dataset.of(demos) if demos else None
+    dataset = Dataset.of(demos).observed(settings_of(config)) if demos else None
     venv = _robots(config)
     model = make(venv, dataset)
     venv.seed(environment_seed(config.seed))  # Stable-Baselines3 has given it the model's
@@ -142,15 +142,17 @@ def _train(
     return evaluations
 
 
-def _start(places: Sequence[Path]) -> tuple[list[Path], BasePolicy | None]:
+def _start(config: Config) -> tuple[list[Path], BasePolicy | None]:
     """The folders of demonstrations, and the policy, among what a warm start is given."""
+    places = config.warm_start
     policies = [place for place in places if (place / "policy.json").is_file()]
     if len(policies) > 1:
         raise ValueError(f"warm_start: expected at most one policy, got {policies[0]} and {policies[1]}")
     for place in places:
         if not place.is_dir():
             raise FileNotFoundError(f"warm_start: {place}: no such folder of demonstrations or of a policy")
-    return [place for place in places if place not in policies], load_policy(policies[0]) if policies else None
+    start = load_policy(policies[0], robot_of(config)) if policies else None
+    return [place for place in places if place not in policies], start
 
 
 def _robots(config: Config) -> VecEnv:
@@ -161,6 +163,7 @@ def _robots(config: Config) -> VecEnv:
         split="fresh",
         reward=config.reward,
         discount=config.gamma,
+        **config.environment,
     )
     venv: VecEnv = robots
     if config.jump_start > 0:

@@ -113,9 +113,9 @@ class Run:
 
         """
         count = None if final else self.config.evaluation_scenarios
+        options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
         found = [
-            evaluate(policy, ScenarioBank.shipped(family, "test"), count=count, timed=False, progress=False)
-            for family in self.families
+            evaluate(policy, ScenarioBank.shipped(family, "test"), count=count, **options) for family in self.families
         ]
         line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
         for family, evaluation in zip(self.families, found, strict=True):
@@ -137,7 +137,7 @@ class Run:
         """Writes the policy, with what the run is, so that runs that differ in their seed alone can be told."""
         # What the run is, not where it lies or how it is watched.
         training = {name: value for name, value in self._plain.items() if name not in (*FREE, "evaluation_scenarios")}
-        save_policy(model, self.folder, training=training)
+        save_policy(model, self.folder, self.config.environment, training=training)
 
     def save_checkpoint(self, write: Callable[[Path], None], progress: Mapping[str, Any]) -> None:
         """Replaces the checkpoint; a run that is killed meanwhile has the old one or the new one.

@@ -200,7 +200,7 @@ class _Slopes:
         step = rng.normal(size=(len(part), 3)) * REACH
         parsed = {episode: Scenario.from_json(dataset.scenarios[episode]) for episode in np.unique(part.episodes)}
         scenarios = [parsed[episode] for episode in part.episodes.tolist()]
-        observer = Observer()
+        observer = Observer(dataset.settings)
         sides = [observer.observe(scenarios, part.states + sign * step, part.times) for sign in (1.0, -1.0)]
         rise = -2.0 * shrinking[chosen] * (part.costates * step).sum(axis=1)
         usual = np.abs(rise) <= STEEPEST * np.median(np.abs(rise))
