@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py \
-    training/*.py training/*.toml training/*.jinja))
+    training/*.py training/*.toml training/*.jinja training/pretrained/*/*))
 
 .PHONY: demo test lint types bench clean
 .DELETE_ON_ERROR:

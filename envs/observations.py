@@ -28,6 +28,7 @@ from leapnav.envs.settings import (
 
 # Entries of the parts; the environments' docstrings say what they mean.
 GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 3, 4
+TIME_LEFT = 4  # place in the goal's part
 # Bounds that no scenario of a sensible size reaches; values beyond are clipped.
 FARTHEST, LONGEST, FASTEST = 1000.0, 10_000.0, 20.0
 LIDAR, MAP = OBSERVATIONS.index("lidar"), OBSERVATIONS.index("map")

@@ -13,8 +13,8 @@ from leapnav.outputs import check_outputs
 if TYPE_CHECKING:
     from leapnav.envs.bank import ScenarioBank
 
-POLICY = """"expert", "random", "go-to-goal", or the folder of a policy or of a run. Runs that differ in their seed
-alone share a row; so do those with the same LABEL=."""
+POLICY = """"expert", "random", "go-to-goal", the folder of a policy or of a run, or the name of a policy that ships: a
+family, or "all". Runs that differ in their seed alone share a row; so do those with the same LABEL=."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ class Watch:
     """Watch a policy drive beside the optimum (the orange line), in a window or as a video."""
 
     policy: str = "expert"
-    """Folder of a policy or of a run, "expert", "random" or "go-to-goal"."""
+    """Folder of a policy or of a run, the name of one that ships, "expert", "random" or "go-to-goal"."""
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     split: Literal["train", "test", "fresh"] = "test"
@@ -90,13 +90,13 @@ class Watch:
     def _make(self, render_mode: str) -> gym.Env[Any, Any]:
         import gymnasium as gym
 
+        from leapnav.training.entrants import BASELINES
+        from leapnav.training.policies import policy_environment
+
+        sensors = {} if self.policy in BASELINES else policy_environment(self.policy)
+        arguments = {**sensors, "actuation": self.actuation, "disturbance": self.disturbance}
         return gym.make(
-            "leapnav/Navigate-v0",
-            family=self.family,
-            split=self.split,
-            actuation=self.actuation,
-            disturbance=self.disturbance,
-            render_mode=render_mode,
+            "leapnav/Navigate-v0", family=self.family, split=self.split, render_mode=render_mode, **arguments
         )
 
     def _play(self, env: gym.Env[Any, Any]) -> None:

@@ -135,7 +135,15 @@ def run(name, out, demos, resume):
 
 def warm(out, demos, **changes):
     start = WarmStartConfig(critic_epochs=1, slopes=100)
-    extra = {"divergence": 0.1, "jump_start": 0.5, "reward": "cost", "warm_start": (demos,), "cloning": QUICK}
+    extra = {
+        "divergence": 0.1,
+        "critic_steps": 256,
+        "last_std": 0.1,
+        "jump_start": 0.5,
+        "reward": "cost",
+        "warm_start": (demos,),
+        "cloning": QUICK,
+    }
     return ppo(out, start=start, **{**extra, **changes})
 
 

@@ -105,11 +105,12 @@ def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
 
 
 def test_discounted_values_shrink():
-    from leapnav.training.warmstart import _discounting
+    from leapnav.training.warmstart import _Rewards
 
     # Ten steps of cost 1 each.
-    assert _discounting(np.array([0.5]), 0.9) * 10 == pytest.approx(sum(0.9**k for k in range(10)))
-    assert _discounting(np.array([0.5]), 1.0) == 1.0
+    assert _Rewards(0.9, 0.05, 1.0).factors(np.array([0.5])) * 10 == pytest.approx(sum(0.9**k for k in range(10)))
+    assert _Rewards(0.9, 0.1, 2.0).factors(np.array([0.5])) * 5 == pytest.approx(2 * sum(0.9**k for k in range(5)))
+    assert _Rewards(1.0, 0.05, 0.1).factors(np.array([0.5])) == 0.1
 
 
 def test_parts_of_a_warm_start_can_be_left_out(dataset):
@@ -137,11 +138,11 @@ def test_bad_settings_are_named(settings, message, dataset):
         warm_start(ppo(), dataset, reward_scale=0.0, progress=False)
 
 
-def test_the_divergence_from_the_anchor_is_that_of_two_gaussians():
+@pytest.mark.parametrize("quiet", [0.0, 10.0])
+def test_the_divergence_from_the_anchor_is_that_of_two_gaussians(quiet):
     env = NavigateEnv("open")
-    policy = AnchoredPolicy(
-        env.observation_space, env.action_space, lambda _: 1e-3, divergence_weight=2.0, entropy_weight=0.5, **small()
-    )
+    weights = {"divergence_weight": 2.0, "entropy_weight": 0.5, "quiet": quiet}
+    policy = AnchoredPolicy(env.observation_space, env.action_space, lambda _: 1e-3, **weights, **small())
     observations = th.as_tensor(np.stack([env.reset(seed=seed)[0] for seed in range(5)]))
     actions = th.zeros(5, 2)
     policy.drop_anchor()
@@ -155,10 +156,25 @@ def test_the_divergence_from_the_anchor_is_that_of_two_gaussians():
     divergence = th.distributions.kl_divergence(now, before).sum(dim=1)
     found = policy.evaluate_actions(observations, actions)[2]
     assert th.allclose(found, 0.5 * now.entropy().sum(dim=1) - 2.0 * divergence, atol=1e-5)
-    assert policy.divergence == pytest.approx(float(divergence.mean()), rel=1e-5)
+    assert policy.divergence == pytest.approx(divergence.mean().item(), rel=1e-5)
     # The anchor is no parameter that an optimiser would move.
     moved = {id(p) for group in policy.optimizer.param_groups for p in group["params"]}
     assert not any(id(p) in moved for p in policy.anchor.parameters())
+
+
+def test_exploration_fades_before_the_horizon():
+    env = NavigateEnv("open")
+    policy = AnchoredPolicy(
+        env.observation_space, env.action_space, lambda _: 1e-3, quiet=2.0, log_std_init=0.0, **small()
+    )
+    observations = th.as_tensor(np.stack([env.reset(seed=0)[0]] * 3))
+    observations[:, 4] = th.tensor([3.0, 1.0, 0.0])
+    spread = policy.get_distribution(observations).distribution.stddev
+    assert th.allclose(spread, th.tensor([[1.0], [0.5], [0.3]]).expand(3, 2))
+    actions, _, likelihoods = policy(observations)
+    values, again, _ = policy.evaluate_actions(observations, actions)
+    assert th.allclose(likelihoods, again)
+    assert values.shape == (3, 1)
 
 
 def test_a_divergence_holds_ppo_near_its_anchor():

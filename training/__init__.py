@@ -20,7 +20,15 @@ if TYPE_CHECKING:
     from leapnav.training.evaluation import Episode, Evaluation, Policy, evaluate
     from leapnav.training.html_report import write_report
     from leapnav.training.imitation import train_bc, train_dagger
-    from leapnav.training.policies import NavigationFeatures, load_policy, make_policy, network, save_policy
+    from leapnav.training.policies import (
+        NavigationFeatures,
+        load_policy,
+        make_policy,
+        network,
+        policy_environment,
+        save_policy,
+        shipped_policies,
+    )
     from leapnav.training.reinforcement import train_ppo, train_sac
     from leapnav.training.scores import Interval, Score, profile, score
     from leapnav.training.vec_env import NavigateVecEnv, make_vec_env
@@ -53,9 +61,11 @@ __all__ = [
     "make_policy",
     "make_vec_env",
     "network",
+    "policy_environment",
     "profile",
     "save_policy",
     "score",
+    "shipped_policies",
     "train_bc",
     "train_dagger",
     "train_ppo",
@@ -80,7 +90,15 @@ _MODULES = {
     "dagger": ("DAgger",),
     "dataset": ("Dataset",),
     "evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
-    "policies": ("NavigationFeatures", "load_policy", "make_policy", "network", "save_policy"),
+    "policies": (
+        "NavigationFeatures",
+        "load_policy",
+        "make_policy",
+        "network",
+        "policy_environment",
+        "save_policy",
+        "shipped_policies",
+    ),
     "html_report": ("write_report",),
     "imitation": ("train_bc", "train_dagger"),
     "reinforcement": ("train_ppo", "train_sac"),

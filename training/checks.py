@@ -27,9 +27,9 @@ COUNTS = (
     "gradient_steps",
     "buffer_size",
 )
-POSITIVE = ("learning_rate", "reward_scale", "clip_range", "std")
+POSITIVE = ("learning_rate", "reward_scale", "clip_range", "std", "control_period")
 SHARES = ("jump_start", "jump_start_until", "divergence_until", "gamma", "gae_lambda")
-NOT_NEGATIVE = ("divergence", "learning_starts")
+NOT_NEGATIVE = ("divergence", "learning_starts", "penalty", "last_std", "quiet", "critic_steps")
 
 
 def check_config(config: RunConfig) -> None:

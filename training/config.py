@@ -197,6 +197,12 @@ class PPOConfig(_LearnerConfig):
     gamma: float = 1.0
     """Discount factor. The horizon is finite and observed, so 1 is possible, and the critic's values are minus the
     costs to go then."""
+    control_period: float = 0.2
+    """s between actions while it learns: with fewer decisions in an episode each matters more. What it learns is
+    evaluated with the environment's own."""
+    penalty: float = 15.0
+    """Of a collision and of a miss while it learns. The environment's own, 50, is so much more than what an optimum
+    costs that its noise drowns the rest."""
     reward: Literal["cost", "shaped"] = "shaped"
     """Reward of the environment; "shaped" tells on the way how near the goal is."""
     n_steps: int = 128
@@ -213,6 +219,12 @@ class PPOConfig(_LearnerConfig):
     """Weight of the entropy."""
     std: float = 0.5
     """Standard deviation of the actions at first."""
+    last_std: float = 0.0
+    """Standard deviation of the actions at the end, to which it goes along a line; 0: it is learned."""
+    quiet: float = 2.0
+    """s before the horizon from which on that noise fades, to a third."""
+    critic_steps: int = 0
+    """Steps at first in which the critic alone learns."""
     divergence: float = 0.0
     """Weight of the divergence from the clone, at first; it falls to zero along a line. 0: none."""
     divergence_until: float = 0.5

@@ -10,7 +10,6 @@ import numpy as np
 from leapnav.envs.bank import ScenarioBank
 from leapnav.training.entrants import NamedEntrant, grouped
 from leapnav.training.evaluation import Evaluation, evaluate
-from leapnav.training.policies import OBSERVED
 from leapnav.training.scores import Score, score
 
 
@@ -72,14 +71,12 @@ def contest(
     for row, members in grouped(entrants).items():
         runs[row] = []
         for member in members:
-            # What it was trained to see; the task is the same for all.
-            environment = {name: value for name, value in member.environment.items() if name in OBSERVED}
             found = [
                 evaluate(
                     member.entrant,
                     bank,
                     count=count,
-                    environment=environment,
+                    environment=member.environment,  # what it sees; the task is the same for all
                     seed=seed,
                     label=f"{member.name}: {bank.family}",
                     progress=progress,

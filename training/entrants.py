@@ -13,7 +13,7 @@ import gymnasium as gym
 from leapnav.experts.policy import ExpertPolicy
 from leapnav.training.baselines import GoToGoal, RandomPolicy
 from leapnav.training.evaluation import Entrant, Policy
-from leapnav.training.policies import load_policy, read_description
+from leapnav.training.policies import load_policy, policy_environment, read_description
 
 BASELINES = ("expert", "random", "go-to-goal")
 
@@ -27,7 +27,7 @@ class NamedEntrant:
         label: of its row, None if none was given.
         method: what runs that differ in their seed alone have in common, None if it is not known.
         entrant: the policy, or what makes it for an environment.
-        environment: arguments of the environment that it was trained for.
+        environment: arguments of the environment that it has to see.
 
     """
 
@@ -42,8 +42,8 @@ def load_entrant(name: str, *, seed: int = 0) -> NamedEntrant:
     """A policy by its name.
 
     Args:
-        name: "expert", "random", "go-to-goal", or the folder of a policy or a run; with "LABEL=" before it, all of the
-            same label are runs of one method.
+        name: "expert", "random", "go-to-goal", the folder of a policy or a run, or the name of a policy that ships;
+            with "LABEL=" before it, all of the same label are runs of one method.
         seed: of the random policy.
 
     Raises:
@@ -60,11 +60,10 @@ def load_entrant(name: str, *, seed: int = 0) -> NamedEntrant:
         }
         return NamedEntrant(place, label, None, makers[place], {})
     policy, description = load_policy(place), read_description(place)
-    environment = {key: value for key, value in description["environment"].items() if key != "id"}
     # Of a run's configuration all but seed and folder make the method.
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
     method = json.dumps(training, sort_keys=True) if training else None
-    return NamedEntrant(place, label, method, policy, environment)
+    return NamedEntrant(place, label, method, policy, policy_environment(place))
 
 
 def grouped(entrants: Sequence[NamedEntrant]) -> dict[str, list[NamedEntrant]]:

@@ -20,12 +20,14 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 import leapnav
+from leapnav.envs.families import ALL, FAMILIES
 from leapnav.envs.observations import GOAL_ENTRIES
 from leapnav.envs.settings import Settings
 from leapnav.experts.demonstrations import ENVIRONMENT
 from leapnav.training.actors import policy_of
 
 FORMAT = 2
+SHIPPED = Path(__file__).parent / "pretrained"
 HIDDEN = (256, 256, 256)
 ROBOT_RADIUS = 0.25  # m, the scale on which a near obstacle matters
 
@@ -191,7 +193,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         ValueError: the file is broken, of another format or for another environment; the message says which.
 
     """
-    path = Path(folder) / "policy.json"
+    path = _place(folder) / "policy.json"
     text = path.read_text()
     try:
         description = json.loads(text)
@@ -221,11 +223,26 @@ def read_description(folder: str | Path) -> dict[str, Any]:
     return description
 
 
+def policy_environment(folder: str | Path) -> dict[str, Any]:
+    """The arguments of `gym.make` that a policy needs to see what it has learned to see.
+
+    Args:
+        folder: see `load_policy`.
+
+    Raises:
+        FileNotFoundError, ValueError: see `load_policy`.
+
+    """
+    found = read_description(folder)["environment"]
+    return {name: found[name] for name in OBSERVED if name in found}
+
+
 def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
     """Reads a policy that `save_policy` wrote; nothing of the file is executed.
 
     Args:
-        folder: of the policy, or of the run that made it.
+        folder: of the policy, or of the run that made it; or the name of a family, "clutter" and so on, or "all", for
+            the policy that ships for it (actors only, in half precision).
         env: if given, the environment that the policy is to drive, single or vector; it must show what the policy
             observes.
 
@@ -237,8 +254,8 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         ValueError: the files are broken, of another format or for other observations; the message says which.
 
     """
-    folder = Path(folder)
     description = read_description(folder)
+    folder = _place(folder)
     try:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
         observation_space = spaces.Box(low, high, dtype=np.float32)
@@ -291,6 +308,17 @@ def _check_environment(folder: Path, description: dict[str, Any], space: spaces.
     if differing or getattr(inner, "single_observation_space", inner.observation_space) != space:
         of_what = ", ".join(differing) or "other bounds"
         raise ValueError(f"{folder}: the policy observes another environment than this one: {of_what}")
+
+
+def shipped_policies() -> list[str]:
+    """Names of the policies that ship with leapnav: families, and "all" for one that knows them all."""
+    return [name for name in (*FAMILIES, ALL) if (SHIPPED / name / "policy.json").is_file()]
+
+
+def _place(folder: str | Path) -> Path:
+    """The folder of a policy, given itself or by the name of one that ships."""
+    place = Path(folder)
+    return SHIPPED / place if isinstance(folder, str) and not place.exists() and folder in shipped_policies() else place
 
 
 # Settings that what is observed depends on.

@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 
 from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.families import ALL, FAMILIES
-from leapnav.training.actors import copy_actor, set_noise
+from leapnav.training.actors import actor_parameters, copy_actor, set_noise
 from leapnav.training.anchored import AnchoredPolicy
 from leapnav.training.checks import check_config
 from leapnav.training.config import PPOConfig, SACConfig
@@ -65,6 +65,7 @@ def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
                 **network(config.hidden),
                 "log_std_init": math.log(config.std),
                 "entropy_weight": config.ent_coef,
+                "quiet": config.quiet,
             },
             seed=config.seed,
             device="cpu",
@@ -157,6 +158,10 @@ def _start(config: Config) -> tuple[list[Path], BasePolicy | None]:
 
 def _robots(config: Config) -> VecEnv:
     """The training environment: fresh scenarios without end."""
+    task: dict[str, Any] = {}
+    if isinstance(config, PPOConfig):
+        penalty = config.penalty
+        task = {"control_period": config.control_period, "collision_penalty": penalty, "miss_penalty": penalty}
     robots = make_vec_env(
         n_envs=config.n_envs,
         family=config.family,
@@ -164,6 +169,7 @@ def _robots(config: Config) -> VecEnv:
         reward=config.reward,
         discount=config.gamma,
         **config.environment,
+        **task,
     )
     venv: VecEnv = robots
     if config.jump_start > 0:
@@ -257,8 +263,13 @@ class _Keeper(BaseCallback):
             self._run.save_checkpoint(self._write, {"step": step, "evaluated": self._evaluated})
         done = step / config.total_timesteps
         if isinstance(config, PPOConfig) and isinstance(self.model.policy, AnchoredPolicy):
-            self.model.policy.divergence_weight = _fading(config.divergence, config.divergence_until, done)
-            self.logger.record("train/divergence", self.model.policy.divergence)
+            policy = self.model.policy
+            policy.divergence_weight = _fading(config.divergence, config.divergence_until, done)
+            self.logger.record("train/divergence", policy.divergence)
+            for parameter in (*actor_parameters(policy), policy.log_std):
+                parameter.requires_grad_(step >= config.critic_steps)
+            if config.last_std > 0:
+                set_noise(policy, th.full((2,), config.std + min(1.0, done) * (config.last_std - config.std)))
         for part in _parts(self._venv):
             if isinstance(part, JumpStart):
                 part.share = _fading(config.jump_start, config.jump_start_until, done)

@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
 from tqdm.auto import tqdm
 
+from leapnav.envs.observations import TIME_LEFT
 from leapnav.envs.observer import Observer
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.demonstrations import CONTROL_PERIOD
@@ -87,12 +88,31 @@ def warm_start(
     value_error = slope_error = math.nan
     if config.critic:
         gamma = float(getattr(model, "gamma", 1.0))
-        value_error, slope_error = _fit_critic(target, samples, config, gamma, reward_scale, progress)
+        robots = model.get_env()
+        period = CONTROL_PERIOD if robots is None else float(robots.get_attr("control_period")[0])
+        rewards = _Rewards(gamma, period, reward_scale)
+        value_error, slope_error = _fit_critic(target, samples, config, rewards, progress)
     return WarmStart(tuple(losses), value_error, slope_error)
 
 
+@dataclass(frozen=True)
+class _Rewards:
+    """What the model makes of rewards: discount factor, control period (s) of its robots, scale."""
+
+    gamma: float
+    period: float
+    scale: float
+
+    def factors(self, time_left: np.ndarray) -> np.ndarray:
+        """What turns a cost to go (N,) into minus a value: the cost is taken as spread evenly over the time left."""
+        if self.gamma == 1.0:
+            return np.full_like(time_left, self.scale)
+        steps = np.maximum(np.ceil(time_left / self.period - 1e-6), 1.0)
+        return self.scale * (1 - self.gamma**steps) / (steps * (1 - self.gamma))
+
+
 def _fit_critic(
-    policy: BasePolicy, dataset: Dataset, config: WarmStartConfig, gamma: float, reward_scale: float, progress: bool
+    policy: BasePolicy, dataset: Dataset, config: WarmStartConfig, rewards: _Rewards, progress: bool
 ) -> tuple[float, float]:
     """Mean squared errors of values and slopes in the last epoch, in units of their variance."""
     device, rng = policy.device, np.random.default_rng(config.seed)
@@ -100,7 +120,7 @@ def _fit_critic(
     if not known.any():
         raise ValueError("dataset: no sample has a cost-to-go and a costate; start.critic needs them")
     dataset = dataset[known]
-    shrinking = reward_scale * _discounting(dataset.observations[:, 4], gamma)
+    shrinking = rewards.factors(dataset.observations[:, TIME_LEFT])
     values = _tensor(shrinking * dataset.returns, device)
     observations, actions = _tensor(dataset.observations, device), _tensor(dataset.actions, device)
     columns = dataset.weights * dataset.limits**2, action_slopes(dataset), shrinking
@@ -127,7 +147,7 @@ def _fit_critic(
                     noise = ACTION_NOISE * th.randn(taken.shape, generator=generator).to(device)
                     error = (taken + noise).clamp(-1.0, 1.0) - taken
                     dearer = (0.5 * curvature[chosen] * error.square() + slope[chosen] * error).sum(dim=1)
-                    cost = CONTROL_PERIOD * shrunk[chosen] * dearer
+                    cost = rewards.period * shrunk[chosen] * dearer
                     difference = estimates - critic.values(inputs, taken + error) - cost[:, None]
                     loss = loss + config.gradient_weight * difference.square().mean() / cost.square().mean()
                 if slopes is not None:
@@ -144,12 +164,6 @@ def _fit_critic(
     critic.finish()
     value_error, slope_error = (errors / batches).tolist()
     return value_error, slope_error if slopes is not None else math.nan
-
-
-def _discounting(time_left: np.ndarray, gamma: float) -> np.ndarray:
-    """Factors (N,) by which discounting shrinks a cost that is spread evenly over the time that is left."""
-    steps = np.maximum(np.ceil(time_left / CONTROL_PERIOD - 1e-6), 1.0)
-    return np.ones_like(steps) if gamma == 1.0 else (1 - gamma**steps) / (steps * (1 - gamma))
 
 
 def _tensor(values: np.ndarray, device: th.device) -> th.Tensor:
