@@ -14,8 +14,9 @@ from leapnav.experts.rollouts import rollout
 from leapnav.training.cloning import behaviour_clone
 from leapnav.training.config import CloningConfig
 from leapnav.training.contest import contest
+from leapnav.training.dataset import Dataset
 from leapnav.training.entrants import load_entrant
-from leapnav.training.policies import make_policy, save_policy
+from leapnav.training.policies import make_policy, save_policy, shipped_policies
 from leapnav.training.reports import plot_episodes, plot_scores, print_scores, write_scores
 
 
@@ -27,6 +28,7 @@ class DemoSettings:
     training_scenarios: int = 1000
     training_seed: int = 1000
     recoveries: int = 4
+    lidar_beams: int = 128
     test_scenarios: int = 200
     workers: int = 2
     cloning: CloningConfig = field(default_factory=CloningConfig)
@@ -62,12 +64,13 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
     if (folder / "policy.json").exists():
         console.print(f"Using {folder}")
     else:
-        env = NavigateEnv(settings.family)
+        env = NavigateEnv(settings.family, lidar_beams=settings.lidar_beams)
         policy = make_policy(env.observation_space, env.action_space, settings.cloning.seed)
-        behaviour_clone(policy, demonstrations, settings.cloning)
-        save_policy(policy, folder)
+        behaviour_clone(policy, Dataset.of(demonstrations).observed(env.settings), settings.cloning)
+        save_policy(policy, folder, {"lidar_beams": settings.lidar_beams})
 
-    entrants = [load_entrant(name) for name in ("expert", f"clone={folder}", "go-to-goal", "random")]
+    names = ["expert", *(["shipped=" + settings.family] if settings.family in shipped_policies() else [])]
+    entrants = [load_entrant(name) for name in (*names, f"clone={folder}", "go-to-goal", "random")]
     bank = ScenarioBank.shipped(settings.family, "test")
     found = contest(entrants, [bank], count=settings.test_scenarios)
     write_scores(found, out / "scores.json")

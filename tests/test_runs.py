@@ -257,6 +257,10 @@ def test_tuned_settings_depend_on_the_family_and_the_warm_start():
             assert kind.tuned(family).family == family
     assert PPOConfig.tuned("clutter", warm=True).reward == "cost"
     assert PPOConfig.tuned("clutter", seed=7).seed == 7
+    # A family's own, and of a part of the configuration.
+    assert DAggerRunConfig.tuned("open").hidden == (128, 128)
+    assert DAggerRunConfig.tuned("open").dagger == DAggerConfig(rounds=2)
+    assert DAggerRunConfig.tuned("clutter").dagger == DAggerConfig()
 
 
 def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -125,8 +125,9 @@ class RunConfig:
         config = cls(out=Path(), family=family)
         for section in (cls.__name__, f"{cls.__name__}-warm")[: 2 if warm else 1]:
             table = _DEFAULTS.get(section, {})
-            common = {name: value for name, value in table.items() if not isinstance(value, dict)}
-            config = replace(config, **common, **table.get(family, {}))
+            settings = {setting.name for setting in fields(config)}
+            common = {name: value for name, value in table.items() if name in settings}  # the others are families
+            config = _changed(_changed(config, common), table.get(family, {}))
         return replace(config, **changes)
 
 
@@ -263,6 +264,15 @@ class SACConfig(_LearnerConfig):
     """Steps between evaluations."""
     checkpoint_every: int = 50_000
     """Steps between checkpoints."""
+
+
+def _changed(config: Any, table: dict[str, Any]) -> Any:
+    """A configuration with what a table says otherwise; its tables are those of the configuration's parts."""
+    changes: dict[str, Any] = {}
+    for name, value in table.items():
+        part = _changed(getattr(config, name), value) if isinstance(value, dict) else value
+        changes[name] = tuple(part) if isinstance(part, list) else part
+    return replace(config, **changes)
 
 
 ALGORITHMS: dict[str, type[RunConfig]] = {

@@ -1,0 +1,36 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from leapnav.envs import FAMILIES
+from leapnav.training import evaluate, load_policy, policy_environment, shipped_policies
+from leapnav.training.entrants import load_entrant
+from leapnav.training.policies import SHIPPED, read_description
+
+
+def test_the_policies_that_ship_are_small():
+    assert sum(file.stat().st_size for file in SHIPPED.glob("*/*")) < 2_000_000
+    assert {folder.name for folder in SHIPPED.iterdir()} == set(shipped_policies())
+
+
+@pytest.mark.parametrize("name", shipped_policies())
+def test_a_policy_that_ships_is_loaded_by_its_name_and_drives(name):
+    policy, sensors = load_policy(name), policy_environment(name)
+    env = gym.make("leapnav/Navigate-v0", family="open", **sensors)
+    observation, _ = env.reset(seed=0)
+    assert env.action_space.contains(policy.predict(observation, deterministic=True)[0])
+    families = FAMILIES if name == "all" else (name,)
+    found = [evaluate(policy, family, count=30, environment=sensors, progress=False) for family in families]
+    assert np.mean([evaluation.success for evaluation in found]) >= 0.85
+    assert read_description(name)["training"]["family"] == name
+
+
+def test_a_shipped_policys_name_is_a_policy_wherever_one_is_asked_for(tmp_path, monkeypatch):
+    name = shipped_policies()[0]
+    assert load_entrant(name).environment == policy_environment(name)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()  # a folder of that name comes first
+    with pytest.raises(FileNotFoundError, match=f"{name}/policy.json"):
+        load_policy(name)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_policy("nowhere")
