@@ -11,6 +11,7 @@ import numpy as np
 
 OBSERVATIONS, REWARDS, ACTUATIONS = ("lidar", "state", "map"), ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS = ("sparse", "cost")
+SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")  # arguments that choose them
 SHORTEST_PERIOD = 1e-4  # s
 MOST = 10_000  # beams, obstacles or vertices
 

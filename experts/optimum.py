@@ -108,7 +108,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
         candidates: how many distinct paths to try at once; more are tried only as long as none of them is certified, or
             a better one may have been missed.
         thorough: False tries no more than these. Mostly the best path is among them, and where there is none this says
-            so fifty times sooner; but it may miss the only one.
+            so fifty times sooner; but it may miss the only one, and a status of failure is then a guess.
 
     Returns:
         An `Optimum`; if nothing is certified, a failure whose status says why.
@@ -131,7 +131,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
         cropped = cropped or lattice.cropped
         paths = lattice.candidates()
         first, search.wasted = None, 0
-        for _ in range(MOST_ROUNDS if thorough else 1):
+        for _ in range(MOST_ROUNDS):
             batch = list(islice(paths, candidates))
             if not batch:
                 break

@@ -16,7 +16,7 @@ from leapnav.training.config import CloningConfig
 from leapnav.training.contest import contest
 from leapnav.training.dataset import Dataset
 from leapnav.training.entrants import load_entrant
-from leapnav.training.policies import make_policy, save_policy, shipped_policies
+from leapnav.training.policies import SHIPPED, make_policy, save_policy, shipped_policies
 from leapnav.training.reports import plot_episodes, plot_scores, print_scores, write_scores
 
 
@@ -69,7 +69,9 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
         behaviour_clone(policy, Dataset.of(demonstrations).observed(env.settings), settings.cloning)
         save_policy(policy, folder, {"lidar_beams": settings.lidar_beams})
 
-    names = ["expert", *(["shipped=" + settings.family] if settings.family in shipped_policies() else [])]
+    names = ["expert"]
+    if settings.family in shipped_policies():
+        names.append(f"shipped={SHIPPED / settings.family}")
     entrants = [load_entrant(name) for name in (*names, f"clone={folder}", "go-to-goal", "random")]
     bank = ScenarioBank.shipped(settings.family, "test")
     found = contest(entrants, [bank], count=settings.test_scenarios)

@@ -10,11 +10,12 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from leapnav.envs.families import ALL, FAMILIES
 from leapnav.training import DAggerRunConfig, evaluate, load_policy, policy_environment, save_policy, train_dagger
 from leapnav.training.policies import read_description
 
 PRETRAINED = Path(__file__).resolve().parent.parent / "training" / "pretrained"
-NAMES = ("open", "clutter", "polygons", "rooms", "slalom", "all")
+NAMES = (*FAMILIES, ALL)
 
 
 def ship(name: str, runs: Path) -> None:
@@ -27,7 +28,7 @@ def ship(name: str, runs: Path) -> None:
     training = read_description(run)["training"]
     save_policy(load_policy(run), folder, policy_environment(run), training=training, half=True)
     policy = load_policy(folder)
-    for family in NAMES[:-1] if name == "all" else (name,):
+    for family in FAMILIES if name == ALL else (name,):
         found = evaluate(policy, family, environment=policy_environment(folder))
         print(f"{name} on {family}: success {found.success:.3f}, SOC {found.soc:.3f}, median regret {found.regret:.4f}")
 

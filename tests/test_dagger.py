@@ -93,11 +93,18 @@ def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, mo
 @pytest.mark.parametrize(
     "settings", [{"rounds": 0}, {"failures": 0}, {"successes": -1.0}, {"learning_rate": -1.0}, {"lead": 0.0}]
 )
-def test_bad_settings_of_dagger_are_named(settings, env):
+def test_bad_settings_of_dagger_are_named(settings, env, dataset):
     venv = make_vec_env(n_envs=1, family="open", split="fresh")
     with pytest.raises(ValueError, match=f"{next(iter(settings))}: "):
         DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(**settings))
     with pytest.raises(ValueError, match="expert: expected one for venv"):
         DAgger(fresh(env), ExpertPolicy(make_vec_env(n_envs=1, family="open")), venv)
+    for arguments, name in (({"disturbance": 0.1}, "disturbed"), ({"actuation": "motor"}, "motors")):
+        robots = make_vec_env(n_envs=1, family="open", split="fresh", **arguments)
+        with pytest.raises(ValueError, match=f"venv: DAgger needs robots that are not {name}"):
+            DAgger(fresh(env), ExpertPolicy(robots), robots)
+    shaped = make_vec_env(n_envs=1, family="open", split="fresh", reward="shaped")
+    with pytest.raises(ValueError, match="dataset: reward: expected that of the robots, 'shaped', got 'cost'"):
+        DAgger(fresh(env), ExpertPolicy(shaped), shaped, dataset=dataset)
     with pytest.raises(TypeError, match="venv: expected one from"):
         DAgger(fresh(env), ExpertPolicy(venv), ScaledReward(venv, 2.0))

@@ -112,5 +112,9 @@ def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):
     assert found.observed(found.settings) is found
     seen.save(tmp_path / "seen.npz")
     assert Dataset.load(tmp_path / "seen.npz").settings == Settings(lidar_beams=64)
+    # What the samples are samples of does not change with what is seen.
+    assert found.observed(Settings(reward="shaped", control_period=0.2)) is found
+    with pytest.raises(ValueError, match="actuation: the samples are of 'velocity', got 'motor'"):
+        found.observed(Settings(actuation="motor"))
     with pytest.raises(ValueError, match="datasets: lidar_beams: expected the same for all, got 32 and 64"):
         Dataset.joined([found, seen])

@@ -4,14 +4,16 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch as th
 
 from leapnav.experts.rollouts import rollout
+from leapnav.training import config as configuration
 from leapnav.training import load_policy
+from leapnav.training.actors import actor_parameters
 from leapnav.training.config import (
     ALGORITHMS,
     BCConfig,
@@ -25,7 +27,7 @@ from leapnav.training.config import (
 )
 from leapnav.training.html_report import write_report
 from leapnav.training.imitation import train_bc, train_dagger
-from leapnav.training.reinforcement import train_ppo, train_sac
+from leapnav.training.reinforcement import _robots, train_ppo, train_sac
 from leapnav.training.vec_env import environment_seed
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
@@ -137,7 +139,7 @@ def warm(out, demos, **changes):
     start = WarmStartConfig(critic_epochs=1, slopes=100)
     extra = {
         "divergence": 0.1,
-        "critic_steps": 256,
+        "critic_first": 0.2,
         "last_std": 0.1,
         "jump_start": 0.5,
         "reward": "cost",
@@ -222,6 +224,9 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         ({"family": "maze"}, r"family: expected one of .*got 'maze'"),
         ({"hidden": (0,)}, r"hidden: expected widths of at least 1"),
         ({"jump_start": 3.0}, r"jump_start: expected a number in \[0, 1\], got 3.0"),
+        ({"critic_first": 1.0}, r"critic_first: expected a number in \[0, 1\), got 1.0"),
+        ({"last_std": 0.1, "ent_coef": 0.01}, "ent_coef: with last_std the noise is not learned; expected 0, got 0.01"),
+        ({"lidar_beams": 7}, "lidar_beams: expected an even number from 2 on, got 7"),
         ({"divergence": 0.1}, r"divergence: without a clone there is nothing to diverge from, got 0.1"),
         ({"cloning": CloningConfig(epochs=0)}, r"cloning.epochs: expected a positive number, got 0"),
         ({"cloning": CloningConfig(seed=3)}, r"cloning.seed: a run has one seed for all"),
@@ -233,6 +238,28 @@ def test_impossible_settings_are_told_before_anything_is_made(changes, message, 
     with pytest.raises(ValueError, match=message):
         train_ppo(ppo(tmp_path / "run", **changes), progress=False)
     assert not (tmp_path / "run").exists()
+
+
+def test_ppo_may_let_the_critic_learn_first_and_end_with_little_noise(demos, tmp_path):
+    clone, out = tmp_path / "clone", tmp_path / "ppo"
+    train_bc(bc(clone, demos), progress=False)
+    start = load_policy(clone)
+    for share in (0.99, 0.5):
+        config = ppo(out / str(share), warm_start=(clone,), critic_first=share, last_std=0.2)
+        train_ppo(config, progress=False)
+        policy = load_policy(config.out)
+        same = [th.equal(a, b) for a, b in zip(actor_parameters(start), actor_parameters(policy), strict=True)]
+        assert all(same) if share == 0.99 else not any(same)
+        assert not th.equal(start.value_net.weight, policy.value_net.weight)
+        assert th.allclose(policy.log_std.exp(), th.tensor(0.2))
+
+
+def test_ppos_robots_have_the_settings_of_the_run(tmp_path):
+    robots = _robots(ppo(tmp_path, control_period=0.1, penalty=7.0, lidar_beams=8))
+    settings = robots.get_attr("settings")[0]
+    assert (settings.control_period, settings.lidar_beams) == (0.1, 8)
+    assert settings.collision_penalty == settings.miss_penalty == 7.0
+    assert _robots(sac(tmp_path)).get_attr("settings")[0].control_period == 0.05
 
 
 def test_demonstrations_have_one_reward_only(demos, tmp_path):
@@ -257,6 +284,9 @@ def test_tuned_settings_depend_on_the_family_and_the_warm_start():
             assert kind.tuned(family).family == family
     assert PPOConfig.tuned("clutter", warm=True).reward == "cost"
     assert PPOConfig.tuned("clutter", seed=7).seed == 7
+    for kind, tables in configuration._DEFAULTS.items():
+        settings = {field.name for field in fields(getattr(configuration, kind.removesuffix("-warm")))}
+        assert set(tables) <= settings | {"open", "clutter", "polygons", "rooms", "slalom", "all"}
     # A family's own, and of a part of the configuration.
     assert DAggerRunConfig.tuned("open").hidden == (128, 128)
     assert DAggerRunConfig.tuned("open").dagger == DAggerConfig(rounds=2)

@@ -9,7 +9,7 @@ from typing import Any
 from leapnav.envs.families import check_family
 from leapnav.envs.settings import Settings
 from leapnav.training.cloning import check_cloning
-from leapnav.training.config import CloningConfig, DAggerConfig, RunConfig, WarmStartConfig
+from leapnav.training.config import CloningConfig, DAggerConfig, PPOConfig, RunConfig, WarmStartConfig
 from leapnav.training.dagger import check_dagger
 from leapnav.training.warmstart import check_warm_start
 
@@ -29,7 +29,7 @@ COUNTS = (
 )
 POSITIVE = ("learning_rate", "reward_scale", "clip_range", "std", "control_period")
 SHARES = ("jump_start", "jump_start_until", "divergence_until", "gamma", "gae_lambda")
-NOT_NEGATIVE = ("divergence", "learning_starts", "penalty", "last_std", "quiet", "critic_steps")
+NOT_NEGATIVE = ("divergence", "learning_starts", "penalty", "last_std", "quiet")
 
 
 def check_config(config: RunConfig) -> None:
@@ -47,6 +47,8 @@ def check_config(config: RunConfig) -> None:
     if not (config.lidar_beams > 0 and config.lidar_beams % 2 == 0):
         raise ValueError(f"lidar_beams: expected an even number from 2 on, got {config.lidar_beams!r}")
     Settings(**config.environment)
+    if isinstance(config, PPOConfig) and config.last_std > 0 and config.ent_coef > 0:
+        raise ValueError(f"ent_coef: with last_std the noise is not learned; expected 0, got {config.ent_coef!r}")
     for field in fields(config):
         value = getattr(config, field.name)
         if is_dataclass(value):
@@ -64,7 +66,7 @@ def _check(name: str, value: Any) -> None:
         raise ValueError(f"{name}: expected a number in [0, 1], got {value!r}")
     if name in NOT_NEGATIVE and not (math.isfinite(value) and value >= 0):
         raise ValueError(f"{name}: expected a number >= 0, got {value!r}")
-    if name == "demonstrations" and not 0 <= value < 1:
+    if name in ("demonstrations", "critic_first") and not 0 <= value < 1:
         raise ValueError(f"{name}: expected a number in [0, 1), got {value!r}")
     if name == "ent_coef":
         number = str(value).removeprefix("auto").removeprefix("_") or "1"

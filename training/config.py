@@ -45,7 +45,7 @@ class DAggerConfig:
     rounds: int = 8
     """How often the learner drives, the expert takes over, and the learner is fitted to all that the expert did."""
     failures: int = 300
-    """Failed episodes after which a round's driving ends; in each the expert takes over a dozen times."""
+    """Failed episodes after which a round's driving ends; in each the expert takes over a dozen times at most."""
     episodes: int = 15_000
     """Episodes that the learner drives in a round at most."""
     successes: float = 1.0
@@ -123,7 +123,7 @@ class RunConfig:
 
         """
         config = cls(out=Path(), family=family)
-        for section in (cls.__name__, f"{cls.__name__}-warm")[: 2 if warm else 1]:
+        for section in ("RunConfig", cls.__name__, f"{cls.__name__}-warm")[: 3 if warm else 2]:
             table = _DEFAULTS.get(section, {})
             settings = {setting.name for setting in fields(config)}
             common = {name: value for name, value in table.items() if name in settings}  # the others are families
@@ -224,8 +224,8 @@ class PPOConfig(_LearnerConfig):
     """Standard deviation of the actions at the end, to which it goes along a line; 0: it is learned."""
     quiet: float = 2.0
     """s before the horizon from which on that noise fades, to a third."""
-    critic_steps: int = 0
-    """Steps at first in which the critic alone learns."""
+    critic_first: float = 0.0
+    """Share of the steps, at first, in which the critic alone learns."""
     divergence: float = 0.0
     """Weight of the divergence from the clone, at first; it falls to zero along a line. 0: none."""
     divergence_until: float = 0.5

@@ -76,7 +76,7 @@ def contest(
                     member.entrant,
                     bank,
                     count=count,
-                    environment=member.environment,  # what it sees; the task is the same for all
+                    environment=member.environment,
                     seed=seed,
                     label=f"{member.name}: {bank.family}",
                     progress=progress,

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -36,7 +36,8 @@ from leapnav.training.dataset import Dataset
 from leapnav.training.vec_env import NavigateVecEnv, environment_seed
 
 PORTION = 16  # episodes that are labelled together
-# s before the end of a failed episode at which the expert takes over, closer where it matters more.
+# s before a collision at which the expert takes over, closer where it matters more; in an episode that misses its goal
+# it takes over as often, at any time.
 BEFORE = np.array([8.0, 6.5, 5.0, 4.0, 3.25, 2.5, 2.0, 1.5, 1.1, 0.8, 0.5, 0.3])
 SPREAD = 0.2  # of these times, relative
 TOO_LATE = 1.0  # s before the horizon from which on nobody takes over
@@ -107,9 +108,13 @@ class DAgger:
         if workers < 1:
             raise ValueError(f"workers: expected at least 1, got {workers!r}")
         self._policy, self._expert, self._venv, self._workers = policy_of(model), expert, venv, workers
+        _check_robots(venv.venv.settings)
         self._parts: list[Dataset] = [] if dataset is None else [Dataset.of(dataset)]
         if self._parts:
             check_observations(self._policy, self._parts[0])
+            for name, value in vars(self._parts[0].settings).items():
+                if value != (own := getattr(venv.venv.settings, name)):
+                    raise ValueError(f"dataset: {name}: expected that of the robots, {own!r}, got {value!r}")
         self._folder = None if folder is None else Path(folder)
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +152,7 @@ class DAgger:
         episodes = self._drive(name, progress)
         failed = [episode for episode in episodes if not episode.success]
         succeeded = [episode for episode in episodes if episode.success]
-        count = max(1, round(config.successes * len(failed)))
+        count = round(config.successes * max(1, len(failed)))
         chosen = failed + [succeeded[i] for i in rng.permutation(len(succeeded))[:count]]
         turns = [_takeovers(episode, self._venv.venv.settings.control_period, rng) for episode in chosen]
         turns = [turns[i] for i in rng.permutation(len(turns)) if turns[i]]
@@ -220,8 +225,9 @@ class DAgger:
         portions = [turns[k : k + PORTION] for k in range(0, len(turns), PORTION)]
         settings, run = self._venv.venv.settings, delayed(_label)
         tasks = (run(settings, self._expert.settings, portion, self.config.lead) for portion in portions)
+        labelled = cast(Iterator[list[Dataset]], Parallel(self._workers, return_as="generator")(tasks))
         parts: list[Dataset] = []
-        for found, portion in zip(Parallel(self._workers, return_as="generator")(tasks), portions, strict=True):
+        for found, portion in zip(labelled, portions, strict=True):
             parts += found
             bar.update(len(portion))
         return Dataset.joined(parts) if parts else None
@@ -287,8 +293,19 @@ def _demonstrated(env: NavigateEnv, driver: ExpertPolicy, scenario: Scenario, le
         before = observation, action, -cost[0], costate[0], info["pose"], info["time"]
         observation, reward, done, _, info = env.step(action)
         rows.append((*before, action, reward))
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Dataset(*columns, np.zeros(len(rows), dtype=int), (scenario.to_json(),), settings=env.settings)
+    names = "observations", "actions", "returns", "costates", "states", "times", "executed", "rewards"
+    columns: dict[str, Any] = {
+        name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
+    }
+    columns["episodes"] = np.zeros(len(rows), dtype=int)
+    return Dataset(**columns, scenarios=(scenario.to_json(),), settings=env.settings)
+
+
+def _check_robots(settings: Settings) -> None:
+    """Refuses robots whose episodes a pose and a time do not continue."""
+    for name in ("disturbed", "motors", "dict_observation", "goal_conditioned"):
+        if getattr(settings, name):
+            raise ValueError(f"venv: DAgger needs robots that are not {name}: the expert goes on from poses alone")
 
 
 def check_dagger(config: DAggerConfig) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from leapnav.envs.observer import Observer
 from leapnav.envs.scenario import Scenario
-from leapnav.envs.settings import Settings
+from leapnav.envs.settings import SENSORS, Settings
 from leapnav.experts.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
 
 FORMAT = 2  # of the files
@@ -78,9 +78,16 @@ class Dataset:
         """The same samples as robots with other sensors would have observed them, undisturbed.
 
         Args:
-            settings: of their environment.
+            settings: of their environment; only the sensors' count.
+
+        Raises:
+            ValueError: the robots are driven in another way, so that they would show more than the samples know.
 
         """
+        if settings.actuation != self.settings.actuation:
+            expected, given = self.settings.actuation, settings.actuation
+            raise ValueError(f"actuation: the samples are of {expected!r}, got {given!r}")
+        settings = replace(self.settings, **{name: getattr(settings, name) for name in SENSORS})
         if settings == self.settings:
             return self
         found = [Scenario.from_json(text) for text in self.scenarios]
@@ -121,6 +128,8 @@ class Dataset:
         """
         if not parts:
             raise ValueError("datasets: expected at least one, got none")
+        if len(parts) == 1:
+            return parts[0]
         for part in parts[1:]:
             if part.settings == parts[0].settings:
                 continue
@@ -186,7 +195,8 @@ class Dataset:
             scenarios.append(text)
         if not scenarios:
             raise ValueError("dataset: expected at least one episode, got none")
-        return cls(**{name: np.concatenate(values) for name, values in columns.items()}, scenarios=tuple(scenarios))
+        whole: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
+        return cls(**whole, scenarios=tuple(scenarios))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a file; an interruption leaves no half of one."""

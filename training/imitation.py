@@ -17,7 +17,7 @@ from leapnav.experts.policy import ExpertPolicy
 from leapnav.experts.rollouts import rollout
 from leapnav.training.actors import copy_actor
 from leapnav.training.checks import check_config
-from leapnav.training.cloning import Cloning
+from leapnav.training.cloning import Cloning, behaviour_clone
 from leapnav.training.config import BCConfig, DAggerRunConfig, RunConfig
 from leapnav.training.dagger import DAgger, Round
 from leapnav.training.dataset import Dataset
@@ -89,10 +89,11 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     Args, returns and errors are those of `train_bc`.
     """
     check_config(config)
-    given = Dataset.of(config.demos) if config.demos else None
+    dataset = Dataset.of(config.demos) if config.demos else None
     first = None if config.policy is None else load_policy(config.policy, robot_of(config))
     run = Run("dagger", config)
-    dataset = (given or demonstrations(run, config.scenarios, workers, progress)).observed(settings_of(config))
+    dataset = dataset or demonstrations(run, config.scenarios, workers, progress)
+    dataset = dataset.observed(settings_of(config))  # what was observed before is not needed again
     policy = new_policy(config)
     venv = make_vec_env(n_envs=config.n_envs, family=config.family, split="fresh", **config.environment)
     dagger = DAgger(
@@ -113,11 +114,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     elif first is not None:
         copy_actor(first, policy)
     else:
-        fit = Cloning(policy, dataset, replace(config.cloning, seed=config.seed))
-        with tqdm(total=fit.config.epochs * fit.batches, desc="First clone", unit="batch", disable=not progress) as bar:
-            while not fit.finished:
-                fit.run_epoch(bar.update)
-        fit.finish()
+        behaviour_clone(policy, dataset, replace(config.cloning, seed=config.seed), progress=progress)
         _save_round(run, policy, dagger)
     evaluations: list[Evaluation] = []
     while not dagger.finished:

@@ -22,7 +22,7 @@ from torch import nn
 import leapnav
 from leapnav.envs.families import ALL, FAMILIES
 from leapnav.envs.observations import GOAL_ENTRIES
-from leapnav.envs.settings import Settings
+from leapnav.envs.settings import SENSORS, Settings
 from leapnav.experts.demonstrations import ENVIRONMENT
 from leapnav.training.actors import policy_of
 
@@ -193,7 +193,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         ValueError: the file is broken, of another format or for another environment; the message says which.
 
     """
-    path = _place(folder) / "policy.json"
+    path = policy_folder(folder) / "policy.json"
     text = path.read_text()
     try:
         description = json.loads(text)
@@ -255,7 +255,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
 
     """
     description = read_description(folder)
-    folder = _place(folder)
+    folder = policy_folder(folder)
     try:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
         observation_space = spaces.Box(low, high, dtype=np.float32)
@@ -315,22 +315,14 @@ def shipped_policies() -> list[str]:
     return [name for name in (*FAMILIES, ALL) if (SHIPPED / name / "policy.json").is_file()]
 
 
-def _place(folder: str | Path) -> Path:
+def policy_folder(folder: str | Path) -> Path:
     """The folder of a policy, given itself or by the name of one that ships."""
     place = Path(folder)
-    return SHIPPED / place if isinstance(folder, str) and not place.exists() and folder in shipped_policies() else place
+    return SHIPPED / place if str(folder) in shipped_policies() and not place.exists() else place
 
 
 # Settings that what is observed depends on.
-OBSERVED = (
-    "observation",
-    "actuation",
-    "dict_observation",
-    "lidar_beams",
-    "lidar_range",
-    "map_obstacles",
-    "map_vertices",
-)
+OBSERVED = (*SENSORS, "actuation", "dict_observation")
 
 
 def _plain(settings: Settings) -> dict[str, Any]:

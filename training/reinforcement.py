@@ -29,7 +29,7 @@ from leapnav.training.dataset import Dataset
 from leapnav.training.evaluation import Evaluation
 from leapnav.training.imitation import robot_of, settings_of, show
 from leapnav.training.jump_start import JumpStart
-from leapnav.training.policies import load_policy, network
+from leapnav.training.policies import load_policy, network, policy_folder
 from leapnav.training.replay import DemonstrationReplayBuffer
 from leapnav.training.runs import Run
 from leapnav.training.vec_env import ScaledReward, environment_seed, make_vec_env
@@ -138,6 +138,8 @@ def _train(
     if remaining > 0:
         model.learn(remaining, callback=callback, reset_num_timesteps=found is None)
     callback.bar.close()
+    if isinstance(config, PPOConfig) and config.last_std > 0:
+        set_noise(model.policy, th.full((2,), config.last_std))
     evaluations = run.evaluate(model.policy, model.num_timesteps, final=True)
     run.save_policy(model.policy)
     return evaluations
@@ -146,11 +148,11 @@ def _train(
 def _start(config: Config) -> tuple[list[Path], BasePolicy | None]:
     """The folders of demonstrations, and the policy, among what a warm start is given."""
     places = config.warm_start
-    policies = [place for place in places if (place / "policy.json").is_file()]
+    policies = [place for place in places if (policy_folder(place) / "policy.json").is_file()]
     if len(policies) > 1:
         raise ValueError(f"warm_start: expected at most one policy, got {policies[0]} and {policies[1]}")
     for place in places:
-        if not place.is_dir():
+        if place not in policies and not place.is_dir():
             raise FileNotFoundError(f"warm_start: {place}: no such folder of demonstrations or of a policy")
     start = load_policy(policies[0], robot_of(config)) if policies else None
     return [place for place in places if place not in policies], start
@@ -266,8 +268,9 @@ class _Keeper(BaseCallback):
             policy = self.model.policy
             policy.divergence_weight = _fading(config.divergence, config.divergence_until, done)
             self.logger.record("train/divergence", policy.divergence)
-            for parameter in (*actor_parameters(policy), policy.log_std):
-                parameter.requires_grad_(step >= config.critic_steps)
+            for parameter in actor_parameters(policy):
+                parameter.requires_grad_(done >= config.critic_first)
+            policy.log_std.requires_grad_(done >= config.critic_first and config.last_std == 0)
             if config.last_std > 0:
                 set_noise(policy, th.full((2,), config.std + min(1.0, done) * (config.last_std - config.std)))
         for part in _parts(self._venv):
