@@ -290,9 +290,13 @@ def _demonstrated(env: NavigateEnv, driver: ExpertPolicy, scenario: Scenario, le
         except NoOptimumError:
             return None
         cost, costate = driver.labels()
+        if not math.isfinite(cost[0]):  # the goal is out of reach: what it does then is no label
+            break
         before = observation, action, -cost[0], costate[0], info["pose"], info["time"]
         observation, reward, done, _, info = env.step(action)
         rows.append((*before, action, reward))
+    if not rows:
+        return None
     names = "observations", "actions", "returns", "costates", "states", "times", "executed", "rewards"
     columns: dict[str, Any] = {
         name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
