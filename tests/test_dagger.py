@@ -7,7 +7,7 @@ from leapnav.envs.settings import Settings
 from leapnav.experts import ExpertPolicy
 from leapnav.training import DAgger, DAggerConfig, Dataset, behaviour_clone, make_vec_env
 from leapnav.training.dagger import _Episode, _label, _takeovers
-from leapnav.training.vec_env import ScaledReward
+from leapnav.training.rewards import ScaledReward
 
 
 def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tmp_path):

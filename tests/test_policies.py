@@ -9,7 +9,7 @@ from helpers import SMALL
 from stable_baselines3 import PPO, SAC
 
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
-from leapnav.training.vec_env import ScaledReward
+from leapnav.training.rewards import ScaledReward
 
 
 def test_the_features_have_the_promised_size_and_are_finite(env):

@@ -13,7 +13,7 @@ from leapnav.training.anchored import AnchoredPolicy
 from leapnav.training.config import WarmStartConfig
 from leapnav.training.jump_start import JumpStart
 from leapnav.training.replay import DemonstrationReplayBuffer
-from leapnav.training.vec_env import ScaledReward
+from leapnav.training.rewards import ScaledReward
 
 
 def small():

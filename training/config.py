@@ -168,6 +168,9 @@ class _LearnerConfig(RunConfig):
 
     reward_scale: float = 0.1
     """Factor of the rewards."""
+    graded_miss: bool = True
+    """While it learns a miss costs from a fifth of the penalty on, by how far from the goal the episode ends. Otherwise
+    nothing says where success lies, and standing still is best; who starts warm knows."""
     warm_start: tuple[Path, ...] = ()
     """Demonstrations (folders that `leapnav rollout` wrote) and at most one policy (a run's folder) to start from: the
     actor is a clone of the demonstrations, or the policy's; the critic is fitted to the demonstrations, if any."""
@@ -191,9 +194,9 @@ class PPOConfig(_LearnerConfig):
 
     total_timesteps: int = 5_000_000
     """Control periods of all robots together."""
-    n_envs: int = 128
+    n_envs: int = 64
     """Robots that drive at once."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-3
     """At first; it falls to zero along a line."""
     gamma: float = 1.0
     """Discount factor. The horizon is finite and observed, so 1 is possible, and the critic's values are minus the
@@ -201,14 +204,14 @@ class PPOConfig(_LearnerConfig):
     control_period: float = 0.2
     """s between actions while it learns: with fewer decisions in an episode each matters more. What it learns is
     evaluated with the environment's own."""
-    penalty: float = 15.0
-    """Of a collision and of a miss while it learns. The environment's own, 50, is so much more than what an optimum
-    costs that its noise drowns the rest."""
+    penalty: float = 50.0
+    """Of a collision and of a miss while it learns. A warm start's defaults have less than the environment's own: most
+    episodes succeed then, and the noise of a high penalty would drown the cost."""
     reward: Literal["cost", "shaped"] = "shaped"
     """Reward of the environment; "shaped" tells on the way how near the goal is."""
-    n_steps: int = 128
+    n_steps: int = 64
     """Control periods of each robot between two updates."""
-    batch_size: int = 2048
+    batch_size: int = 512
     """Samples per gradient step."""
     n_epochs: int = 6
     """Passes over the samples of an update."""
@@ -218,9 +221,9 @@ class PPOConfig(_LearnerConfig):
     """Of the ratio of likelihoods."""
     ent_coef: float = 0.0
     """Weight of the entropy."""
-    std: float = 0.5
+    std: float = 0.3
     """Standard deviation of the actions at first."""
-    last_std: float = 0.0
+    last_std: float = 0.1
     """Standard deviation of the actions at the end, to which it goes along a line; 0: it is learned."""
     quiet: float = 2.0
     """s before the horizon from which on that noise fades, to a third."""

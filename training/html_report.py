@@ -146,7 +146,8 @@ def _curves(rows: dict[str, list[_Run]], families: Sequence[str]) -> list[dict[s
                 axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.set(xlabel=label, ylabel={"success": "success rate", "soc": "SOC"}[measure], ylim=(-0.02, 1.02))
             axes.grid(alpha=0.3)
-        panels[1].legend(frameon=False, fontsize=8)
+        lines = panels[1].get_legend_handles_labels()
+        figure.legend(*lines, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
         note = "; the band is that of the seeds" if any(len(runs) > 1 for runs in rows.values()) else ""
         text = f"{caption}, and how good they were on the test split ({', '.join(families)}){note}."
         found.append({"svg": _as_svg(figure), "caption": text})

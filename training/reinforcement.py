@@ -31,8 +31,9 @@ from leapnav.training.imitation import robot_of, settings_of, show
 from leapnav.training.jump_start import JumpStart
 from leapnav.training.policies import load_policy, network, policy_folder
 from leapnav.training.replay import DemonstrationReplayBuffer
+from leapnav.training.rewards import GradedMiss, ScaledReward
 from leapnav.training.runs import Run
-from leapnav.training.vec_env import ScaledReward, environment_seed, make_vec_env
+from leapnav.training.vec_env import environment_seed, make_vec_env
 from leapnav.training.warmstart import warm_start
 
 Config = PPOConfig | SACConfig
@@ -178,6 +179,8 @@ def _robots(config: Config) -> VecEnv:
         families = FAMILIES if config.family == ALL else (config.family,)
         banks = [ScenarioBank.shipped(family, "train") for family in families]
         venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
+    if config.graded_miss:
+        venv = GradedMiss(venv)
     return ScaledReward(venv, config.reward_scale)
 
 

@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnvIndices,
     VecEnvObs,
     VecEnvStepReturn,
-    VecEnvWrapper,
 )
 
 from leapnav.envs.scenario import Scenario
@@ -217,28 +216,3 @@ class NavigateVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """True for `Monitor`, whose records are kept here."""
         return [issubclass(Monitor, wrapper_class)] * len(list(self._get_indices(indices)))
-
-
-class ScaledReward(VecEnvWrapper):
-    """Multiplies the rewards by a constant, so that a critic's targets are of the order of 1.
-
-    Unlike a running normalisation it keeps the critic's meaning: its values are the scale times the return.
-
-    Args:
-        venv: the robots.
-        scale: the factor.
-
-    """
-
-    def __init__(self, venv: VecEnv, scale: float) -> None:
-        super().__init__(venv)
-        self.scale = scale
-
-    def reset(self) -> VecEnvObs:
-        """Starts episodes of all robots."""
-        return self.venv.reset()
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Steps all robots; the episodes' records in the infos keep the unscaled return."""
-        observations, rewards, dones, infos = self.venv.step_wait()
-        return observations, rewards * self.scale, dones, infos
