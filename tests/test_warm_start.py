@@ -162,7 +162,7 @@ def test_the_divergence_from_the_anchor_is_that_of_two_gaussians(quiet):
     assert not any(id(p) in moved for p in policy.anchor.parameters())
 
 
-def test_exploration_fades_before_the_horizon():
+def test_exploration_fades_before_the_horizon(tmp_path):
     env = NavigateEnv("open")
     policy = AnchoredPolicy(
         env.observation_space, env.action_space, lambda _: 1e-3, quiet=2.0, log_std_init=0.0, **small()
@@ -175,6 +175,9 @@ def test_exploration_fades_before_the_horizon():
     values, again, _ = policy.evaluate_actions(observations, actions)
     assert th.allclose(likelihoods, again)
     assert values.shape == (3, 1)
+    policy.save(tmp_path / "policy")
+    loaded = AnchoredPolicy.load(tmp_path / "policy")
+    assert th.equal(loaded.get_distribution(observations).distribution.stddev, spread)
 
 
 def test_a_divergence_holds_ppo_near_its_anchor():

@@ -49,6 +49,11 @@ class AnchoredPolicy(ActorCriticPolicy):
         self.anchor = copy.deepcopy(self.anchor).requires_grad_(False)
         self.register_buffer("anchor_log_std", self.log_std.detach().clone())
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        # What `save` keeps, so that `load` makes the same policy.
+        own = {name: getattr(self, name) for name in ("entropy_weight", "divergence_weight", "quiet")}
+        return {**super()._get_constructor_parameters(), **own}
+
     def drop_anchor(self) -> None:
         """Makes the actor as it is now the anchor."""
         own = nn.ModuleList([self.pi_features_extractor, self.mlp_extractor.policy_net, self.action_net])

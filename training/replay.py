@@ -52,13 +52,8 @@ class DemonstrationReplayBuffer(ReplayBuffer):
         usable = np.isfinite(dataset.rewards) & np.isfinite(dataset.executed).all(axis=1)
         if not usable.any():
             raise ValueError("dataset: no transition has a reward; demonstrations from `leapnav rollout` have")
-        self._demonstrated = (
-            dataset.observations[usable],
-            dataset.executed[usable],
-            dataset.observations[following][usable],
-            last[usable].astype(np.float32)[:, None],
-            (reward_scale * dataset.rewards[usable]).astype(np.float32)[:, None],
-        )
+        # The dataset's own arrays, of which rows are drawn: copies would be as large again.
+        self._demonstrated = dataset, np.flatnonzero(usable), following, last, reward_scale
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """A batch, the demonstrations last.
@@ -71,9 +66,17 @@ class DemonstrationReplayBuffer(ReplayBuffer):
             raise ValueError("env: demonstrations cannot be normalised by a VecNormalize; scale the rewards instead")
         count = round(self.share * batch_size)
         driven = super().sample(batch_size - count)
-        chosen = np.random.randint(0, len(self._demonstrated[0]), size=count)  # noqa: NPY002 (as for the others)
-        demonstrated = [self.to_torch(column[chosen]) for column in self._demonstrated]
-        return ReplayBufferSamples(*(th.cat(pair) for pair in zip(driven[:5], demonstrated, strict=True)))
+        dataset, usable, following, last, scale = self._demonstrated
+        rows = usable[np.random.randint(0, len(usable), size=count)]  # noqa: NPY002 (as for the others)
+        demonstrated = (
+            dataset.observations[rows],
+            dataset.executed[rows],
+            dataset.observations[following[rows]],
+            last[rows].astype(np.float32)[:, None],
+            (scale * dataset.rewards[rows]).astype(np.float32)[:, None],
+        )
+        pairs = zip(driven[:5], map(self.to_torch, demonstrated), strict=True)
+        return ReplayBufferSamples(*(th.cat(pair) for pair in pairs))
 
     def __getstate__(self) -> dict[str, Any]:
         # A checkpoint need not hold the demonstrations again.
