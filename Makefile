@@ -4,7 +4,7 @@ BIN := .venv/bin
 SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py \
     training/*.py training/*.toml training/*.jinja training/pretrained/*/*))
 
-.PHONY: demo test lint types bench clean
+.PHONY: demo test lint types docs bench clean
 .DELETE_ON_ERROR:
 
 demo: .venv/installed
@@ -19,6 +19,11 @@ lint: .venv/installed
 
 types: .venv/installed
 	$(BIN)/basedpyright
+
+# Into build/site; needs no network once the packages are there.
+docs: .venv/installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "wrote build/site/index.html"
 
 bench: .venv/installed
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]" --config-settings editable_mode=strict

@@ -109,7 +109,8 @@ class ScenarioBank(Sequence[Scenario]):
         path: the file. Nothing but its header is read at first.
 
     Attributes:
-        path, family, seed.
+        path: the file.
+        family, seed: what the scenarios were drawn from.
         drawn: how many scenarios were drawn for those that were admitted.
         rejected: how many of them were not admitted, by reason.
         software: the version of leapnav that built the bank.

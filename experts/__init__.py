@@ -2,12 +2,12 @@
 
 from leapnav.experts.banks import build_bank
 from leapnav.experts.certificate import certify, verify
-from leapnav.experts.continuation import continuation
 from leapnav.experts.extremal import Certificate, Extremal, Iteration, SolveError, Status
+from leapnav.experts.homotopy import continuation
+from leapnav.experts.methods import solve
 from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.problem import OptimalControlProblem, Path
-from leapnav.experts.solve import solve
 from leapnav.experts.system import ControlAffineSystem, differential_drive, unicycle, unicycle_with_inertia
 
 __all__ = [

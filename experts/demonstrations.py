@@ -22,9 +22,9 @@ from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal
 from leapnav.experts.feedback import Feedback
+from leapnav.experts.methods import solve
 from leapnav.experts.policy import plan_actions
 from leapnav.experts.problem import Path
-from leapnav.experts.solve import solve
 
 ENVIRONMENT = "leapnav/Navigate-v0"
 CONTROL_PERIOD = 0.05  # s, the environment's by default, in which demonstrations are driven

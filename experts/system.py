@@ -35,7 +35,7 @@ GENERATOR_VERSION = "3"  # part of the file name: raise it whenever the generate
 
 @dataclass(frozen=True)
 class ControlAffineSystem:
-    """q' = drift(q) + sum_j fields[j](q) u_j, declared with SymPy symbols.
+    """q' = drift(q) + sum_j u_j b_j(q) with `fields` b_j, declared with SymPy symbols.
 
     Args:
         state: the n state symbols.

@@ -227,7 +227,7 @@ def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
     from leapnav.experts import Path as GuessedPath
     from leapnav.experts.certificate import failure
     from leapnav.experts.lattice import Lattice
-    from leapnav.experts.solve import Method
+    from leapnav.experts.methods import Method
 
     candidate = next(Lattice(scenario).candidates(), None)
     if candidate is None:

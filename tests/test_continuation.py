@@ -14,8 +14,8 @@ from leapnav.experts import (
     find_optimum,
     solve,
 )
-from leapnav.experts.continuation import blend
-from leapnav.experts.solve import METHODS
+from leapnav.experts.homotopy import blend
+from leapnav.experts.methods import METHODS
 
 SCENARIO = {s.name: s for s, _ in best_known()}["clutter-5"]
 

@@ -18,7 +18,7 @@ from leapnav.experts import (
     solve,
     unicycle_with_inertia,
 )
-from leapnav.experts.solve import METHODS
+from leapnav.experts.methods import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()

@@ -4,7 +4,7 @@ import sympy as sp
 from helpers import best_known, published_problems
 
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, solve
-from leapnav.experts.solve import METHODS
+from leapnav.experts.methods import METHODS
 from leapnav.experts.system import _check_same
 
 x, v = sp.symbols("x v")

@@ -16,8 +16,8 @@ from leapnav.envs.families import FAMILIES
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenario import Scenario
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
+from leapnav.experts.methods import solve
 from leapnav.experts.problem import Path
-from leapnav.experts.solve import solve
 
 ROBOTS = 256  # that drive at once
 TIMED = 100  # actions whose time is taken

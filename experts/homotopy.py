@@ -14,8 +14,8 @@ import numpy as np
 from leapnav.envs.obstacles import blend_fields
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal, SolveError
+from leapnav.experts.methods import Method, solve
 from leapnav.experts.problem import OptimalControlProblem, as_problem
-from leapnav.experts.solve import Method, solve
 
 GROWTH = 2.0  # of the step after a success; a failure halves it
 

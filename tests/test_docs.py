@@ -14,6 +14,7 @@ BLOCKS = [
     for page in (README, (ROOT / "docs" / "banks.md").read_text())
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
 ]
+GUIDES = [path for path in sorted((ROOT / "docs" / "guides").iterdir()) if "```python" in path.read_text()]
 BANK = r"rooms-1-7 (\d+\.\d+)\n200 \1\d* \(\d+, 3\)( \(\d+, 3\))?\n"
 
 
@@ -48,6 +49,27 @@ def test_the_page_on_training_runs_as_printed(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "20 True\n1\n2 True\n"
+
+
+@pytest.mark.parametrize("page", ["index.md", "tutorial.md", *(f"guides/{path.name}" for path in GUIDES)])
+def test_the_blocks_of_a_page_run_one_after_the_other(page, tmp_path):
+    code = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.DOTALL))
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_site_is_built_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    theory, reference, commands = (
+        (tmp_path / page / "index.html").read_text() for page in ("theory", "reference/experts", "reference/cli")
+    )
+    assert "<math" in theory
+    assert "arithmatex" not in theory
+    for name in ("solve", "find_optimum", "ExpertPolicy"):
+        assert f'id="leapnav.experts.{name}"' in reference
+    assert "usage: leapnav train ppo" in commands
 
 
 def test_the_readme_s_scenario_is_valid():
