@@ -199,7 +199,7 @@ def compile_flow(
     # The kernel that the generated text calls is compiled into it, so its source belongs to the key.
     identity = "\n".join([GENERATOR_VERSION, declaration, inspect.getsource(obstacles)])
     name = f"flow_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
-    path = _cache_directory() / f"{name}.py"
+    path = cache_directory() / f"{name}.py"
     if not path.exists():
         _write_atomically(path, _generate(system, state_cost, in_field))
     spec = importlib.util.spec_from_file_location(f"leapnav_generated.{name}", path)
@@ -210,7 +210,8 @@ def compile_flow(
     return CompiledFunction(module.flow, FLOW), CompiledFunction(module.control, CONTROL)
 
 
-def _cache_directory() -> Path:
+def cache_directory() -> Path:
+    """Where compiled systems are kept: LEAPNAV_CACHE_DIR, or the user's cache; a temporary folder if that is no use."""
     chosen = os.environ.get("LEAPNAV_CACHE_DIR") or platformdirs.user_cache_dir("leapnav", appauthor=False)
     directory = Path(chosen)
     try:

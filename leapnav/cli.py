@@ -1,4 +1,4 @@
-"""The command line: `leapnav solve | bank | rollout | train | evaluate | watch | demo`."""
+"""The command line: `leapnav solve | bank | rollout | train | evaluate | report | watch | demo | doctor`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from leapnav.bank_commands import Build, Show
+from leapnav.doctor import Doctor
 from leapnav.evaluate_commands import Evaluate, Report
 from leapnav.outputs import check_outputs
 from leapnav.train_commands import TrainCommand, train_command
@@ -197,6 +198,7 @@ COMMANDS = {
     "report": Report,
     "watch": Watch,
     "demo": Demo,
+    "doctor": Doctor,
 }
 
 

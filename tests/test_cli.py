@@ -2,6 +2,8 @@ import json
 import re
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from helpers import best_known, scenario_fields
@@ -372,3 +374,22 @@ def test_without_a_display_or_moviepy_watch_says_what_to_do(tmp_path, capsys, mo
     monkeypatch.setitem(sys.modules, "moviepy", None)
     assert main(["watch", "--video", str(tmp_path / "film.mp4")]) == 2
     assert 'pip install "leapnav[video]"' in capsys.readouterr().err
+
+
+def test_the_doctor_says_what_is_installed_and_that_it_works(tmp_path, capsys):
+    assert main(["doctor", "--json", str(tmp_path / "doctor.json")]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"^torch +2\.", out, re.MULTILINE)
+    assert out.count("ok    ") == 4
+    found = json.loads((tmp_path / "doctor.json").read_text())
+    assert found["versions"]["leapnav"] == version("leapnav")
+    assert "missing" not in found["versions"].values()
+    assert all(check["passed"] for check in found["checks"])
+
+
+def test_the_doctor_says_what_does_not_work(capsys, monkeypatch):
+    monkeypatch.setattr("leapnav.training.policies.SHIPPED", Path("/nowhere"))
+    assert main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert re.search(r"FAILED  load a policy .*: \w+Error: .*clutter", out)
+    assert "ok      drive it" in out
