@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,6 +38,7 @@ LEAST_SEED = 2  # the scenarios of seeds 0 and 1 are the first ones of the train
 SHARD = 16  # scenarios
 DASK_TIMEOUT = 30  # s to wait for a scheduler and its workers
 WORK, DONE = ".rollout", ".rollout-done"  # folders of what is not finished, and of what is only to be removed
+RECORD = "rollout.json"  # what a finished rollout is, beside its dataset
 # Arrays of a demonstration, and whether they have an entry more than there are steps.
 _ARRAYS = {
     "observations": True,
@@ -76,7 +78,8 @@ def rollout(
     """Samples scenarios, finds their optima, drives them, and writes a Minari dataset.
 
     What is finished is kept in `out`: a rollout that was stopped, however rudely, goes on where it was when it is
-    called again with the same arguments, and its dataset is that of one that was not stopped.
+    called again with the same arguments, and its dataset is that of one that was not stopped. One that is finished is
+    not made again.
 
     Args:
         family: family of the scenarios.
@@ -97,7 +100,7 @@ def rollout(
     Raises:
         ValueError: an argument is impossible, a shard is damaged, or `out` holds an unfinished rollout of other
             arguments.
-        FileExistsError: `out` holds something already.
+        FileExistsError: `out` holds something already, if only a rollout of other arguments.
         OSError: `out` cannot be written, or there is no such scheduler; what is finished is kept.
         ModuleNotFoundError: `dask` without the extra `cluster`.
 
@@ -113,7 +116,6 @@ def rollout(
         if not (math.isfinite(value) and value >= least):
             raise ValueError(f"{name}: expected at least {least}, got {value!r}")
     folder = Path(out).absolute()
-    _prepare(folder, force)
     settings = {
         "version": VERSION,
         "software": leapnav.__version__,
@@ -122,11 +124,17 @@ def rollout(
         "recoveries": recoveries,
         "noise": float(noise),
     }
+    finished = None if force else _finished(folder, {**settings, "count": count})
+    if finished is not None:
+        return finished
+    _prepare(folder, force)
     shards = Shards(folder / WORK, settings)  # not of the count: a longer rollout goes on where a shorter one was
     try:
         with _backend(workers, dask) as pool:
             parts = _solve(shards, pool, family, count, seed, recoveries, float(noise), progress)
         summary = _write(shards, parts, folder, family, count)
+        record = {**settings, "count": count, "summary": asdict(summary)}
+        (folder / RECORD).write_text(json.dumps(record, indent=1) + "\n")
     finally:
         shards.close()
     # At once: shards that are removed one by one would look like a rollout to go on with.
@@ -197,15 +205,33 @@ def _replay(env: NavigateEnv, demonstration: Demonstration) -> np.ndarray:
     return np.array([np.abs(np.subtract(one, other)).max() for one, other in pairs])
 
 
+def _finished(folder: Path, settings: dict[str, Any]) -> RolloutSummary | None:
+    """What a finished rollout did, None if the folder holds none."""
+    shutil.rmtree(folder / DONE, ignore_errors=True)
+    if not (folder / RECORD).is_file() or (folder / WORK).exists() or not (folder / "leapnav").is_dir():
+        return None
+    try:
+        record = json.loads((folder / RECORD).read_text())
+        summary = RolloutSummary(**record.pop("summary"))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{folder / RECORD}: damaged: {error!r}") from None
+    for name, value in settings.items():
+        if record.get(name) != value:
+            raise FileExistsError(
+                f"{folder}: holds a rollout whose {name} is {record.get(name)!r}, got {value!r}; choose another "
+                "folder, or replace it with force"
+            )
+    return summary
+
+
 def _prepare(folder: Path, force: bool) -> None:
     """Makes the folder, or refuses it."""
-    shutil.rmtree(folder / DONE, ignore_errors=True)
     content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if force and content and content <= {WORK, "leapnav"}:  # what a rollout makes, and nothing else
+    if force and content and content <= {WORK, DONE, RECORD, "leapnav"}:  # what a rollout makes, and nothing else
         shutil.rmtree(folder)
         content = set()
     # A dataset beside the shards was moved there just before the end of a run that was stopped.
-    ours = {WORK, "leapnav"} if WORK in content else set()
+    ours = {WORK, RECORD, "leapnav"} if WORK in content else set()
     if (folder.exists() and not folder.is_dir()) or content - ours:
         raise FileExistsError(f"{folder}: exists and is not empty; choose another folder or remove it")
     folder.mkdir(parents=True, exist_ok=True)  # before the work: an impossible place is told at once

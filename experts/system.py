@@ -210,10 +210,14 @@ def compile_flow(
     return CompiledFunction(module.flow, FLOW), CompiledFunction(module.control, CONTROL)
 
 
+def chosen_cache_directory() -> Path:
+    """Where compiled systems are to be kept: LEAPNAV_CACHE_DIR, or the user's cache."""
+    return Path(os.environ.get("LEAPNAV_CACHE_DIR") or platformdirs.user_cache_dir("leapnav", appauthor=False))
+
+
 def cache_directory() -> Path:
-    """Where compiled systems are kept: LEAPNAV_CACHE_DIR, or the user's cache; a temporary folder if that is no use."""
-    chosen = os.environ.get("LEAPNAV_CACHE_DIR") or platformdirs.user_cache_dir("leapnav", appauthor=False)
-    directory = Path(chosen)
+    """The same folder, which is made, or a new temporary one if it cannot be written."""
+    directory = chosen_cache_directory()
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -202,13 +202,22 @@ COMMANDS = {
 }
 
 
+def parse(words: list[str]) -> Any:
+    """The command that the words ask for; it has a method `run`.
+
+    Raises:
+        ValueError, FileNotFoundError: the run to resume is damaged, or there is none.
+        SystemExit: the words are no command, or ask for help.
+
+    """
+    commands = {**COMMANDS, "train": train_command(words)}
+    return tyro.extras.subcommand_cli_from_dict(commands, prog="leapnav", description=DESCRIPTION, args=words)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code; bad input is one line on standard error and exit code 2."""
-    words = sys.argv[1:] if arguments is None else arguments
     try:
-        commands = {**COMMANDS, "train": train_command(words)}
-        command = tyro.extras.subcommand_cli_from_dict(commands, prog="leapnav", description=DESCRIPTION, args=words)
-        return command.run()
+        return parse(sys.argv[1:] if arguments is None else arguments).run()
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT

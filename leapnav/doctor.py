@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -63,8 +65,8 @@ def installed_versions() -> dict[str, str]:
     """The versions of leapnav, of Python, of the machine, and of what leapnav requires."""
     found = {"leapnav": version("leapnav"), "python": sys.version.split()[0], "machine": platform.platform(terse=True)}
     for line in requires("leapnav") or ():
-        if "extra ==" not in line:
-            name = line.split(">")[0].split("[")[0].strip()
+        if "extra ==" not in line and (start := re.match(r"[\w.-]+", line)):
+            name = start[0]
             try:
                 found[name] = version(name)
             except PackageNotFoundError:
@@ -87,13 +89,14 @@ def find_an_optimum() -> str:
 def keep_compiled_code() -> str:
     """Compiled code is found again by the next process."""
     from leapnav.envs.obstacles import clearance
-    from leapnav.experts.system import cache_directory
+    from leapnav.experts.system import cache_directory, chosen_cache_directory
 
-    # Both end in a temporary folder, or in none, where nothing else can be written.
-    path = clearance.stats.cache_path
-    if not path or not Path(path).is_dir():
-        raise RuntimeError("kernels are compiled in every process; NUMBA_CACHE_DIR can say where they are kept")
-    return f"kernels in {path}, systems in {cache_directory()}"
+    kernels, systems = clearance.stats.cache_path, chosen_cache_directory()
+    if not kernels or not os.access(kernels, os.W_OK):
+        raise RuntimeError(f"{kernels}: cannot be written; set NUMBA_CACHE_DIR to where kernels can be kept")
+    if cache_directory() != systems:
+        raise RuntimeError(f"{systems}: cannot be written; set LEAPNAV_CACHE_DIR to where systems can be kept")
+    return f"kernels in {kernels}, systems in {systems}"
 
 
 def drive_it() -> str:

@@ -152,7 +152,7 @@ def test_a_rollout_does_not_depend_on_the_number_of_workers(folder, tmp_path):
 
 
 def test_nothing_is_overwritten(folder):
-    with pytest.raises(FileExistsError, match="not empty"):
+    with pytest.raises(FileExistsError, match="holds a rollout whose"):
         rollout("clutter", 1, folder, progress=False)
 
 

@@ -1,10 +1,12 @@
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from leapnav.cli import parse
 from leapnav.envs import Scenario
 
 ROOT = Path(__file__).parent.parent
@@ -14,7 +16,6 @@ BLOCKS = [
     for page in (README, (ROOT / "docs" / "banks.md").read_text())
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
 ]
-GUIDES = [path for path in sorted((ROOT / "docs" / "guides").iterdir()) if "```python" in path.read_text()]
 BANK = r"rooms-1-7 (\d+\.\d+)\n200 \1\d* \(\d+, 3\)( \(\d+, 3\))?\n"
 
 
@@ -51,11 +52,38 @@ def test_the_page_on_training_runs_as_printed(tmp_path):
     assert done.stdout == "20 True\n1\n2 True\n"
 
 
-@pytest.mark.parametrize("page", ["index.md", "tutorial.md", *(f"guides/{path.name}" for path in GUIDES)])
+NUMBER = r"\d+\.\d+(e-\d+)?"
+PRINTED = {
+    "index.md": rf"{NUMBER} {NUMBER}\nRolloutSummary\(demonstrations=100, .*\)\n(0\.9\d*|1\.0)\n",
+    "tutorial.md": rf"True {NUMBER} 0\.3106\d+\n\[5\.2072\d+, .*\]\nTrue 1\.0000\d*\n"
+    rf"RolloutSummary\(demonstrations=100, .*\)\n{NUMBER} (0\.9\d*|1\.0) (0\.9\d*|1\.0) 0\.00\d*\n(0\.9\d*|1\.0)\n",
+    "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
+    "guides/obstacles.md": rf"True {NUMBER}\nrooms-3\n",
+    "guides/robots.md": r"1\.7322 \[ 4\. +1\. +-?0\. +-0\.2402\] \[-0\.7902 -0\.2627 +0\.0862 +-?0\. *\]\n",
+}
+
+
+def test_every_page_with_code_is_run():
+    pages = [path for path in (ROOT / "docs").rglob("*.md") if "```python" in path.read_text()]
+    assert {str(path.relative_to(ROOT / "docs")) for path in pages} == {*PRINTED, "banks.md", "training.md"}
+
+
+@pytest.mark.parametrize("page", PRINTED)
 def test_the_blocks_of_a_page_run_one_after_the_other(page, tmp_path):
     code = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.DOTALL))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert re.fullmatch(PRINTED[page], done.stdout), done.stdout
+
+
+def test_every_command_that_the_pages_show_is_one():
+    shown = 0
+    for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+        text = path.read_text().replace("\\\n", " ")
+        for line in re.findall(r"^    .*?(leapnav [^`\n]*)", text, re.MULTILINE):
+            parse(shlex.split(line.rstrip(" &").replace("$seed", "0"))[1:])
+            shown += 1
+    assert shown > 30
 
 
 def test_the_site_is_built_without_a_warning(tmp_path):

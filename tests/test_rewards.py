@@ -59,7 +59,7 @@ def test_a_free_heading_is_never_off():
     assert paid(task, GradedMiss)[0] == pytest.approx(-30.0 * 0.3, rel=1e-5)
 
 
-def test_a_collision_is_paid_in_full():
+def test_a_collision_is_paid_in_full_and_as_a_miss_by_how_far_it_is():
     disc = Obstacle(circle=Circle(center=(4.0, 4.0), radius=0.5))
     task = Scenario(start=(2.0, 4.0, 0.0), goal=(6.0, 4.0, 0.0), horizon=6.0, arena=ARENA, obstacles=(disc,))
     forwards = np.array([[1.0, 0.0]], np.float32)

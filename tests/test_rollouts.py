@@ -17,7 +17,7 @@ from leapnav.cli import main
 from leapnav.envs import NavigateEnv
 from leapnav.experts import ExpertPolicy, rollouts
 from leapnav.experts.demonstrations import dataset_id, load_demonstrations
-from leapnav.experts.rollouts import DONE, SHARD, WORK, check_dataset, rollout
+from leapnav.experts.rollouts import DONE, RECORD, SHARD, WORK, check_dataset, rollout
 from leapnav.experts.shards import Shards
 
 SETTINGS = {"family": "open", "seed": 3}
@@ -43,7 +43,7 @@ def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("rollouts") / "whole"
     summary = rollout("open", 60, out, seed=3, recoveries=1, workers=2, progress=False)
     assert summary.demonstrations > 100
-    assert [path.name for path in out.iterdir()] == ["leapnav"]
+    assert {path.name for path in out.iterdir()} == {"leapnav", RECORD}
     return out
 
 
@@ -94,9 +94,11 @@ def test_stopped_just_before_the_end_it_ends(whole, tmp_path, monkeypatch):
     rollout("open", 60, out, seed=3, recoveries=1, progress=False)
     assert contents(out) == contents(whole)
     (out / DONE).mkdir()  # a run that was stopped while it tidied up
-    with pytest.raises(FileExistsError, match="not empty"):
-        rollout("open", 60, out, seed=3, recoveries=1, progress=False)
-    assert [path.name for path in out.iterdir()] == ["leapnav"]
+    before = (out / RECORD).stat().st_mtime_ns
+    again = rollout("open", 60, out, seed=3, recoveries=1, progress=False)
+    assert again.demonstrations == 120
+    assert (out / RECORD).stat().st_mtime_ns == before
+    assert {path.name for path in out.iterdir()} == {"leapnav", RECORD}
 
 
 def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
@@ -165,8 +167,15 @@ def test_other_arguments_do_not_continue_it(tmp_path, monkeypatch):
 def test_nothing_is_overwritten_without_force(tmp_path):
     out = tmp_path / "out"
     rollout("open", 2, out, progress=False)
+    for changes, message in (({"count": 3}, "count is 2, got 3"), ({"noise": 0.1}, r"noise is 0\.0, got 0\.1")):
+        with pytest.raises(FileExistsError, match=f"holds a rollout whose {message}; choose another folder"):
+            rollout(**{"family": "open", "count": 2, "out": out, "progress": False, **changes})
+    (out / RECORD).rename(tmp_path / "record")
     with pytest.raises(FileExistsError, match="not empty"):
-        rollout("open", 3, out, progress=False)
+        rollout("open", 2, out, progress=False)
+    (out / RECORD).write_text("[]")
+    with pytest.raises(ValueError, match=r"rollout\.json: damaged"):
+        rollout("open", 2, out, progress=False)
     assert rollout("open", 3, out, force=True, progress=False).demonstrations == 3
     (out / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty"):

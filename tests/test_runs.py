@@ -5,14 +5,16 @@ import subprocess
 import sys
 import time
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from leapnav.experts.rollouts import rollout
 from leapnav.training import config as configuration
-from leapnav.training import load_policy
+from leapnav.training import load_policy, shipped_policies
 from leapnav.training.actors import actor_parameters
 from leapnav.training.config import (
     ALGORITHMS,
@@ -27,7 +29,8 @@ from leapnav.training.config import (
 )
 from leapnav.training.html_report import write_report
 from leapnav.training.imitation import train_bc, train_dagger
-from leapnav.training.reinforcement import _robots, train_ppo, train_sac
+from leapnav.training.reinforcement import _robots, _start, train_ppo, train_sac
+from leapnav.training.rewards import GradedMiss
 from leapnav.training.vec_env import environment_seed
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
@@ -91,6 +94,51 @@ def test_a_folder_is_used_once_and_resumed_with_the_same_settings_only(demos, tm
     before = weights(config.out)
     train_bc(replace(config, resume=True), progress=False)  # there is nothing left to do
     assert weights(config.out) == before
+
+
+def test_what_is_finished_is_not_trained_again(tmp_path):
+    config = ppo(tmp_path / "run")
+    train_ppo(config, progress=False)
+    before, evaluated = weights(config.out), lines(config.out)
+    events = sorted((config.out / "tensorboard").iterdir())
+    progress = json.loads((config.out / "checkpoint" / "manifest.json").read_text())["progress"]
+    assert progress["step"] == config.total_timesteps
+    train_ppo(replace(config, resume=True), progress=False)
+    assert weights(config.out) == before
+    assert [line["step"] for line in lines(config.out)] == [line["step"] for line in evaluated]
+    assert len(events) == 1
+
+
+def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):
+    config = ppo(tmp_path / "run", total_timesteps=256)
+    train_ppo(config, progress=False)
+    record = json.loads((config.out / "config.json").read_text())
+    del record["config"]["graded_miss"]
+    (config.out / "config.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match="a run of another version of leapnav, without graded_miss"):
+        train_ppo(replace(config, resume=True), progress=False)
+
+
+@pytest.mark.parametrize("name", shipped_policies())
+def test_a_policy_that_ships_starts_a_run_with_the_defaults(name, tmp_path):
+    config = PPOConfig.tuned(name, out=tmp_path, warm_start=(Path(name),))
+    demos, start = _start(config)
+    assert demos == []
+    assert start.observation_space == _robots(config).observation_space
+
+
+def test_misses_are_graded_from_scratch_and_not_from_a_warm_start(tmp_path):
+    for config, graded in (
+        (PPOConfig.tuned("open", out=tmp_path), True),
+        (SACConfig.tuned("open", out=tmp_path), True),
+        (PPOConfig.tuned("open", out=tmp_path, warm_start=(Path("open"),)), False),
+        (SACConfig.tuned("open", warm=True), False),
+        (replace(PPOConfig.tuned("open", out=tmp_path), graded_miss=False), False),
+    ):
+        venv, found = _robots(config), False
+        while isinstance(venv, VecEnvWrapper):
+            venv, found = venv.venv, found or isinstance(venv, GradedMiss)
+        assert found == graded
 
 
 def test_a_damaged_checkpoint_is_refused(tmp_path):

@@ -103,7 +103,7 @@ class RunConfig:
     """Widths of the actor's and the critic's hidden layers."""
     lidar_beams: int = 128
     """Beams of the robot's lidar. Demonstrations were seen with those of the environment's defaults, and are seen anew
-    with these: with 32 many a gap looks wide enough that is not."""
+    with these: with 32 many a gap looks wide enough that is not. A policy to start from must have as many."""
     evaluation_scenarios: int = 100
     """Scenarios of each family's test split that an evaluation on the way plays; the last one plays all."""
 
@@ -113,15 +113,17 @@ class RunConfig:
         return {"lidar_beams": self.lidar_beams}
 
     @classmethod
-    def tuned(cls, family: str, *, warm: bool = False, **changes: Any) -> Self:
+    def tuned(cls, family: str, *, warm: bool | None = None, **changes: Any) -> Self:
         """The settings that were tuned for a family, from the file `defaults.toml`, with changes.
 
         Args:
             family: one of the families, or "all".
-            warm: whether those for a warm start.
+            warm: whether those for a warm start; None: if `changes` have a `warm_start`.
             changes: of any settings.
 
         """
+        if warm is None:
+            warm = bool(changes.get("warm_start"))
         config = cls(out=Path(), family=family)
         for section in ("RunConfig", cls.__name__, f"{cls.__name__}-warm")[: 3 if warm else 2]:
             table = _DEFAULTS.get(section, {})
@@ -190,7 +192,7 @@ class _LearnerConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig(_LearnerConfig):
-    """Proximal policy optimisation, from scratch or from a warm start."""
+    """Proximal policy optimisation. These are the settings from scratch; `tuned` knows those of a warm start."""
 
     total_timesteps: int = 5_000_000
     """Control periods of all robots together."""
@@ -205,8 +207,8 @@ class PPOConfig(_LearnerConfig):
     """s between actions while it learns: with fewer decisions in an episode each matters more. What it learns is
     evaluated with the environment's own."""
     penalty: float = 50.0
-    """Of a collision and of a miss while it learns. A warm start's defaults have less than the environment's own: most
-    episodes succeed then, and the noise of a high penalty would drown the cost."""
+    """Of a collision, which is a miss too, and of a miss while it learns. The defaults of most warm starts have less
+    than the environment's own: most episodes succeed then, and the noise of a high penalty would drown the cost."""
     reward: Literal["cost", "shaped"] = "shaped"
     """Reward of the environment; "shaped" tells on the way how near the goal is."""
     n_steps: int = 64

@@ -138,6 +138,7 @@ def _train(
     remaining = config.total_timesteps - model.num_timesteps
     if remaining > 0:
         model.learn(remaining, callback=callback, reset_num_timesteps=found is None)
+        callback.keep()
     callback.bar.close()
     if isinstance(config, PPOConfig) and config.last_std > 0:
         set_noise(model.policy, th.full((2,), config.last_std))
@@ -264,8 +265,7 @@ class _Keeper(BaseCallback):
             self._run.save_policy(self.model.policy)
             self._evaluated = step
         if step // config.checkpoint_every > self._kept // config.checkpoint_every:
-            self._kept = step
-            self._run.save_checkpoint(self._write, {"step": step, "evaluated": self._evaluated})
+            self.keep()
         done = step / config.total_timesteps
         if isinstance(config, PPOConfig) and isinstance(self.model.policy, AnchoredPolicy):
             policy = self.model.policy
@@ -279,6 +279,11 @@ class _Keeper(BaseCallback):
         for part in _parts(self._venv):
             if isinstance(part, JumpStart):
                 part.share = _fading(config.jump_start, config.jump_start_until, done)
+
+    def keep(self) -> None:
+        """Replaces the checkpoint."""
+        self._kept = self.model.num_timesteps
+        self._run.save_checkpoint(self._write, {"step": self._kept, "evaluated": self._evaluated})
 
     def _write(self, folder: Path) -> None:
         self.model.save(folder / "model.zip", exclude=["replay_buffer_kwargs"])

@@ -41,7 +41,8 @@ class GradedMiss(VecEnvWrapper):
     """Lets a miss cost the more the farther it is from the goal's pose, and no more than the environment's penalty.
 
     Until a learner has met the goal by chance, a penalty that is the same for all misses does not say where it is, and
-    the cost says that standing still is best. What a success returns stays what it was: -J.
+    the cost says that standing still is best. What a success returns stays what it was: -J. A touch, which ends the
+    episode, is a miss too, and costs its own penalty in full.
 
     Args:
         venv: robots whose observations begin with the part `goal`, as those of `leapnav/Navigate-v0` do.

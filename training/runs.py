@@ -96,6 +96,11 @@ class Run:
             found: dict[str, Any] = json.loads(record.read_text())["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{record}: not a run's configuration: {error!r}") from None
+        missing = sorted(set(self._plain) - set(found))
+        if missing:
+            raise ValueError(
+                f"{record}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed"
+            )
         for name in sorted({*found, *self._plain} - set(FREE)):
             if found.get(name) != self._plain.get(name):
                 raise ValueError(
