@@ -34,8 +34,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 def _help(found: re.Match[str]) -> str:
     command = [sys.executable, "-m", "leapnav", *found[1].split(), "--help"]
     environment = {**os.environ, "COLUMNS": _WIDTH, "NO_COLOR": "1"}
-    text = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-    return f"```text\n{text.strip()}\n```"
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode != 0:
+        raise RuntimeError(f"{found[0]}: {done.stderr}")
+    return f"```text\n{done.stdout.strip()}\n```"
 
 
 def on_page_content(html: str, **_: Any) -> str:
