@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
+from leapnav.envs.maps import check_discs, disc_arena, read_movingai, rectangles
 from leapnav.envs.obstacles import clearance, pack_field
 
 # Squares of larger numbers, in metres or seconds, would leave nothing of a double's precision for the robot.
@@ -237,6 +239,78 @@ class Scenario(_Frozen):
         except (ValueError, RecursionError) as error:  # syntax, encoding, a number of thousands of digits, nesting
             raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
         return cls.from_dict(fields)
+
+    @classmethod
+    def from_discs(
+        cls,
+        discs: Any,
+        *,
+        start: tuple[float, float, float],
+        goal: tuple[float, float, float | None],
+        horizon: float,
+        arena: tuple[float, float, float, float] | None = None,
+        **fields: Any,
+    ) -> Scenario:
+        """A scenario among discs, as worlds of cylinders are often given.
+
+        Args:
+            discs (n, 3): x, y and radius of each (m).
+            start, goal, horizon: see the class.
+            arena: None is the smallest one with 1 m of room round the discs, the start and the goal.
+            fields: name, robot and cost, see the class.
+
+        Raises:
+            ScenarioError: see the class.
+            ValueError: the discs are none; the message names the first that is not.
+
+        """
+        array = check_discs(discs)
+        obstacles = tuple(Obstacle(circle=Circle(center=(x, y), radius=radius)) for x, y, radius in array.tolist())
+        arena = arena or disc_arena(array, (start[:2], goal[:2]))
+        return cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=obstacles, **fields)
+
+    @classmethod
+    def from_movingai(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        start: tuple[float, float, float],
+        goal: tuple[float, float, float | None],
+        horizon: float,
+        cell_size: float = 1.0,
+        **fields: Any,
+    ) -> Scenario:
+        """A scenario on a grid map of the Moving AI Lab, its blocked cells merged into few rectangles.
+
+        The arena's lower left corner is (0, 0): the cell in column c of line l, counted from the top and from 0, is
+        c to c + 1 cells from the left and height - 1 - l to height - l from below. Of the blocked cells only those
+        that touch a free one are obstacles; what lies behind cannot be reached.
+
+        Args:
+            path: of the map (`.map`).
+            start, goal, horizon: see the class, in metres and seconds.
+            cell_size: side of a cell (m).
+            fields: name (the file's, if not given), robot and cost, see the class.
+
+        Raises:
+            OSError: the file cannot be read.
+            ScenarioError: see the class.
+            ValueError: it is no such map, or the size is impossible.
+
+        """
+        if not (math.isfinite(cell_size) and cell_size > 0):
+            raise ValueError(f"cell_size: expected a positive number of metres, got {cell_size!r}")
+        blocked = read_movingai(path)
+        height, width = blocked.shape
+        obstacles = []
+        for top, left, bottom, right in rectangles(blocked):
+            low, high = cell_size * (height - bottom), cell_size * (height - top)
+            near, far = cell_size * left, cell_size * right
+            vertices = ((near, low), (far, low), (far, high), (near, high))
+            obstacles.append(Obstacle(polygon=Polygon(vertices=vertices)))
+        fields.setdefault("name", Path(path).stem)
+        arena = (0.0, 0.0, cell_size * width, cell_size * height)
+        return cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=tuple(obstacles), **fields)
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

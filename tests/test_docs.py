@@ -58,7 +58,7 @@ PRINTED = {
     "tutorial.md": rf"True {NUMBER} 0\.3106\d+\n\[5\.2072\d+, .*\]\nTrue 1\.0000\d*\n"
     rf"RolloutSummary\(demonstrations=100, .*\)\n{NUMBER} (0\.9\d*|1\.0) (0\.9\d*|1\.0) 0\.00\d*\n(0\.9\d*|1\.0)\n",
     "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
-    "guides/obstacles.md": rf"True {NUMBER}\nrooms-3\n",
+    "guides/obstacles.md": rf"True {NUMBER}\n8 4 True\nrooms-3\n",
     "guides/robots.md": r"1\.7322 \[ 4\. +1\. +-?0\. +-0\.2402\] \[-0\.7902 -0\.2627 +0\.0862 +-?0\. *\]\n",
 }
 
