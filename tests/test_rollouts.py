@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from unittest import mock
 
 import h5py
 import numpy as np
@@ -191,6 +192,7 @@ def test_two_processes_do_not_share_a_rollout(tmp_path):
     Shards(tmp_path / WORK, SETTINGS).close()
 
 
+@mock.patch.dict(os.environ)  # Dask leaves OMP_NUM_THREADS=1 there, and processes started later compute other last bits
 def test_a_dask_cluster_that_loses_a_worker_makes_the_same_dataset(whole, tmp_path):
     from dask.distributed import Client, LocalCluster
 
