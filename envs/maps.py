@@ -109,10 +109,10 @@ def rectangles(blocked: np.ndarray) -> list[tuple[int, int, int, int]]:
 
 def _grown(blocked: np.ndarray, line: int, column: int) -> tuple[int, int, int, int]:
     """The rectangle of blocked cells that is as wide as can be at a cell, and then as tall as can be."""
-    row = blocked[line]
+    row: np.ndarray = blocked[line]
     left = column - int(np.argmin(row[column::-1])) + 1 if not row[: column + 1].all() else 0
     right = column + int(np.argmin(row[column:])) if not row[column:].all() else len(row)
-    whole = blocked[:, left:right].all(axis=1)
+    whole: np.ndarray = np.all(blocked[:, left:right], axis=1)
     top = line - int(np.argmin(whole[line::-1])) + 1 if not whole[: line + 1].all() else 0
     bottom = line + int(np.argmin(whole[line:])) if not whole[line:].all() else len(whole)
     return top, left, bottom, right
