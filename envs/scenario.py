@@ -283,8 +283,8 @@ class Scenario(_Frozen):
         """A scenario on a grid map of the Moving AI Lab, its blocked cells merged into few rectangles.
 
         The arena's lower left corner is (0, 0): the cell in column c of line l, counted from the top and from 0, is
-        c to c + 1 cells from the left and height - 1 - l to height - l from below. Of the blocked cells only those
-        that touch a free one are obstacles; what lies behind cannot be reached.
+        c to c + 1 cells from the left and height - 1 - l to height - l from below. Blocked cells that touch no free
+        one may be left out: what lies there cannot be reached.
 
         Args:
             path: of the map (`.map`).
@@ -302,15 +302,22 @@ class Scenario(_Frozen):
             raise ValueError(f"cell_size: expected a positive number of metres, got {cell_size!r}")
         blocked = read_movingai(path)
         height, width = blocked.shape
+        fields.setdefault("name", Path(path).stem)
         obstacles = []
         for top, left, bottom, right in rectangles(blocked):
             low, high = cell_size * (height - bottom), cell_size * (height - top)
             near, far = cell_size * left, cell_size * right
             vertices = ((near, low), (far, low), (far, high), (near, high))
             obstacles.append(Obstacle(polygon=Polygon(vertices=vertices)))
-        fields.setdefault("name", Path(path).stem)
         arena = (0.0, 0.0, cell_size * width, cell_size * height)
-        return cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=tuple(obstacles), **fields)
+        scenario = cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=tuple(obstacles), **fields)
+        # Of what obstacles there are the class has told already.
+        for name, (x, y, _) in (("start", scenario.start), ("goal", scenario.goal)):
+            if blocked[height - 1 - int(y / cell_size), int(x / cell_size)]:
+                raise ScenarioError(
+                    f"Scenario {scenario.name!r}: {name}: ({x:g}, {y:g}) is in a blocked cell of {path}"
+                )
+        return scenario
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -72,6 +72,16 @@ def test_a_scenario_on_a_map_is_solved_through_its_door(rooms):
 def test_a_pose_in_a_blocked_cell_is_refused(rooms):
     with pytest.raises(ScenarioError, match=r"goal: \(4\.5, 5\.5\) is inside obstacles"):
         Scenario.from_movingai(rooms, **{**POSES, "goal": (4.5, 5.5, 0.0)})
+    with pytest.raises(ScenarioError, match=r"start: \(1\.1, 5\.5\) is inside obstacles"):  # its rim is
+        Scenario.from_movingai(rooms, **{**POSES, "start": (1.1, 5.5, 0.0)})
+    with pytest.raises(ScenarioError, match=r"start: \(-1, 5\.5\) is inside the arena wall"):
+        Scenario.from_movingai(rooms, **{**POSES, "start": (-1.0, 5.5, 0.0)})
+    with pytest.raises(ScenarioError, match=r"start\[0\]: input should be a finite number, got nan"):
+        Scenario.from_movingai(rooms, **{**POSES, "start": (float("nan"), 5.5, 0.0)})
+    # Deep in a wall there is no obstacle: nothing can get there, and nothing may begin there.
+    rooms.write_text("type octile\nheight 5\nwidth 5\nmap\n@.@.@\n@@@.@\n.@@@@\n@.@@@\n@.@@@\n")
+    with pytest.raises(ScenarioError, match=r"'rooms': start: \(3\.5, 1\.5\) is in a blocked cell of .*rooms\.map"):
+        Scenario.from_movingai(rooms, start=(3.5, 1.5, 0.0), goal=(3.5, 3.5, 0.0), horizon=9.0)
     with pytest.raises(ValueError, match="cell_size: expected a positive number of metres, got 0"):
         Scenario.from_movingai(rooms, cell_size=0, **POSES)
 
