@@ -10,8 +10,9 @@ SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py 
 demo: .venv/installed
 	$(BIN)/leapnav demo
 
+# A process for each core: torch's threads would only be in each other's way.
 test: lint types
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
 lint: .venv/installed
 	$(BIN)/ruff check .
