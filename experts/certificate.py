@@ -41,6 +41,7 @@ from leapnav.experts.problem import OptimalControlProblem
 # Tighter than any solver's own integration, and about what double precision allows.
 ACCURACY = 1e-12
 FAILED_ACCURACY = 1e-9
+FEWEST_ROWS, ROWS_PER_SEGMENT = 512, 24  # room for the steps of an extremal; where it is short, four times as much
 MOST_ROWS = 100_000  # steps of an extremal; one that needs more has diverged
 
 
@@ -193,7 +194,7 @@ def certify(
     times, nodes = np.ascontiguousarray(times, dtype=float), np.ascontiguousarray(nodes, dtype=float)
     # A path that did not converge is only looked at.
     accuracy = ACCURACY if converged is Status.SUCCESS else FAILED_ACCURACY
-    rows = 512
+    rows = max(FEWEST_ROWS, ROWS_PER_SEGMENT * len(times))
     sensitivity = np.empty((2 * n, n))
     while True:
         out, terms = np.empty((rows, 4 + m + 4 * n)), np.empty((rows, DENSE_TERMS, 2 * n + 1))

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import cast
 
 import numpy as np
-from numba import float64, njit
+from numba import float64, int64, njit, types
 from scipy.optimize import brentq, minimize_scalar
 
 from leapnav.experts.extremal import Extremal
-from leapnav.experts.integrator import matrix, propagate
+from leapnav.experts.integrator import FLOW, constant, cube, matrix, propagate, vector
 
 ROUGH_ACCURACY = 1e-6
 # A determinant that touches zero dips to this share of its size before, and the parabola through the points around goes
@@ -121,7 +121,7 @@ def _touch(
     for i in _dips(times, determinants, likely):
         low, high = sorted((float(times[i - 1]), float(times[i + 1])))
         found = minimize_scalar(
-            lambda t: np.linalg.svd(frame(t)[: frame(t).shape[1]], compute_uv=False)[-1],
+            lambda t: _smallest_singular_value(frame(t)),
             bounds=(low, high),
             method="bounded",
             options={"xatol": 1e-9 * (high - low)},
@@ -129,6 +129,52 @@ def _touch(
         if found.fun < TOUCHED:
             return float(found.x)
     return None
+
+
+def _smallest_singular_value(frame: np.ndarray) -> float:
+    """Of the upper block of a frame (2n, n)."""
+    return float(np.linalg.svd(frame[: frame.shape[1]], compute_uv=False)[-1])
+
+
+@njit(types.none(matrix, matrix), cache=True, error_model="numpy", nogil=True)
+def _pull_back(S, basis):
+    """Turns basis (2n, n) into S^-1 basis for a symplectic S (2n, 2n), whose inverse is [[D', -B'], [-C', A']]."""
+    size, n = basis.shape
+    pulled = np.zeros((size, n))
+    for i in range(n):
+        for r in range(n):
+            for j in range(n):
+                pulled[i, j] += S[n + r, n + i] * basis[r, j] - S[r, n + i] * basis[n + r, j]
+                pulled[n + i, j] += S[r, i] * basis[n + r, j] - S[n + r, i] * basis[r, j]
+    basis[:] = pulled
+
+
+@njit(int64(FLOW, vector, matrix, constant, constant, cube, vector), cache=True, error_model="numpy", nogil=True)
+def _carry_back(flow, times, z, data, field, frames, determinants):
+    """Carries frames[0] (2n, n), at the last of the times, back to the others; the step of a change of sign, or -1.
+
+    Fills `frames` (N, 2n, n), orthonormal, and `determinants` (N,) of their upper blocks, in the order of falling
+    times, up to the step in which the determinant changes its sign.
+    """
+    last = len(times) - 1
+    size = z.shape[1]
+    sign = 0.0
+    S = np.empty((size, size))
+    for k in range(last):
+        early = last - k - 1
+        state = z[early].copy()
+        S[:] = 0.0
+        for i in range(size):
+            S[i, i] = 1.0
+        propagate(flow, state, S, times[early + 1] - times[early], data, field, ROUGH_ACCURACY, 0.0, False)
+        frames[k + 1] = frames[k]
+        _pull_back(S, frames[k + 1])
+        determinants[k + 1] = orthonormalise(frames[k + 1])
+        if abs(determinants[k + 1]) > NO_RANK:
+            if sign * determinants[k + 1] < 0.0:
+                return k
+            sign = math.copysign(1.0, determinants[k + 1])
+    return -1
 
 
 def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
@@ -139,40 +185,31 @@ def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
     with one before its horizon is no local minimum.
     """
     arrays, n = extremal.problem.arrays, extremal.problem.system.n
-    symplectic = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
-    times = extremal.times[::-1]
-    frames = [np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])]
+    times, count = extremal.times[::-1], len(extremal.times)
+    frames, determinants = np.empty((count, 2 * n, n)), np.zeros(count)
+    frames[0] = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
+    z = np.concatenate([extremal.states, extremal.costates], axis=1)
+    step = _carry_back(arrays.flow, extremal.times, z, arrays.data, arrays.field, frames, determinants)
 
-    def back(k: int, time: float) -> np.ndarray:
-        """The frame at a time up to a step before times[k], orthonormal."""
-        duration = float(times[k]) - time
-        basis = np.ascontiguousarray(frames[k])
+    def back(k: int, time: float) -> tuple[np.ndarray, float]:
+        """The frame at a time up to a step before times[k], orthonormal, and its determinant."""
+        duration, basis = float(times[k]) - time, frames[k].copy()
         if duration > 0.0:
             z, S = extremal.interpolate(np.array([time]))[0], np.eye(2 * n)
             propagate(arrays.flow, z, S, duration, arrays.data, arrays.field, ROUGH_ACCURACY, 0.0, False)
-            # The inverse of a symplectic matrix.
-            basis = np.ascontiguousarray(-symplectic @ S.T @ symplectic @ basis)
-        return basis
+            _pull_back(S, basis)
+        return basis, orthonormalise(basis)
 
-    determinants = [0.0]
-    sign, crossing = 0.0, None
-    for k in range(len(times) - 1):
-        frames.append(back(k, float(times[k + 1])))
-        determinants.append(orthonormalise(frames[-1]))
-        if abs(determinants[-1]) > NO_RANK:
-            if sign * determinants[-1] < 0:
-                step = float(times[k] - times[k + 1])
-                crossing = float(times[k]) - _zero(lambda d, k=k: orthonormalise(back(k, float(times[k]) - d)), step)
-                break
-            sign = math.copysign(1.0, determinants[-1])
+    crossing = None
+    if step >= 0:
+        determinants = determinants[: step + 2]
+        start = float(times[step])
+        crossing = start - _zero(lambda d: back(step, start - d)[1], start - float(times[step + 1]))
 
     def frame(time: float) -> np.ndarray:
-        k = max(int(np.searchsorted(-times, -time, side="left")) - 1, 0)
-        basis = back(k, time)
-        orthonormalise(basis)
-        return basis
+        return back(max(int(np.searchsorted(-times, -time, side="left")) - 1, 0), time)[0]
 
-    touch = _touch(times, np.array(determinants), frame, likely=False)
+    touch = _touch(times, determinants, frame, likely=False)
     return max((t for t in (touch, crossing) if t is not None), default=None)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numba import boolean, float64, int64, njit, types
@@ -23,6 +24,7 @@ SUBPROBLEM_ITERATIONS = 12
 LONG_ACCURACY = 1e-13  # of the integrator, for arcs over which errors grow
 EDGE = 0.05  # of a sub-problem's duration, within which its node stays
 CLOSED = 5e-10  # larger jumps of the states between arcs call for a better integrator
+LOOKED_AT = 1e-10  # accuracy of arcs that are drawn: errors grow along long ones, which still should look connected
 STEERING_INTERVALS, STEERING_STARTS = 16, 6
 
 
@@ -453,3 +455,30 @@ def merge(flow, times, Z, goal, free, data, field, tolerance, accuracy, costs, k
             rejected[i] = True
             i += 1
     return work
+
+
+def dense_path(
+    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, points: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (K,) and states (K, n) along a sweep's path, at least so many points.
+
+    Args:
+        problem: that was solved.
+        times: (p + 1,), see `Iteration`.
+        nodes: (p + 1, 2n).
+        points: of the path, K or fewer.
+
+    """
+    arrays, n = problem.arrays, problem.system.n
+    none = np.empty((2 * n, 0))
+    steps = math.ceil(points / (len(times) - 1))
+    dense = np.concatenate([np.linspace(a, b, steps + 1) for a, b in pairwise(times)])
+    states = np.empty((len(dense), n))
+    for k in range(len(times) - 1):
+        z, at = nodes[k].copy(), k * (steps + 1)
+        states[at] = z[:n]
+        for j in range(at + 1, at + steps + 1):
+            step = dense[j] - dense[j - 1]
+            propagate(arrays.flow, z, none, step, arrays.data, arrays.field, LOOKED_AT, 0.0, False)
+            states[j] = z[:n]
+    return dense, states

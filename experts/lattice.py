@@ -11,7 +11,8 @@ the path through it is locally shortest; the cheapest such paths that are distin
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,6 +58,16 @@ class Candidate:
     times: np.ndarray
     poses: np.ndarray
     cost: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the robot does not get through (m), the clearance (m) of a path there, and whether to keep well clear."""
+
+    x: float
+    y: float
+    clearance: float
+    wide: bool = False
 
 
 class Tree(NamedTuple):
@@ -127,6 +138,27 @@ class Lattice:
         self.phi = phi
         self.energy = 0.0
         self._found: Found | None = None
+
+    def without(self, places: Sequence[Place]) -> Lattice:
+        """The same with some places shut to it, about as far around as a gap that is only tolerated is wide."""
+        if not places:
+            return self
+        lattice = copy(self)
+        lattice.phi, lattice._found = self.phi.copy(), None
+        spacing = self.cell / 2
+        ends = np.array([self.scenario.start[:2], self.scenario.goal[:2]])
+        x, y = (self.origin[axis] + spacing * np.arange(count) for axis, count in enumerate(self.phi.shape))
+        for place in places:
+            radius = TOLERATED_DEPTH * self.scenario.robot.radius + spacing
+            if place.wide:  # the middle of a gap next to it is farther away than this
+                radius = max(radius, 2.0 * self.scenario.robot.radius)
+            if np.hypot(*(ends - (place.x, place.y)).T).min() <= radius + 2 * self.cell:
+                continue  # there every path leads
+            columns, lines = np.abs(x - place.x) <= radius, np.abs(y - place.y) <= radius
+            near = np.hypot(x[columns, None] - place.x, y[lines] - place.y) <= radius
+            shut = np.ix_(columns, lines)
+            lattice.phi[shut] = np.where(near, np.inf, lattice.phi[shut])
+        return lattice
 
     @property
     def slack(self) -> float:

@@ -15,14 +15,14 @@ from leapnav.envs.scenario import Scenario
 from leapnav.experts.certificate import certify, failure
 from leapnav.experts.direct import DirectPath, discretise, optimise
 from leapnav.experts.extremal import Extremal, Status
-from leapnav.experts.lattice import TOLERATED_DEPTH, Lattice, is_connected
+from leapnav.experts.lattice import TOLERATED_DEPTH, Lattice, Place, is_connected
 from leapnav.experts.multiple_shooting import confirm, polish
 from leapnav.experts.nodes import Settings
 from leapnav.experts.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.problem import OptimalControlProblem, Path
 
 TOLERANCE = 1e-9
-NEWTON_ITERATIONS = 25
+NEWTON_ITERATIONS, FIRST_ITERATIONS = 25, 14  # the first tries are on paths that can be refined
 # Intervals of the refined direct path per segment of multiple shooting, and from how many refinements it is tried.
 INTERVALS_PER_SEGMENT, FEWEST_SEGMENTS = 8, 8
 REFINEMENTS = 3
@@ -41,6 +41,8 @@ SHORT = 4.0  # m between start and goal; where it is less, paths nearer to each 
 DIRECT_ERROR = 0.01
 # How deep, in robot radii, an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
 SLIGHT = TOLERATED_DEPTH
+# A path is in vain if it is this share as deep in an obstacle as one before it, so many robot radii from there at most.
+AS_DEEP, SAME_PLACE = 0.5, 0.5
 MOST_WASTED = 1_000_000  # evaluations of the flow by Newton's method in vain, on the paths of one lattice
 CLOSED = 1e-3  # sum of the violations of a direct path's constraints
 COMPARED = np.linspace(0.0, 1.0, 65)
@@ -125,12 +127,12 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     search = Search(scenario, problem)
     shortest_time, cropped = np.inf, False
     for refinement, margin, whole in LATTICES[: None if thorough else 1]:
-        lattice = Lattice(scenario, refinement, margin, whole=whole)
+        lattice = Lattice(scenario, refinement, margin, whole=whole).without(search.shut)
         if whole and (search.certified or not cropped):
             break
         cropped = cropped or lattice.cropped
         paths = lattice.candidates()
-        first, search.wasted = None, 0
+        first, search.wasted, shut = None, 0, search.shut.copy()
         for _ in range(MOST_ROUNDS):
             batch = list(islice(paths, candidates))
             if not batch:
@@ -144,6 +146,10 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
             if search.certified and margin is None and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
                 search.add(Path(c.times, c.poses) for c in islice(lattice.elsewhere(), ELSEWHERE))
                 return search.result()
+            if search.shut != shut:  # many combinations of detours elsewhere would lead through the same gap
+                shut = search.shut.copy()
+                lattice = lattice.without(search.shut)
+                paths, first = lattice.candidates(), None
         # Looked at when it is in doubt: lattice paths may lead through gaps that are a little too narrow.
         if thorough and not search.certified and not is_connected(scenario):
             return as_optimum(failure(problem, Status.NO_PATH))
@@ -171,6 +177,9 @@ class Search:
         # The same, of what cuts deep into obstacles.
         self._deep: list[tuple[float, OptimalControlProblem, DirectPath]] = []
         self.wasted = 0
+        self._near = SAME_PLACE * scenario.robot.radius
+        # Where paths that came to nothing cut deepest into obstacles.
+        self.shut: list[Place] = []
 
     @property
     def best(self) -> Extremal:
@@ -190,11 +199,15 @@ class Search:
         """Takes a solution of the discretised problem to an extremal, unless that is known or of no interest."""
         best = self.best.cost if self.certified else np.inf
         if self._known(direct):
+            self._widen(direct)
             return
-        clearance = clearances(direct.states, self.scenario.field).min()
-        if direct.cost > (1 + DIRECT_ERROR) * best and clearance <= 0:
+        depths = clearances(direct.states, self.scenario.field)
+        if direct.cost > (1 + DIRECT_ERROR) * best and depths.min() <= 0:
             return
-        if clearance < -2.0 * self.slight:  # neither it nor a path near it is of any use
+        if self._in_vain(direct, depths):
+            return
+        if depths.min() < -2.0 * self.slight:  # neither it nor a path near it is of any use
+            self._shut(direct, depths)
             self._deep.append((direct.cost, problem, direct))
             return
         # Where the cost is flat, paths to the same optimum are told from others by their refinement only.
@@ -202,31 +215,85 @@ class Search:
         known = self._known(refined)
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if known:
+            self._widen(refined)
             return
         # Seen at twice as many points, a path may cut through a wall after all.
-        clearance = clearances(refined.states, self.scenario.field).min()
-        if clearance < -2.0 * self.slight:
+        depths = clearances(refined.states, self.scenario.field)
+        if self._in_vain(refined, depths):
+            return
+        if depths.min() < -2.0 * self.slight:
+            self._shut(refined, depths)
             self._deep.append((direct.cost, problem, direct))
             return
         # Where the limits hardly leave a way, direct paths may not close their gaps, but Newton sometimes does.
         closed = refined.gap < CLOSED
         trying = self.wasted < MOST_WASTED and (closed or not self.certified)
-        extremal, work = _extremal(problem, refined) if trying else (None, 0)
+        extremal, work = self._extremal(problem, refined, depths.min() >= 0.0) if trying else (None, 0)
         if extremal is None:
             self.wasted += work
-            likely = closed and clearance >= -self.slight
+            likely = closed and depths.min() >= -self.slight
             self._stalled.append((refined.cost if likely else np.inf, problem, refined))
-            return
-        if any(_same(extremal, other) for other in (*self.certified, *self.refused)):
-            return
-        if extremal.success:
-            self.certified.append(extremal)
-        else:
-            self.refused.append(extremal)
+            self._shut(refined, depths)
+        elif not any(_same(extremal, other) for other in (*self.certified, *self.refused)):
+            self._seen.append(_shape(extremal.times, extremal.states))
+            (self.certified if extremal.success else self.refused).append(extremal)
+            if extremal.status is Status.COLLISION:
+                self._shut(refined, depths)
+
+    def _extremal(
+        self, problem: OptimalControlProblem, direct: DirectPath, clear: bool = True
+    ) -> tuple[Extremal | None, int]:
+        """Multiple shooting from a direct path, which is refined further as long as that fails, and its evaluations."""
+        history, work = (), 0
+        last = REFINEMENTS if clear else REFINEMENTS - 1  # what collides is worth less effort
+        for refinement in range(last):
+            if refinement > 0:
+                direct = optimise(problem, direct.refined())
+                for extremal in (*self.certified, *self.refused):
+                    if self._alike(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
+                        return extremal, work
+            iterations = NEWTON_ITERATIONS if refinement == last - 1 else FIRST_ITERATIONS
+            intervals = len(direct.controls)
+            segments = max(round(intervals / (INTERVALS_PER_SEGMENT * 2**refinement)), FEWEST_SEGMENTS) * 2**refinement
+            at = np.rint(np.linspace(0, intervals, segments + 1)).astype(int)
+            times, nodes = direct.times[at], np.concatenate([direct.states[at], direct.costates[at]], axis=1)
+            arrays = problem.arrays
+            nodes[-1, :3] = np.where(arrays.free, nodes[-1, :3], arrays.goal)
+            status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, iterations)
+            history += rows
+            work += evaluations
+            if status is Status.SUCCESS:
+                settings = Settings(TOLERANCE, iterations)
+                return confirm(problem, times, nodes, status, history, work, settings), work
+        return None, work
+
+    def _shut(self, path: DirectPath, depths: np.ndarray) -> None:
+        """Shuts the place where a path cuts deepest into an obstacle, if it does."""
+        if depths.min() < 0.0:
+            x, y, _ = path.states[int(depths.argmin())].tolist()
+            if all(math.hypot(x - place.x, y - place.y) > 0.5 * self._near for place in self.shut):
+                self.shut.append(Place(x, y, float(depths.min())))
+
+    def _in_vain(self, path: DirectPath, depths: np.ndarray) -> bool:
+        """Whether a path cuts into an obstacle where one that was looked at does: what is near is alike."""
+        in_vain = any((depths[self._at(path, place)] <= AS_DEEP * place.clearance).any() for place in self.shut)
+        if in_vain:
+            self._widen(path)
+        return in_vain
+
+    def _widen(self, path: DirectPath) -> None:
+        """Shuts more around the places to which a path came back from where the lattice was led around them."""
+        self.shut = [replace(place, wide=place.wide or bool(self._at(path, place).any())) for place in self.shut]
+
+    def _at(self, path: DirectPath, place: Place) -> np.ndarray:
+        return np.hypot(path.states[:, 0] - place.x, path.states[:, 1] - place.y) < self._near
 
     def _known(self, direct: DirectPath) -> bool:
         shape = _shape(direct.times, direct.states)
-        return any(np.abs(shape - other).max() < self._same_path for other in self._seen)
+        return any(self._alike(shape, other) for other in self._seen)
+
+    def _alike(self, shape: np.ndarray, other: np.ndarray) -> bool:
+        return bool(np.abs(shape - other).max() < self._same_path)
 
     def result(self) -> Optimum:
         """The best extremal with the others, or, if none is certified, the cheapest that was refused or stalled."""
@@ -234,7 +301,7 @@ class Search:
             if self.refused:
                 return as_optimum(min(self.refused, key=lambda extremal: extremal.cost))
             _, problem, direct = min(self._deep or self._stalled, key=lambda entry: entry[0])
-            extremal = _extremal(problem, optimise(problem, direct.refined()))[0] if self._deep else None
+            extremal = self._extremal(problem, optimise(problem, direct.refined()))[0] if self._deep else None
             return as_optimum(extremal or _stalled(problem, direct))
         best, *others = sorted(self.certified, key=lambda extremal: extremal.cost)
         alternatives = tuple(map(as_optimum, others))
@@ -243,8 +310,8 @@ class Search:
     def doubts(self, cost: float) -> tuple[Extremal, ...]:
         """Solutions found that are cheaper than `cost` and not certified; see `Optimum`."""
         refused = [extremal for extremal in self.refused if extremal.cost < cost and self._is_slight(extremal)]
-        cheaper = [entry[1:] for entry in self._stalled if entry[0] < cost * (1 - DIRECT_ERROR)]
-        return (*refused, *(_stalled(*entry) for entry in cheaper))
+        cheaper = [_stalled(*entry[1:]) for entry in self._stalled if entry[0] < cost * (1 - DIRECT_ERROR)]
+        return (*refused, *filter(self._is_slight, cheaper))
 
     def _is_slight(self, extremal: Extremal) -> bool:
         """Whether a collision-free path that is about as cheap is thinkable: not where an extremal cuts deep."""
@@ -261,27 +328,6 @@ def _stalled(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
     """What there is of a direct path that Newton's method did not take to an extremal."""
     nodes = np.concatenate([direct.states, direct.costates], axis=1)
     return certify(problem, direct.times, nodes, Status.STALLED)
-
-
-def _extremal(problem: OptimalControlProblem, direct: DirectPath) -> tuple[Extremal | None, int]:
-    """Multiple shooting from a direct path, which is refined further as long as that fails, and its evaluations."""
-    history, work = (), 0
-    settings = Settings(TOLERANCE, NEWTON_ITERATIONS)
-    for refinement in range(REFINEMENTS):
-        if refinement > 0:
-            direct = optimise(problem, direct.refined())
-        intervals = len(direct.controls)
-        segments = max(round(intervals / (INTERVALS_PER_SEGMENT * 2**refinement)), FEWEST_SEGMENTS) * 2**refinement
-        at = np.rint(np.linspace(0, intervals, segments + 1)).astype(int)
-        times, nodes = direct.times[at], np.concatenate([direct.states[at], direct.costates[at]], axis=1)
-        arrays = problem.arrays
-        nodes[-1, :3] = np.where(arrays.free, nodes[-1, :3], arrays.goal)
-        status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, NEWTON_ITERATIONS)
-        history += rows
-        work += evaluations
-        if status is Status.SUCCESS:
-            return confirm(problem, times, nodes, status, history, work, settings), work
-    return None, work
 
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:

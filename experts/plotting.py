@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from itertools import cycle, pairwise
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal, Iteration
-from leapnav.experts.integrator import propagate
+from leapnav.experts.feasible_path import dense_path
 from leapnav.experts.optimum import Optimum
 from leapnav.experts.problem import OptimalControlProblem
 
@@ -36,7 +36,6 @@ BOUND_SHOWN = 3.0  # times the largest control
 SMALLEST_DRIFT = 1e-9  # below it the Hamiltonian's deviations are drawn small, as what they are
 SWEEPS = ("sweep", "reduce")  # Leapfrog's phases, whose rows carry a feasible path
 SWEEPS_DRAWN, FIRST_SWEEPS = 12, 4  # the first ones change most
-SWEEP_ACCURACY = 1e-10  # errors grow along the long arcs of the last sweeps, which still should look connected
 SMALLEST_DISTANCE = 1e-10  # of costs, relative: the end error that Leapfrog allows an arc
 SPREAD = 100.0  # costs further apart, in smallest distances, are drawn as distances on a logarithmic axis
 
@@ -320,7 +319,7 @@ def _draw_sweeps(
     for k, color in _chosen(sweeps).items():
         times, nodes = sweeps[k].times, sweeps[k].nodes
         assert times is not None and nodes is not None
-        axes.plot(*place(*_feasible_path(problem, times, nodes)), color=color, linewidth=1.0, label=f"sweep {k}")
+        axes.plot(*place(*dense_path(problem, times, nodes, POINTS)), color=color, linewidth=1.0, label=f"sweep {k}")
         axes.plot(*place(times, nodes[:, : problem.system.n]), ".", color=color, markersize=3.5)
 
 
@@ -331,23 +330,6 @@ def _chosen(sweeps: Sequence[Iteration]) -> dict[int, Any]:
     rest = np.linspace(first, last, SWEEPS_DRAWN - first).round().astype(int) if last >= first else []
     numbers = sorted({*range(first), *map(int, rest)})
     return dict(zip(numbers, colormaps["viridis_r"](np.linspace(0.12, 0.92, len(numbers))), strict=True))
-
-
-def _feasible_path(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Times (K,) and states (K, n) on the extremal arcs from node to node; times (p + 1,), nodes (p + 1, 2n)."""
-    arrays, n = problem.arrays, problem.system.n
-    none = np.empty((2 * n, 0))
-    steps = math.ceil(POINTS / (len(times) - 1))
-    dense = np.concatenate([np.linspace(a, b, steps + 1) for a, b in pairwise(times)])
-    states = np.empty((len(dense), n))
-    for k in range(len(times) - 1):
-        z, at = nodes[k].copy(), k * (steps + 1)
-        states[at] = z[:n]
-        for j in range(at + 1, at + steps + 1):
-            step = dense[j] - dense[j - 1]
-            propagate(arrays.flow, z, none, step, arrays.data, arrays.field, SWEEP_ACCURACY, 0.0, False)
-            states[j] = z[:n]
-    return dense, states
 
 
 def _draw_costs(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration]) -> None:

@@ -3,9 +3,9 @@ import pytest
 from helpers import best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
-from leapnav.envs import FAMILIES, Scenario, sample_scenario
+from leapnav.envs import FAMILIES, Robot, Scenario, sample_scenario
 from leapnav.experts import Status, find_optimum
-from leapnav.experts.lattice import Lattice, is_connected
+from leapnav.experts.lattice import Lattice, Place, is_connected
 
 BEST_KNOWN = best_known()
 
@@ -182,6 +182,34 @@ def test_a_gap_just_too_narrow_leaves_patience_for_a_way_round():
     """Nearly all first candidates lead through a gap that lacks 0.14 m, where Newton's method mostly fails."""
     extremal = find_optimum(sample_scenario("polygons", 2_000_188))
     assert extremal.success, extremal
+
+
+def test_walls_full_of_gaps_that_are_a_little_too_narrow_are_gone_round():
+    """A hundred combinations of gaps lead straight on, and all are in vain."""
+    discs = [(x, y, 0.3) for x in (3.0, 5.0, 7.0) for y in np.arange(0.35, 8.5, 0.95)]
+    robot = Robot(radius=0.2)
+    scenario = Scenario.from_discs(
+        discs, start=(1, 4, 0), goal=(9, 4, None), horizon=16, arena=(0, 0, 10, 10), robot=robot
+    )
+    optimum = find_optimum(scenario)
+    assert optimum.success
+    for x in (3.0, 5.0, 7.0):
+        assert optimum.states[np.abs(optimum.states[:, 0] - x).argmin(), 1] > 8.4
+
+
+def test_a_lattice_without_a_place_leads_round_it():
+    scenario = BEST_KNOWN[0][0]
+    lattice = Lattice(scenario)
+    first = next(lattice.candidates())
+    x, y, _ = first.poses[len(first.poses) // 2]
+    for wide, least in ((False, 0.4), (True, 2.0)):
+        other = next(lattice.without([Place(x, y, -0.1, wide)]).candidates())
+        distance = np.hypot(other.poses[:, 0] - x, other.poses[:, 1] - y).min()
+        assert distance > least * scenario.robot.radius
+        assert other.cost > first.cost
+    assert next(lattice.candidates()).cost == first.cost  # it is as it was
+    start, goal = (Place(*pose[:2], -0.1) for pose in (scenario.start, scenario.goal))
+    assert next(lattice.without([start, goal]).candidates()).cost == first.cost  # every path leads there
 
 
 def test_candidates_elsewhere_leave_the_first_ones():
