@@ -1,7 +1,7 @@
 # `make demo` and `make test` work in a fresh clone; both set up .venv first.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-SOURCES := $(sort $(wildcard leapnav/* envs/*.py envs/banks/*.bank experts/*.py \
+SOURCES := $(sort $(wildcard leapnav/* leapnav/play/* envs/*.py envs/banks/*.bank experts/*.py \
     training/*.py training/*.toml training/*.jinja training/pretrained/*/*))
 
 .PHONY: demo test lint types docs bench clean
@@ -11,7 +11,7 @@ demo: .venv/installed
 	$(BIN)/leapnav demo
 
 # A process for each core: torch's threads would only be in each other's way.
-test: lint types
+test: lint types .venv/examples
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
 lint: .venv/installed
@@ -40,6 +40,10 @@ clean:
 # it is made again whenever one is added or removed.
 .venv/installed: pyproject.toml constraints.txt .venv/sources
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]" --config-settings editable_mode=strict
+	touch $@
+
+.venv/examples: examples/requirements.txt .venv/bin/python
+	$(BIN)/pip install --quiet --no-deps --upgrade --target $@ --requirement $<
 	touch $@
 
 .venv/sources: .venv/bin/python FORCE

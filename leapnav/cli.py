@@ -1,4 +1,4 @@
-"""The command line: `leapnav solve | bank | rollout | train | evaluate | report | watch | demo | doctor`."""
+"""The command line: `leapnav solve | bank | rollout | train | evaluate | report | watch | play | demo | doctor`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from leapnav.bank_commands import Build, Show
 from leapnav.doctor import Doctor
 from leapnav.evaluate_commands import Evaluate, Report
 from leapnav.outputs import check_outputs
+from leapnav.play.command import Play
 from leapnav.train_commands import TrainCommand, train_command
 from leapnav.watch import Watch
 
@@ -197,6 +198,7 @@ COMMANDS = {
     "evaluate": Evaluate,
     "report": Report,
     "watch": Watch,
+    "play": Play,
     "demo": Demo,
     "doctor": Doctor,
 }
