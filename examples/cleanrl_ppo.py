@@ -1,0 +1,142 @@
+"""PPO in one file, after CleanRL's ppo_continuous_action.py, on leapnav's vector environment, scored at the end.
+
+S. Huang et al., CleanRL: High-quality single-file implementations of deep RL algorithms, JMLR 23 (2022).
+
+python examples/cleanrl_ppo.py --total-timesteps 1000000
+"""
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from torch import nn
+from torch.distributions import Normal
+
+import leapnav  # noqa: F401 (registers the environments)
+from leapnav.training import evaluate
+from leapnav.training.policies import NavigationFeatures
+
+SCALE = 0.1  # of the rewards: a return is some units then
+
+
+def layers(inputs: int, outputs: int, gain: float) -> nn.Sequential:
+    """Two hidden layers of 64, with orthogonal weights."""
+    sizes, gains, found = (inputs, 64, 64, outputs), (2**0.5, 2**0.5, gain), []
+    for i, scale in enumerate(gains):
+        linear = nn.Linear(sizes[i], sizes[i + 1])
+        nn.init.orthogonal_(linear.weight, scale)
+        nn.init.zeros_(linear.bias)
+        found += [linear, nn.Tanh()]
+    return nn.Sequential(*found[:-1])
+
+
+class Agent(nn.Module):
+    """Actor and critic; `predict` makes it a policy that leapnav can score."""
+
+    def __init__(self, envs: gym.vector.VectorEnv) -> None:
+        super().__init__()
+        self.features = NavigationFeatures(
+            envs.single_observation_space
+        )  # raw metres and seconds are hard to learn from
+        inputs, actions = self.features.features_dim, envs.single_action_space.shape[0]
+        self.critic, self.actor = layers(inputs, 1, 1.0), layers(inputs, actions, 0.01)
+        self.log_std = nn.Parameter(torch.full((actions,), -1.2))
+
+    def value(self, observation: torch.Tensor) -> torch.Tensor:
+        """Of the observations."""
+        return self.critic(self.features(observation))[:, 0]
+
+    def distribution(self, observation: torch.Tensor) -> Normal:
+        """Of the actions."""
+        return Normal(self.actor(self.features(observation)), self.log_std.exp())
+
+    @torch.no_grad()
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        """The means of the actions, for one observation or several."""
+        several = torch.as_tensor(observation).reshape(-1, np.shape(observation)[-1])
+        actions = self.distribution(several).mean.clamp(-1, 1).numpy()
+        return actions.reshape(*np.shape(observation)[:-1], -1), state
+
+
+def main(
+    family: str = "open", total_timesteps: int = 300_000, num_envs: int = 64, num_steps: int = 64, seed: int = 0
+) -> float:
+    """Learns from scratch, and scores what was learned against the optimum.
+
+    Args:
+        family: of the scenarios.
+        total_timesteps: of all robots.
+        num_envs: robots.
+        num_steps: that each drives between two updates.
+        seed: of everything.
+
+    """
+    gamma, gae_lambda, clip, epochs, batch = 0.99, 0.95, 0.2, 5, 512
+    torch.manual_seed(seed)
+    environment = {"reward": "shaped", "control_period": 0.2}
+    envs = gym.make_vec(
+        "leapnav/Navigate-v0",
+        num_envs,
+        "vector_entry_point",
+        autoreset_mode=gym.vector.AutoresetMode.SAME_STEP,
+        family=family,
+        split="fresh",
+        discount=gamma,
+        **environment,
+    )
+    agent = Agent(envs)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-3, eps=1e-5)
+    following = torch.as_tensor(envs.reset(seed=seed)[0])
+    updates = max(1, total_timesteps // (num_envs * num_steps))
+    for update in range(updates):
+        optimizer.param_groups[0]["lr"] = 1e-3 * (1 - update / updates)
+        rows: dict[str, list[torch.Tensor]] = {name: [] for name in ("x", "a", "logp", "value", "reward", "done")}
+        successes: list[float] = []
+        for _ in range(num_steps):
+            with torch.no_grad():
+                distribution = agent.distribution(following)
+                action, value = distribution.sample(), agent.value(following)
+            observed = following
+            # An episode of leapnav ends by itself, at the horizon: there is no value beyond.
+            observation, reward, done, _, info = envs.step(action.clamp(-1, 1).numpy())
+            following = torch.as_tensor(observation)
+            if done.any():
+                ended, seen = info["final_info"], np.stack(info["final_obs"][done].tolist())
+                successes += ended["is_success"][done].tolist()
+                # A miss costs the more the farther it is from the goal: one penalty for all would not say where it is.
+                away = np.hypot(seen[:, 0], seen[:, 1]) + np.abs(np.arctan2(seen[:, 3], seen[:, 2]))
+                reward[done] -= ended["reward_parts"]["miss"][done] * (1 - np.minimum(1, 0.2 + 0.1 * away))
+            new = (observed, action, distribution.log_prob(action).sum(1), value, SCALE * reward, done)
+            for row, entry in zip(rows.values(), new, strict=True):
+                row.append(torch.as_tensor(entry, dtype=torch.float32))
+        x, a, logp, value, reward, done = (torch.stack(row) for row in rows.values())
+        with torch.no_grad():
+            values = torch.cat([value, agent.value(following)[None]])
+        advantage, last = torch.zeros_like(reward), torch.zeros(num_envs)
+        for t in reversed(range(num_steps)):
+            alive = 1 - done[t]
+            last = reward[t] + gamma * alive * values[t + 1] - values[t] + gamma * gae_lambda * alive * last
+            advantage[t] = last
+        flat = [column.flatten(0, 1) for column in (x, a, logp, advantage, advantage + value)]
+        for _ in range(epochs):
+            for chosen in torch.randperm(num_envs * num_steps).split(batch):
+                x_, a_, logp_, advantage_, return_ = (column[chosen] for column in flat)
+                distribution = agent.distribution(x_)
+                ratio = (distribution.log_prob(a_).sum(1) - logp_).exp()
+                advantage_ = (advantage_ - advantage_.mean()) / (advantage_.std() + 1e-8)
+                policy_loss = -torch.min(ratio * advantage_, ratio.clamp(1 - clip, 1 + clip) * advantage_).mean()
+                value_loss = 0.5 * (agent.value(x_) - return_).square().mean()
+                optimizer.zero_grad()
+                (policy_loss + 0.5 * value_loss).backward()
+                nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
+                optimizer.step()
+        if successes and update % 10 == 0:
+            steps = (update + 1) * num_envs * num_steps
+            print(f"{steps:9,} steps: success {100 * np.mean(successes):.0f} % while it learns", flush=True)
+    found = evaluate(agent, family, environment=environment)
+    print(f"success {100 * found.success:.1f} %, collision {100 * found.collision:.1f} %, SOC {found.soc:.3f}")
+    return found.soc
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

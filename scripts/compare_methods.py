@@ -1,0 +1,86 @@
+"""All methods on all families: clones of several seeds, PPO from scratch and from a clone, the policies that ship.
+
+python scripts/compare_methods.py --runs DIR                      # what is finished there is not done again
+python scripts/compare_methods.py --only bc --families open       # some
+python scripts/compare_methods.py --table                         # nothing is trained: the table of what is there
+
+A clone takes minutes: five seeds, which share their demonstrations, so that the spread is the fit's. A run of PPO takes
+more than ten minutes: one seed. Those from a clone start with the first.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from leapnav.envs import FAMILIES, ScenarioBank
+from leapnav.experts.rollouts import rollout
+from leapnav.training import BCConfig, PPOConfig, train_bc, train_ppo
+from leapnav.training.contest import contest
+from leapnav.training.entrants import load_entrant
+from leapnav.training.reports import COLUMNS, cell
+
+SHOWN = ("success", "collision", "soc", "regret")
+METHODS = ("bc", "scratch", "warm")
+DEMONSTRATIONS = {"open": 2000, "clutter": 10_000, "polygons": 4000, "rooms": 4000, "slalom": 4000}
+DEMONSTRATION_SEED = 60_000
+STEPS = {"open": 1_000_000, "clutter": 5_000_000, "polygons": 2_000_000, "rooms": 2_000_000, "slalom": 2_000_000}
+EVALUATIONS = 8  # on the way of a run of PPO
+ROWS = {"bc": "clone of {demos:,}", "scratch": "PPO from scratch, {steps:.1f} M steps", "warm": "PPO from a clone"}
+
+
+def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> None:
+    """The runs of a method on a family that are not finished."""
+    demos = runs / family / "demonstrations"
+    if method != "scratch":
+        rollout(family, DEMONSTRATIONS[family], demos, seed=DEMONSTRATION_SEED, workers=workers)
+    for seed in range(seeds if method == "bc" else 1):
+        out = runs / family / f"{method}-{seed}"
+        run = {"out": out, "seed": seed, "resume": (out / "config.json").exists()}
+        if method == "bc":
+            train_bc(BCConfig.tuned(family, demos=(demos,), **run))
+            continue
+        if method == "warm":
+            config = PPOConfig.tuned(family, warm_start=(runs / family / "bc-0", demos), **run)
+        else:
+            config = PPOConfig.tuned(family, total_timesteps=STEPS[family], **run)
+        train_ppo(replace(config, evaluate_every=config.total_timesteps // EVALUATIONS))
+
+
+def entrants(family: str, runs: Path) -> list[str]:
+    """What the table of a family compares, each with its row's name."""
+    values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6}
+    found = [
+        f"{ROWS[method].format(**values)}={folder}"
+        for method in METHODS
+        for folder in sorted((runs / family).glob(f"{method}-*"))
+        if (folder / "policy.json").exists()
+    ]
+    return [*found, f"DAgger (ships)={family}", "go-to-goal"]
+
+
+def main() -> None:
+    """Trains what is asked for and prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, default=Path("runs/methods"))
+    parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
+    parser.add_argument("--only", nargs="+", default=METHODS, choices=METHODS, help="train these methods")
+    parser.add_argument("--seeds", type=int, default=5, help="of the clones")
+    parser.add_argument("--table", action="store_true", help="train nothing")
+    parser.add_argument("--workers", type=int, default=1, help="processes that make demonstrations")
+    arguments = parser.parse_args()
+    if not arguments.table:
+        for method in arguments.only:
+            for family in arguments.families:
+                train(method, family, arguments.runs, arguments.seeds, arguments.workers)
+    print("| family | policy | runs | success (%) | collision (%) | SOC | median regret (%) |")
+    print("|---|---|---|---|---|---|---|")
+    for family in arguments.families:
+        names = [load_entrant(name) for name in entrants(family, arguments.runs)]
+        found = contest(names, [ScenarioBank.shipped(family, "test")])
+        for row in found.scores():
+            cells = [cell(getattr(row, name), *form).replace("\n", " ") for _, name, *form in COLUMNS if name in SHOWN]
+            print(f"| {family} | {row.policy} | {row.runs} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
