@@ -178,6 +178,7 @@ def drive_arcs(bodies, state, tasks, fields, settings):
         state[i, CLEARANCE], state[i, HERE] = lowest, after
         if share < 1.0:
             state[i, TOUCHED] = 1.0
+            state[i, CLEARANCE] = after  # it does not get to where the arc would have gone
             state[i, REMAINING] = state[i, DURATION] * (1.0 - share)
             distance *= share
             turn *= share
@@ -234,6 +235,7 @@ def drive_motors(bodies, state, tasks, fields, settings, piece, pieces):
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * share, dy * share, turn * share
         if share < 1.0:
             state[i, TOUCHED] = 1.0
+            state[i, CLEARANCE] = after  # it does not get to where the arc would have gone
             state[i, REMAINING] = state[i, DURATION] - step * (piece + share)
             continue
         wheels = state[i, SPEED], state[i, TURN_RATE]

@@ -1,10 +1,17 @@
+import os
 import sys
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from hypothesis import HealthCheck, settings
 
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
+
+# The same cases each time; HYPOTHESIS_PROFILE=long makes many new ones.
+settings.register_profile("default", max_examples=40, deadline=None, derandomize=True)
+settings.register_profile("long", max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
 @pytest.fixture(scope="session")
