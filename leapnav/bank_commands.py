@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from leapnav.outputs import check_outputs
+from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
     from leapnav.envs.bank import ScenarioBank
@@ -36,14 +35,19 @@ class Build:
     """Seed of the bank. The banks that ship with leapnav have 0 (training) and 1 (test)."""
     workers: int = os.cpu_count() or 1
     """Processes; their number changes nothing in the bank."""
+    json: Path | None = None
+    """Write how many scenarios were drawn, and why some were rejected."""
 
     def run(self) -> int:
         """Builds the bank."""
+        check_outputs(self.json)
         from leapnav.experts.banks import build_bank
 
         bank = build_bank(self.family, self.count, self.out, seed=self.seed, workers=self.workers)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         print(f"wrote {self.out}: {len(bank)} of {bank.drawn} scenarios drawn{f' ({rejected})' if rejected else ''}")
+        summary = {"scenarios": len(bank), "drawn": bank.drawn, "rejected": dict(bank.rejected)}
+        write_json({"bank": str(self.out), **summary}, self.json)
         return 0
 
 
@@ -60,7 +64,7 @@ class Show:
     verify: bool = False
     """Search every scenario again with a hundred times the effort (seconds each) and report where it found better."""
     json: Path | None = None
-    """Write what --verify found for each scenario."""
+    """Write a row for each scenario: name, cost, horizon, clearance; and what --verify found."""
     workers: int = os.cpu_count() or 1
     """Processes of --verify."""
 
@@ -79,9 +83,15 @@ class Show:
         if self.count > 0:
             plot_bank(bank, plot, self.count)
             print(f"wrote {plot}")
-        return self._verify(bank) if self.verify else 0
+        rows = [
+            {"name": scenario.name, "cost": float(cost), "horizon": scenario.horizon, "clearance": float(clearance)}
+            for scenario, cost, clearance in zip(bank, bank.costs, bank.certificates[:, 3], strict=True)
+        ]
+        code = self._verify(bank, rows) if self.verify else 0
+        write_json(rows, self.json)
+        return code
 
-    def _verify(self, bank: ScenarioBank) -> int:
+    def _verify(self, bank: ScenarioBank, rows: list[dict[str, Any]]) -> int:
         from leapnav.experts.second_opinion import verify_bank
 
         opinions = verify_bank(bank, workers=self.workers)
@@ -100,9 +110,9 @@ class Show:
         print(
             f"cheaper solutions that touch or lack a certificate, which the bank's builder did not see: {len(doubtful)}"
         )
-        if self.json is not None:
-            self.json.write_text(json.dumps([asdict(opinion) for opinion in opinions], indent=1) + "\n")
-            print(f"wrote {self.json}")
+        found = {opinion.name: asdict(opinion) for opinion in opinions}
+        for row in rows:
+            row.update(found[row["name"]])
         return 1 if better else 0
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -15,7 +15,7 @@ import tyro
 from leapnav.bank_commands import Build, Show
 from leapnav.doctor import Doctor
 from leapnav.evaluate_commands import Evaluate, Report
-from leapnav.outputs import check_outputs
+from leapnav.outputs import check_outputs, reserved_for_json, write_json
 from leapnav.play.command import Play
 from leapnav.train_commands import TrainCommand, train_command
 from leapnav.watch import Watch
@@ -43,7 +43,8 @@ class Solve:
     plot: Path | None = None
     """Write a picture of the solution (.png, .pdf or .svg); with "all", of the cheapest one that is certified."""
     json: Path | None = None
-    """Write the solution: cost, certificate, states, controls, costates, history; with "all", one for each method."""
+    """Write the solution: cost, certificate, states, controls, costates, history; with "all", one for each method.
+    "-" is standard output, here and in the other commands."""
 
     def run(self) -> int:
         """Solves and reports."""
@@ -73,24 +74,20 @@ class Solve:
             print(f"  evaluations        {extremal.work}{scope}")
         if isinstance(extremal, Optimum) and extremal.success:
             _print_alternatives(extremal)
-        self._write(scenario, extremal, extremal.to_json())
+        self._write(scenario, extremal, extremal.to_dict())
         return 0 if extremal.success else FAILED
 
     def _compare(self, scenario: Scenario) -> int:
-        import json
-
         extremals = _solve_by_all_methods(scenario)
         best = min(extremals.values(), key=lambda extremal: (not extremal.success, extremal.cost))
-        content = json.dumps({method: extremal.to_dict() for method, extremal in extremals.items()}, allow_nan=False)
+        content = {method: extremal.to_dict() for method, extremal in extremals.items()}
         self._write(scenario, best if best.success else None, content)
         return 0 if best.success else FAILED
 
-    def _write(self, scenario: Scenario, extremal: Extremal | None, content: str) -> None:
+    def _write(self, scenario: Scenario, extremal: Extremal | None, content: dict[str, Any]) -> None:
         from leapnav.experts.plotting import plot_solution
 
-        if self.json is not None:
-            self.json.write_text(content + "\n")
-            print(f"wrote {self.json}")
+        write_json(content, self.json)
         if self.plot is not None and extremal is not None and len(extremal.times):
             plot_solution(scenario, extremal, self.plot)
             print(f"wrote {self.plot}")
@@ -124,9 +121,12 @@ class Rollout:
     check: bool = False
     """Write nothing: replay the dataset that the folder holds and report the largest deviation (exit code 1 if there
     is one)."""
+    json: Path | None = None
+    """Write what was made, or what --check found."""
 
     def run(self) -> int:
         """Writes the dataset, or checks it."""
+        check_outputs(self.json)
         if self.check:
             return self._check()
         from leapnav.experts.demonstrations import dataset_id
@@ -149,6 +149,7 @@ class Rollout:
             f"{summary.failed_replays} failed replays left out)"
         )
         print(f"minari.load_dataset({dataset_id(self.family)!r}) reads it with MINARI_DATASETS_PATH={self.out}")
+        write_json(asdict(summary), self.json)
         return 0
 
     def _check(self) -> int:
@@ -159,6 +160,7 @@ class Rollout:
             f"{self.out}: {replay.episodes} episodes replayed; largest deviation of observations "
             f"{replay.observation:.1e}, rewards {replay.reward:.1e}, states {replay.state:.1e} (episode {replay.worst})"
         )
+        write_json(asdict(replay), self.json)
         return 0 if max(replay.observation, replay.reward, replay.state) <= DEVIATION else FAILED
 
 
@@ -184,6 +186,11 @@ class Bank:
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Show, tyro.conf.subcommand("show")]
     ]
+
+    @property
+    def json(self) -> Path | None:
+        """Where the action writes."""
+        return self.action.json
 
     def run(self) -> int:
         """Builds or shows a bank."""
@@ -219,7 +226,9 @@ def parse(words: list[str]) -> Any:
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code; bad input is one line on standard error and exit code 2."""
     try:
-        return parse(sys.argv[1:] if arguments is None else arguments).run()
+        command = parse(sys.argv[1:] if arguments is None else arguments)
+        with reserved_for_json(getattr(command, "json", None)):
+            return command.run()
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT

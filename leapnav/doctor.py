@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import re
@@ -13,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from time import perf_counter
 
-from leapnav.outputs import check_outputs
+from leapnav.outputs import check_outputs, write_json
 
 FAILED = 1
 BANK, INDEX = "clutter", 7  # the scenario of the checks
@@ -54,10 +53,7 @@ class Doctor:
             print(
                 f"{'ok    ' if done.passed else 'FAILED'}  {done.name} ({done.seconds:.2f} s): {done.found}", flush=True
             )
-        if self.json is not None:
-            content = {"versions": versions, "checks": [asdict(check) for check in checks]}
-            self.json.write_text(json.dumps(content, indent=1) + "\n")
-            print(f"wrote {self.json}")
+        write_json({"versions": versions, "checks": [asdict(check) for check in checks]}, self.json)
         return 0 if all(check.passed for check in checks) else FAILED
 
 

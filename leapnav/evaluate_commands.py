@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.outputs import check_outputs
+from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
     from leapnav.envs.bank import ScenarioBank
@@ -43,7 +43,7 @@ class Evaluate:
         """Plays and reports."""
         from leapnav.training.contest import contest
         from leapnav.training.entrants import load_entrant
-        from leapnav.training.reports import plot_episodes, plot_scores, print_scores, write_scores
+        from leapnav.training.reports import plot_episodes, plot_scores, print_scores, scores_to_dict
 
         if not self.policies:
             raise ValueError("policies: name at least one folder, or expert, random or go-to-goal")
@@ -56,8 +56,7 @@ class Evaluate:
         found = contest(entrants, self._banks(), count=self.count, seed=self.seed)
         print_scores(found)
         if self.json is not None:
-            write_scores(found, self.json)
-            print(f"wrote {self.json}")
+            write_json(scores_to_dict(found), self.json)
         if self.plot is not None:
             plot_scores(found, self.plot)
             print(f"wrote {self.plot}")
@@ -90,17 +89,22 @@ class Report:
     """Only so many scenarios of each family; by default all."""
     seed: int = 0
     """Of the bootstrap intervals."""
+    json: Path | None = None
+    """Write the table and every episode."""
 
     def run(self) -> int:
         """Evaluates the runs and writes the page."""
         from leapnav.training.html_report import write_report
-        from leapnav.training.reports import print_scores
+        from leapnav.training.reports import print_scores, scores_to_dict
 
         if not self.runs:
             raise ValueError("runs: name at least one folder")
         if self.count is not None and self.count < 1:
             raise ValueError(f"count: expected at least 1, got {self.count}")
-        check_outputs(page=self.out)
-        print_scores(write_report(self.runs, self.out, count=self.count, seed=self.seed))
+        check_outputs(self.json, page=self.out)
+        found = write_report(self.runs, self.out, count=self.count, seed=self.seed)
+        print_scores(found)
         print(f"wrote {self.out}")
+        if self.json is not None:
+            write_json(scores_to_dict(found), self.json)
         return 0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from leapnav.outputs import check_outputs
+from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -37,6 +37,8 @@ class Watch:
     """Noise on motion and sensing, see the environment's documentation."""
     video: Path | None = None
     """Write a video (.mp4) instead of opening a window."""
+    json: Path | None = None
+    """Write how the episodes ended."""
 
     def run(self) -> int:
         """Plays the episodes."""
@@ -44,8 +46,8 @@ class Watch:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
         if self.index is not None and self.split == "fresh":
             raise ValueError(f"index: a newly drawn scenario has no number, got {self.index}")
+        check_outputs(self.json, video=self.video)
         if self.video is not None:
-            check_outputs(video=self.video)
             return self._film(self.video)
         import pygame
 
@@ -109,7 +111,7 @@ class Watch:
         last = None if self.index is None else self.index + self.episodes - 1
         if last is not None and inner.bank is not None and not 0 <= last - self.episodes + 1 <= last < len(inner.bank):
             raise ValueError(f"index: the bank has scenarios 0 to {len(inner.bank) - 1}, got {self.index} to {last}")
-        policy = self._load(env)
+        policy, results = self._load(env), []
         for episode in range(self.episodes):
             options = None if self.index is None or inner.bank is None else {"index": self.index + episode}
             observation, info = env.reset(seed=self.seed if episode == 0 else None, options=options)
@@ -120,10 +122,15 @@ class Watch:
                 observation, _, terminated, truncated, info = env.step(action)
                 start, done = False, terminated or truncated
                 if inner.window_closed:
-                    return
+                    break
+            if inner.window_closed:
+                break
             result = "success" if info["is_success"] else "collision" if info["collision"] else "missed the goal"
             optimum = "" if reference is None else f", optimum {reference:.3f}"
             print(f"{scenario}: {result} after {info['time']:.1f} s, cost {info['cost']:.3f}{optimum}")
+            measured = {name: float(info[name]) for name in ("time", "cost")}
+            results.append({"scenario": scenario, "result": result, **measured, "reference_cost": reference})
+        write_json(results, self.json)
 
     def _load(self, env: gym.Env[Any, Any]) -> Policy:
         from leapnav.training.entrants import make_entrant

@@ -256,6 +256,45 @@ def test_solve_tells_the_alternatives_apart(tmp_path, capsys):
     assert "(+1.5 %), backward, forward" in drawn
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["solve", "{scenario}"],
+        ["solve", "{scenario}", "--method", "all"],
+        ["bank", "build", "--family", "open", "--count", "2", "--out", "{folder}/small.bank"],
+        ["bank", "show", "open-test", "--count", "0"],
+        ["rollout", "--family", "open", "--count", "2", "--out", "{folder}/demos"],
+        ["evaluate", "go-to-goal", "--family", "open", "--count", "2"],
+        ["watch", "--family", "open", "--policy", "go-to-goal", "--episodes", "1"],
+    ],
+)
+def test_every_command_writes_json_to_a_file_or_to_standard_output_alone(
+    words, scenario_file, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    words = [word.format(scenario=scenario_file[0], folder=tmp_path) for word in words]
+    code = main([*words, "--json", "-"])
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    assert code == 0 and found and captured.err
+    out = tmp_path / "found.json"
+    assert main([*words, "--json", str(out)]) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    written = json.loads(out.read_text())
+    assert type(written) is type(found)
+    assert written.keys() == found.keys() if isinstance(found, dict) else len(written) == len(found)
+    assert failing([*words, "--json", tmp_path / "missing" / "x.json"], capsys)[0] == 2
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands_and_options(shell, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--tyro-print-completion", shell])
+    printed = capsys.readouterr().out
+    assert end.value.code in (0, None)
+    assert all(word in printed for word in ("solve", "evaluate", "--episodes-plot", "play"))
+
+
 def test_a_bank_is_built_and_shown(tmp_path, capsys):
     bank, sheet, report = tmp_path / "small.bank", tmp_path / "sheet.png", tmp_path / "report.json"
     assert main(["bank", "build", "--family", "rooms", "--count", "4", "--seed", "9", "--out", str(bank)]) == 0

@@ -87,9 +87,9 @@ def cell(interval: Interval, factor: float, digits: int, interval_digits: int) -
     return f"{factor * interval.value:.{digits}f}\n[{low}, {high}]"
 
 
-def write_scores(contest: Contest, path: str | os.PathLike[str]) -> None:
-    """The table and every episode behind it as JSON (null where there is nothing to measure)."""
-    content: dict[str, Any] = {
+def scores_to_dict(contest: Contest) -> dict[str, Any]:
+    """The table and every episode behind it as plain numbers (None where there is nothing to measure)."""
+    content = {
         "environment": ENVIRONMENT,
         "leapnav": leapnav.__version__,
         "banks": [{"family": bank.family, "file": bank.path.name} for bank in contest.banks],
@@ -99,7 +99,12 @@ def write_scores(contest: Contest, path: str | os.PathLike[str]) -> None:
             name: [[_record(episode) for episode in run] for run in runs] for name, runs in contest.runs.items()
         },
     }
-    Path(path).write_text(json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
+    return _finite(content)
+
+
+def write_scores(contest: Contest, path: str | os.PathLike[str]) -> None:
+    """`scores_to_dict` as JSON."""
+    Path(path).write_text(json.dumps(scores_to_dict(contest), indent=1, allow_nan=False) + "\n")
 
 
 def _record(episode: Episode) -> dict[str, Any]:
