@@ -12,7 +12,7 @@ import tyro
 from torch import nn
 from torch.distributions import Normal
 
-import leapnav  # noqa: F401 (registers the environments)
+from leapnav.envs.vector import AutoresetMode
 from leapnav.training import evaluate
 from leapnav.training.policies import NavigationFeatures
 
@@ -78,7 +78,7 @@ def main(
         "leapnav/Navigate-v0",
         num_envs,
         "vector_entry_point",
-        autoreset_mode=gym.vector.AutoresetMode.SAME_STEP,
+        autoreset_mode=AutoresetMode.SAME_STEP,
         family=family,
         split="fresh",
         discount=gamma,

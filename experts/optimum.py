@@ -43,6 +43,7 @@ DIRECT_ERROR = 0.01
 SLIGHT = TOLERATED_DEPTH
 # A path is in vain if it is this share as deep in an obstacle as one before it, so many robot radii from there at most.
 AS_DEEP, SAME_PLACE = 0.5, 0.5
+TOUCH = 0.1  # share of what is slight; what hardly touches shuts no place
 MOST_WASTED = 1_000_000  # evaluations of the flow by Newton's method in vain, on the paths of one lattice
 CLOSED = 1e-3  # sum of the violations of a direct path's constraints
 COMPARED = np.linspace(0.0, 1.0, 65)
@@ -125,6 +126,16 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.max_speed * scenario.horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
     search = Search(scenario, problem)
+    failed = _search(search, candidates, thorough)
+    if not search.certified and search.shut:  # the only way may lead close by a place that was shut
+        search.shut, search.shutting = [], False
+        failed = _search(search, candidates, thorough)
+    return search.result() if failed is None else as_optimum(failure(problem, failed))
+
+
+def _search(search: Search, candidates: int, thorough: bool) -> Status | None:
+    """Lattice after lattice, until the best path can be told to be found; why there is none, or None."""
+    scenario = search.scenario
     shortest_time, cropped = np.inf, False
     for refinement, margin, whole in LATTICES[: None if thorough else 1]:
         lattice = Lattice(scenario, refinement, margin, whole=whole).without(search.shut)
@@ -145,21 +156,19 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
             # A margin shuts ways that may be better.
             if search.certified and margin is None and lattice.explains(search.best.cost, first.cost, batch[-1].cost):
                 search.add(Path(c.times, c.poses) for c in islice(lattice.elsewhere(), ELSEWHERE))
-                return search.result()
+                return None
             if search.shut != shut:  # many combinations of detours elsewhere would lead through the same gap
                 shut = search.shut.copy()
                 lattice = lattice.without(search.shut)
                 paths, first = lattice.candidates(), None
         # Looked at when it is in doubt: lattice paths may lead through gaps that are a little too narrow.
         if thorough and not search.certified and not is_connected(scenario):
-            return as_optimum(failure(problem, Status.NO_PATH))
+            return Status.NO_PATH
     if search.certified:
-        return search.result()
+        return None
     if shortest_time == np.inf:
-        return as_optimum(failure(problem, Status.NO_PATH))
-    if shortest_time > scenario.horizon:
-        return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
-    return search.result()
+        return Status.NO_PATH
+    return Status.HORIZON_TOO_SHORT if shortest_time > scenario.horizon else None
 
 
 class Search:
@@ -177,6 +186,7 @@ class Search:
         # The same, of what cuts deep into obstacles.
         self._deep: list[tuple[float, OptimalControlProblem, DirectPath]] = []
         self.wasted = 0
+        self.shutting = True
         self._near = SAME_PLACE * scenario.robot.radius
         # Where paths that came to nothing cut deepest into obstacles.
         self.shut: list[Place] = []
@@ -268,18 +278,25 @@ class Search:
         return None, work
 
     def _shut(self, path: DirectPath, depths: np.ndarray) -> None:
-        """Shuts the place where a path cuts deepest into an obstacle, if it does."""
-        if depths.min() < 0.0:
+        """Shuts the place where a path cuts deepest into an obstacle, if it does so in earnest."""
+        if self.shutting and depths.min() < -TOUCH * self.slight:
             x, y, _ = path.states[int(depths.argmin())].tolist()
-            if all(math.hypot(x - place.x, y - place.y) > 0.5 * self._near for place in self.shut):
+            slight = depths.min() >= -self.slight
+            near = [p for p in self.shut if math.hypot(x - p.x, y - p.y) <= 0.5 * self._near]
+            if not any((p.clearance >= -self.slight) == slight for p in near):
                 self.shut.append(Place(x, y, float(depths.min())))
 
     def _in_vain(self, path: DirectPath, depths: np.ndarray) -> bool:
         """Whether a path cuts into an obstacle where one that was looked at does: what is near is alike."""
-        in_vain = any((depths[self._at(path, place)] <= AS_DEEP * place.clearance).any() for place in self.shut)
-        if in_vain:
-            self._widen(path)
-        return in_vain
+        # One that cuts in slightly is a doubt, see `Optimum`, where only deeper ones have been looked at.
+        slight = depths.min() >= -self.slight
+        for place in self.shut:
+            if slight and place.clearance < -self.slight:
+                continue
+            if (depths[self._at(path, place)] <= AS_DEEP * place.clearance).any():
+                self._widen(path)
+                return True
+        return False
 
     def _widen(self, path: DirectPath) -> None:
         """Shuts more around the places to which a path came back from where the lattice was led around them."""

@@ -13,7 +13,7 @@ import sympy as sp
 
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.dynamics import sample_dynamics, smallest_costates
-from leapnav.experts.system import CompiledFunction, ControlAffineSystem, compile_flow, unicycle
+from leapnav.experts.system import CompiledFunction, ControlAffineSystem, as_expression, compile_flow, unicycle
 
 
 @dataclass(frozen=True)
@@ -71,17 +71,17 @@ class OptimalControlProblem:
         ):
             if len(values) != length:
                 raise ValueError(f"{name}: expected {length} numbers, got {len(values)}: {values!r}")
-            if not all((v is None and name == "goal") or (v is not None and math.isfinite(v)) for v in values):
+            if not all((v is None and name == "goal") or _is_finite(v) for v in values):
                 raise ValueError(f"{name}: expected finite numbers, got {values!r}")
         if not all(w > 0 for w in self.control_weight):
             raise ValueError(f"control_weight: expected positive numbers, got {self.control_weight!r}")
-        if not (math.isfinite(self.horizon) and self.horizon > 0):
+        if not (_is_finite(self.horizon) and self.horizon > 0):
             raise ValueError(f"horizon: expected a positive number, got {self.horizon!r}")
         if self.control_bounds is not None:
             if len(self.control_bounds) != m:
                 raise ValueError(f"control_bounds: expected {m} pairs, got {len(self.control_bounds)}")
             for low, high in self.control_bounds:
-                if not low < high:
+                if not (_is_number(low) and _is_number(high) and low < high):
                     raise ValueError(f"control_bounds: expected lowest < highest, got ({low!r}, {high!r})")
         # SymPy's or NumPy's numbers are as good as Python's, but not to compiled functions.
         for name in ("start", "goal", "control_weight", "parameters"):
@@ -91,7 +91,10 @@ class OptimalControlProblem:
         if self.control_bounds is not None:
             bounds = tuple((float(low), float(high)) for low, high in self.control_bounds)
             object.__setattr__(self, "control_bounds", bounds)
-        unknown = sp.sympify(self.state_cost).free_symbols - {*self.system.state, *self.system.parameters}
+        unknown = as_expression("state_cost", self.state_cost).free_symbols - {
+            *self.system.state,
+            *self.system.parameters,
+        }
         if unknown:
             raise ValueError(
                 f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}"
@@ -184,6 +187,18 @@ class ProblemArrays:
     free: np.ndarray
     data: np.ndarray
     field: np.ndarray
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number, Python's, NumPy's or SymPy's, that a double can hold."""
+    try:
+        return not isinstance(value, str) and not math.isnan(float(value))
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def _is_finite(value: Any) -> bool:
+    return _is_number(value) and math.isfinite(float(value))
 
 
 def _constant(values: Sequence[float] | list[float]) -> np.ndarray:

@@ -88,8 +88,8 @@ class ControlAffineSystem:
                 raise ValueError(f"fields[{j}]: expected {n} expressions, one per state, got {len(column)}")
         values = {
             "state": tuple(state),
-            "drift": tuple(sp.sympify(e) for e in drift),
-            "fields": tuple(tuple(sp.sympify(e) for e in column) for column in fields),
+            "drift": tuple(as_expression("drift", e) for e in drift),
+            "fields": tuple(tuple(as_expression(f"fields[{j}]", e) for e in c) for j, c in enumerate(fields)),
             "angles": tuple(angles),
             "position": None if position is None else tuple(position),
             "parameters": tuple(parameters),
@@ -119,6 +119,22 @@ class ControlAffineSystem:
     def m(self) -> int:
         """Number of controls."""
         return len(self.fields)
+
+
+def as_expression(where: str, value: Any) -> sp.Expr:
+    """A SymPy expression, or what SymPy can make one of.
+
+    Raises:
+        ValueError: it is none, or has no value anywhere; the message begins with `where`.
+
+    """
+    try:
+        expression = sp.sympify(value)
+    except (sp.SympifyError, TypeError, AttributeError, SyntaxError):
+        expression = None
+    if not isinstance(expression, sp.Expr) or expression.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise ValueError(f"{where}: expected an expression, got {value!r}")
+    return expression
 
 
 def unicycle() -> ControlAffineSystem:

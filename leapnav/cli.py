@@ -44,7 +44,7 @@ class Solve:
     """Write a picture of the solution (.png, .pdf or .svg); with "all", of the cheapest one that is certified."""
     json: Path | None = None
     """Write the solution: cost, certificate, states, controls, costates, history; with "all", one for each method.
-    "-" is standard output, here and in the other commands."""
+    "-" is standard output."""
 
     def run(self) -> int:
         """Solves and reports."""
@@ -229,6 +229,9 @@ def main(arguments: list[str] | None = None) -> int:
         command = parse(sys.argv[1:] if arguments is None else arguments)
         with reserved_for_json(getattr(command, "json", None)):
             return command.run()
+    except BrokenPipeError:  # whoever read what was printed has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT

@@ -50,10 +50,15 @@ def reserved_for_json(json: Path | None) -> Iterator[None]:
 
 
 def write_json(content: Any, path: Path | None) -> None:
-    """Writes what a command found, and says where; with the path "-" to standard output, and with None nowhere."""
+    """Writes what a command found, and says where; with the path "-" to standard output, and with None nowhere.
+
+    Numbers that are not finite become null.
+    """
     if path is None:
         return
-    text = encoder.dumps(content, allow_nan=False)
+    from leapnav.experts.plain import finite  # whoever asks for help need not load the solvers
+
+    text = encoder.dumps(finite(content), allow_nan=False)
     if path == STDOUT:
         print(text, file=_reserved.get() or sys.stdout)
         return

@@ -266,6 +266,7 @@ def test_solve_tells_the_alternatives_apart(tmp_path, capsys):
         ["rollout", "--family", "open", "--count", "2", "--out", "{folder}/demos"],
         ["evaluate", "go-to-goal", "--family", "open", "--count", "2"],
         ["watch", "--family", "open", "--policy", "go-to-goal", "--episodes", "1"],
+        ["doctor"],
     ],
 )
 def test_every_command_writes_json_to_a_file_or_to_standard_output_alone(
@@ -284,6 +285,16 @@ def test_every_command_writes_json_to_a_file_or_to_standard_output_alone(
     assert type(written) is type(found)
     assert written.keys() == found.keys() if isinstance(found, dict) else len(written) == len(found)
     assert failing([*words, "--json", tmp_path / "missing" / "x.json"], capsys)[0] == 2
+
+
+def test_a_dataset_that_deviates_by_no_number_is_told_in_json_too(tmp_path, capsys, monkeypatch):
+    from leapnav.experts import rollouts
+
+    replay = rollouts.Replay(episodes=1, observation=float("inf"), reward=0.0, state=float("nan"), worst=0)
+    monkeypatch.setattr(rollouts, "check_dataset", lambda folder: replay)
+    assert main(["rollout", "--check", "--out", str(tmp_path), "--json", "-"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found == {"episodes": 1, "observation": None, "reward": 0.0, "state": None, "worst": 0}
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 D3RLPY = ROOT / ".venv" / "examples"  # `make test` puts it there
 SCORE = r"success \d+\.\d %, collision \d+\.\d %, SOC \d\.\d+"
-# What each prints last, with arguments that make it short.
+# What each prints last, with arguments that make it short; too short to see whether it learns.
 EXAMPLES = {
     "own_robot": ("--plot {out}", r"certified: .*: J = 3\.165478; largest angle at the hitch 66 degrees\nwrote .*\n"),
     "compare_methods": ("--plot {out}", r".*\n(.*SUCCESS.*4\.616791339.*\n){3}.*\n(.*: J = 4\.616791339)\nwrote .*\n"),

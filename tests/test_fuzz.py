@@ -79,7 +79,7 @@ def test_fields_are_a_scenario_or_refused_in_one_line(fields):
 
 
 @given(st.one_of(st.binary(max_size=200), damaged_scenarios().map(lambda fields: json.dumps(fields).encode())))
-def test_a_file_is_solved_or_refused_in_one_line(tmp_path_factory, content):
+def test_a_file_that_is_no_scenario_is_refused_in_one_line(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "fuzzed.json"
     path.write_bytes(content)
     try:
@@ -153,8 +153,11 @@ ENTRIES = st.one_of(NUMBERS, st.none(), st.booleans(), SMALL_TEXT)
     bounds=st.none() | st.lists(st.tuples(ENTRIES, ENTRIES), max_size=3),
 )
 def test_a_problem_is_declared_or_refused(start, goal, horizon, weight, bounds):
-    with contextlib.suppress(ValueError, TypeError):
-        OptimalControlProblem(unicycle(), start, goal, horizon, weight, control_bounds=bounds)
+    _, error = outcome(
+        lambda: OptimalControlProblem(unicycle(), start, goal, horizon, weight, control_bounds=bounds),
+        ValueError,
+    )
+    assert error is None or (one_line(str(error)) and ": expected " in str(error))
 
 
 @given(
@@ -164,8 +167,8 @@ def test_a_problem_is_declared_or_refused(start, goal, horizon, weight, bounds):
 )
 def test_a_system_is_declared_or_refused(state, drift, fields):
     symbols = [sympy.Symbol(name) if isinstance(name, str) and name else name for name in state]
-    with contextlib.suppress(ValueError, TypeError, sympy.SympifyError):
-        ControlAffineSystem(symbols, drift, fields)
+    _, error = outcome(lambda: ControlAffineSystem(symbols, drift, fields), ValueError)
+    assert error is None or one_line(str(error))
 
 
 POSES = st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-7, 7))

@@ -20,6 +20,7 @@ from rich.table import Table
 import leapnav
 from leapnav.envs.bank import ScenarioBank
 from leapnav.experts.demonstrations import ENVIRONMENT
+from leapnav.experts.plain import finite
 from leapnav.experts.plotting import CURVES, OPTIMUM, draw_scenario
 from leapnav.training.contest import Contest
 from leapnav.training.evaluation import Episode
@@ -99,7 +100,7 @@ def scores_to_dict(contest: Contest) -> dict[str, Any]:
             name: [[_record(episode) for episode in run] for run in runs] for name, runs in contest.runs.items()
         },
     }
-    return _finite(content)
+    return finite(content)
 
 
 def write_scores(contest: Contest, path: str | os.PathLike[str]) -> None:
@@ -110,15 +111,6 @@ def write_scores(contest: Contest, path: str | os.PathLike[str]) -> None:
 def _record(episode: Episode) -> dict[str, Any]:
     record = {name: value for name, value in vars(episode).items() if name not in ("states", "episode_return")}
     return {**record, "return": episode.episode_return, "soc": episode.soc, "regret": episode.regret}
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def plot_scores(contest: Contest, path: str | os.PathLike[str]) -> None:

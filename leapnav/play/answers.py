@@ -22,6 +22,7 @@ from leapnav.experts.optimum import Optimum, as_optimum, find_optimum
 
 POINTS, POINTS_OF_OTHERS = 201, 101  # of the optimum, and of each alternative and sweep
 KEPT = 64  # optima that a page may go on from
+LONGEST_DRIVE = 300.0  # s
 CANDIDATES = 6  # of a search while the user drags
 MOST_SWEEPS, FIRST_SWEEPS = 40, 16
 
@@ -79,7 +80,7 @@ class Answers:
         """The way that a policy takes.
 
         Raises:
-            ValueError: it is none of those that may drive.
+            ValueError: it is none of those that may drive, or the horizon is too long.
 
         """
         from leapnav.envs.navigation import NavigateEnv
@@ -88,6 +89,8 @@ class Answers:
 
         if policy not in self.policies:
             raise ValueError(f"policy: expected one of {', '.join(self.policies) or 'none'}, got {policy!r}")
+        if scenario.horizon > LONGEST_DRIVE:
+            raise ValueError(f"horizon: here a policy drives for at most {LONGEST_DRIVE:g} s, got {scenario.horizon:g}")
         with self._lock:
             env = NavigateEnv(scenario=scenario, **({} if policy in BASELINES else policy_environment(policy)))
             driver = make_entrant(policy, env)
@@ -131,15 +134,17 @@ class Answers:
 
 
 def banked(family: str, index: int) -> Scenario:
-    """A scenario of a family's test bank, by its number modulo the bank's length.
+    """A scenario of a family's test bank, by its number.
 
     Raises:
-        ValueError: there is no such family.
+        ValueError: there is no such family or number.
 
     """
     check_family(family)
     bank = ScenarioBank.shipped(family, "test")
-    return bank[index % len(bank)]
+    if not 0 <= index < len(bank):
+        raise ValueError(f"index: expected 0 to {len(bank) - 1}, got {index}")
+    return bank[index]
 
 
 def _path(scenario: Scenario, optimum: Optimum) -> dict[str, Any]:

@@ -12,15 +12,16 @@ const play = (window.play = {
   scenario: null, answer: null, before: null, shown: 0, sweeps: null, drive: null, chosen: null, time: null,
   waiting: 0, searched: false, error: null,
 });
-let drag = null, busy = false, changed = false, timer = null, revision = 0;
+let drag = null, busy = false, searching = false, changed = false, timer = null, revision = 0;
 
 // ---- Questions
 
 async function ask(path, question) {
   play.waiting += 1;
   try {
-    const reply = await fetch(path, {
-      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(question),
+    const asked = question && { method: "POST", headers: { "Content-Type": "application/json" } };
+    const reply = await fetch(path, asked && { ...asked, body: JSON.stringify(question) }).catch(() => {
+      throw new Error("the server does not answer");
     });
     const isJson = (reply.headers.get("content-type") || "").startsWith("application/json");
     const answer = isJson ? await reply.json() : { error: `the server answers ${reply.status}; see its terminal` };
@@ -60,16 +61,25 @@ async function follow() {
 }
 
 async function search() {
-  if (drag !== null) return;
+  // One at a time: the server answers in turn, and what is asked in vain would be in the way of what follows.
+  if (drag !== null || searching) return;
   const asked = revision;
+  searching = true;
   try {
     const answer = await ask("/search", { scenario: play.scenario });
-    if (asked !== revision) return;
-    play.searched = true;
-    take(answer);
-    if (byId("policy").value) await driven();
+    if (asked === revision) {
+      play.searched = true;
+      take(answer);
+      if (byId("policy").value) await driven();
+    }
   } catch (error) {
     if (asked === revision) refuse(error);
+  } finally {
+    searching = false;
+  }
+  if (asked !== revision) {
+    clearTimeout(timer);
+    timer = setTimeout(search, IDLE);
   }
 }
 
@@ -120,6 +130,7 @@ async function driven() {
 
 function begin(scenario) {
   play.scenario = scenario;
+  drag = null;
   play.chosen = null;
   play.before = null;
   play.answer = null;
@@ -444,8 +455,9 @@ for (const name of ["pointerup", "pointercancel"]) {
   canvas.addEventListener(name, () => {
     if (!drag) return;
     drag = null;
+    if (play.searched) return;
     clearTimeout(timer);
-    timer = setTimeout(search, play.searched ? 0 : IDLE);
+    timer = setTimeout(search, IDLE);
   });
 }
 
@@ -453,6 +465,7 @@ for (const name of ["pointerup", "pointercancel"]) {
 
 function remove() {
   if (play.chosen === null) return;
+  drag = null;
   play.scenario.obstacles = play.scenario.obstacles.filter((_, i) => i !== play.chosen);
   play.chosen = null;
   touch();
@@ -491,11 +504,17 @@ byId("horizon").addEventListener("change", () => {
   touch();
 });
 
+let loads = 0;
+
 byId("load").addEventListener("click", async () => {
   const query = new URLSearchParams({ family: byId("family").value, index: byId("index").value || "0" });
-  const reply = await fetch(`/bank?${query}`), found = await reply.json();
-  if (reply.ok) begin(found.scenario);
-  else refuse(new Error(found.error));
+  const load = (loads += 1);
+  try {
+    const found = await ask(`/bank?${query}`);
+    if (load === loads) begin(found.scenario);
+  } catch (error) {
+    refuse(error);
+  }
 });
 
 byId("open").addEventListener("click", () => byId("file").click());
@@ -534,7 +553,11 @@ byId("play").addEventListener("click", () => {
 new ResizeObserver(draw).observe(canvas);
 
 (async () => {
-  const first = await (await fetch("/first")).json();
-  for (const policy of first.policies) byId("policy").add(new Option(policy, policy));
-  begin(first.scenario);
+  try {
+    const first = await ask("/first");
+    for (const policy of first.policies) byId("policy").add(new Option(policy, policy));
+    begin(first.scenario);
+  } catch (error) {
+    refuse(error);
+  }
 })();

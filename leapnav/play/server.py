@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Awaitable, Callable
 from importlib.resources import files
 from typing import Any
@@ -50,8 +51,11 @@ def create_app(answers: Answers, scenario: Scenario, host: str = "127.0.0.1") ->
         return JSONResponse({"scenario": scenario.to_dict(), "policies": answers.policies})
 
     async def bank(request: Request) -> Response:
+        index = request.query_params.get("index", "0")
         try:
-            found = banked(request.query_params.get("family", ""), int(request.query_params.get("index", "0")))
+            if not re.fullmatch(r"-?[0-9]{1,9}", index):
+                raise ValueError(f"index: expected a number, got {index[:20]!r}")
+            found = banked(request.query_params.get("family", ""), int(index))
         except ValueError as error:
             return _refused(error)
         return JSONResponse({"scenario": found.to_dict()})
@@ -110,7 +114,10 @@ def _question(answer: Callable[[dict[str, Any]], dict[str, Any]]) -> Endpoint:
         except ClientDisconnect:
             return Response(status_code=400)
         try:
-            question = json.loads(body)
+            try:
+                question = json.loads(body)
+            except (ValueError, RecursionError):
+                raise ValueError("the question is not JSON") from None
             if not isinstance(question, dict):
                 raise ValueError("expected a JSON object")
             return JSONResponse(await run_in_threadpool(answer, question))
@@ -121,8 +128,12 @@ def _question(answer: Callable[[dict[str, Any]], dict[str, Any]]) -> Endpoint:
 
 
 def _refused(error: Exception) -> Response:
-    return JSONResponse({"error": str(error).splitlines()[0] if str(error) else type(error).__name__}, 400)
+    line = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return JSONResponse({"error": line.encode("utf-8", "replace").decode()}, 400)  # no halves of surrogate pairs
 
 
 def _scenario(question: dict[str, Any]) -> Scenario:
-    return Scenario.from_dict(question.get("scenario"))
+    scenario = Scenario.from_dict(question.get("scenario"))
+    if not scenario.name.isprintable():
+        raise ValueError(f"Scenario: name: expected printable characters, got {ascii(scenario.name)[:80]}")
+    return scenario
