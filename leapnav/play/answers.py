@@ -46,10 +46,10 @@ class Answers:
             start = perf_counter()
             guess = self._solved.get(before or "")
             found = None if guess is None else solve(scenario, method="multiple_shooting", guess=guess)
-            searched = found is None or not found.success
-            if searched:
-                found = find_optimum(scenario, CANDIDATES, thorough=False)
-            return {**self._describe(scenario, found, start), "searched": searched}
+            if found is not None and found.success:
+                return {**self._describe(scenario, found, start), "searched": False}
+            found = find_optimum(scenario, CANDIDATES, thorough=False)
+            return {**self._describe(scenario, found, start), "searched": True}
 
     def search(self, scenario: Scenario) -> dict[str, Any]:
         """The optimum with its alternatives, by the whole search."""
