@@ -25,6 +25,7 @@ from numba import float64, int64, njit, types
 # A term whose distance exceeds 30 sigma is below 1e-13 k, a tenth of what the integrator is asked for, and is skipped.
 CUTOFF = 30.0
 VALUE_CUTOFF = 25.0  # where nothing is differentiated
+ROUGH_CUTOFF = 20.0  # where a billionth of k is nothing
 CIRCLES, POLYGONS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # positions in the packed field
 FEW, MOST_CELLS = 16, 32  # obstacles without a grid; columns or lines of one
 _field = types.Array(types.float64, 1, "C", readonly=True)
@@ -275,12 +276,19 @@ def _proximity_kernel(derivatives: bool, cutoff: float) -> Any:
 
 
 _proximity, _proximity_value = _proximity_kernel(True, CUTOFF), _proximity_kernel(False, VALUE_CUTOFF)
+_rough_proximity = _proximity_kernel(True, ROUGH_CUTOFF)
 
 
 @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
 def proximity(x, y, field):
     """Proximity cost at a point: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
     return _proximity(x, y, field)
+
+
+@njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
+def rough_proximity(x, y, field):
+    """`proximity` to 1e-9 of the weight for each obstacle: among hundreds it takes half the time."""
+    return _rough_proximity(x, y, field)
 
 
 @njit(float64(float64, float64, _field), cache=True, error_model="numpy", nogil=True)

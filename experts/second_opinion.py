@@ -17,8 +17,9 @@ from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.initial_path import local_minima
 from leapnav.experts.lattice import Lattice
-from leapnav.experts.optimum import Search, find_optimum
+from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem import OptimalControlProblem, Path
+from leapnav.experts.search import Search
 
 # Refinement, margin (m), reach and number of candidates of the lattices that are searched.
 LATTICES = ((1, None, 1.6, 80), (2, None, 1.4, 80), (1, 0.05, 1.6, 40))

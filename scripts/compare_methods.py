@@ -1,11 +1,11 @@
-"""All methods on all families: clones of several seeds, PPO from scratch and from a clone, the policies that ship.
+"""All methods on all families: clones of several seeds, PPO and SAC from scratch and from a clone, what ships.
 
 python scripts/compare_methods.py --runs DIR                      # what is finished there is not done again
 python scripts/compare_methods.py --only bc --families open       # some
 python scripts/compare_methods.py --table                         # nothing is trained: the table of what is there
 
 What takes less than ten minutes is run with five seeds; clones share their demonstrations, so that their spread is the
-fit's. PPO from a clone starts with the first one.
+fit's. PPO and SAC from a clone start with the first one.
 """
 
 import argparse
@@ -14,25 +14,38 @@ from pathlib import Path
 
 from leapnav.envs import FAMILIES, ScenarioBank
 from leapnav.experts.rollouts import rollout
-from leapnav.training import BCConfig, PPOConfig, train_bc, train_ppo
+from leapnav.training import BCConfig, PPOConfig, SACConfig, train_bc, train_ppo, train_sac
 from leapnav.training.contest import contest
 from leapnav.training.entrants import load_entrant
 from leapnav.training.reports import COLUMNS, cell
 
 SHOWN = ("success", "collision", "soc", "regret")
-METHODS = ("bc", "scratch", "warm")
+METHODS = ("bc", "scratch", "warm", "sac", "sacwarm")
+FROM_A_CLONE = ("warm", "sacwarm")
 DEMONSTRATIONS = {"open": 2000, "clutter": 10_000, "polygons": 4000, "rooms": 4000, "slalom": 4000}
 DEMONSTRATION_SEED = 60_000
 STEPS = {"open": 1_000_000, "clutter": 5_000_000, "polygons": 2_000_000, "rooms": 2_000_000, "slalom": 2_000_000}
-ONE_SEED = {"bc": ("slalom",), "scratch": ("clutter", "polygons", "rooms", "slalom"), "warm": tuple(FAMILIES)}
-EVALUATIONS = 8  # on the way of a run of PPO
-ROWS = {"bc": "clone of {demos:,}", "scratch": "PPO from scratch, {steps:.1f} M steps", "warm": "PPO from a clone"}
+SAC_STEPS = 100_000
+ONE_SEED = {
+    "bc": ("slalom",),
+    "scratch": ("clutter", "polygons", "rooms", "slalom"),
+    "warm": ("clutter", "polygons", "rooms", "slalom"),
+    **dict.fromkeys(("sac", "sacwarm"), tuple(FAMILIES)),
+}
+EVALUATIONS = 8  # on the way of a run of PPO or SAC
+ROWS = {
+    "bc": "clone of {demos:,}",
+    "scratch": "PPO from scratch, {steps:.1f} M steps",
+    "warm": "PPO from a clone",
+    "sac": "SAC from scratch, {sac_steps:.1f} M steps",
+    "sacwarm": "SAC from a clone, {sac_steps:.1f} M steps",
+}
 
 
 def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> None:
     """The runs of a method on a family that are not finished."""
     demos = runs / family / "demonstrations"
-    if method != "scratch":
+    if method == "bc" or method in FROM_A_CLONE:
         rollout(family, DEMONSTRATIONS[family], demos, seed=DEMONSTRATION_SEED, workers=workers)
     for seed in range(1 if family in ONE_SEED[method] else seeds):
         out = runs / family / f"{method}-{seed}"
@@ -40,16 +53,21 @@ def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> Non
         if method == "bc":
             train_bc(BCConfig.tuned(family, demos=(demos,), **run))
             continue
-        if method == "warm":
-            config = PPOConfig.tuned(family, warm_start=(runs / family / "bc-0", demos), **run)
-        else:
-            config = PPOConfig.tuned(family, total_timesteps=STEPS[family], **run)
+        if method in FROM_A_CLONE:
+            run["warm_start"] = (runs / family / "bc-0", demos)
+        if method in ("sac", "sacwarm"):
+            every = SAC_STEPS // EVALUATIONS
+            train_sac(SACConfig.tuned(family, total_timesteps=SAC_STEPS, evaluate_every=every, **run))
+            continue
+        if method == "scratch":
+            run["total_timesteps"] = STEPS[family]
+        config = PPOConfig.tuned(family, **run)
         train_ppo(replace(config, evaluate_every=config.total_timesteps // EVALUATIONS))
 
 
 def entrants(family: str, runs: Path) -> list[str]:
     """What the table of a family compares, each with its row's name."""
-    values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6}
+    values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6, "sac_steps": SAC_STEPS / 1e6}
     found = [
         f"{ROWS[method].format(**values)}={folder}"
         for method in METHODS

@@ -81,6 +81,17 @@ def test_the_same_scenario_gives_the_same_optimum_bit_for_bit():
     assert one.cost == other.cost
 
 
+def test_alternatives_get_only_so_much_work(monkeypatch):
+    """Among hundreds of obstacles the dearer ones would take most of the time; the optimum does not depend on them."""
+    scenario = sample_scenario("clutter", 2)
+    optimum = find_optimum(scenario)
+    monkeypatch.setattr("leapnav.experts.optimum.WORK_ON_ALTERNATIVES", 1)
+    hasty = find_optimum(scenario)
+    assert hasty.cost == optimum.cost
+    assert [a.cost for a in hasty.alternatives] == [a.cost for a in optimum.alternatives[: len(hasty.alternatives)]]
+    assert 1 <= len(hasty.alternatives) < len(optimum.alternatives)
+
+
 def test_candidates_are_distinct_and_in_order():
     candidates = [c for c, _ in zip(Lattice(BEST_KNOWN[0][0]).candidates(), range(6), strict=False)]
     assert [c.cost for c in candidates] == sorted(c.cost for c in candidates)
