@@ -11,7 +11,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import ConvexHull
 
-from leapnav.envs.obstacles import clearances, pack_field
+from leapnav.envs.fields import pack_field
+from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario
 
 ARENA = (0.0, 0.0, 10.0, 10.0)

@@ -18,7 +18,8 @@ import pymunk.batch
 from numba import float64, njit, types
 
 from leapnav.envs.arcs import follow_arc
-from leapnav.envs.obstacles import ARENA, clearance, proximity_value, unpack_field
+from leapnav.envs.fields import ARENA, unpack_field
+from leapnav.envs.obstacles import clearance, proximity_value
 
 WALL_THICKNESS = 1.0  # m, outside the arena
 SKIN = 1e-3  # m by which the rim is felt farther out, so that a robot that slides along something stays in contact

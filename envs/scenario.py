@@ -18,8 +18,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
+from leapnav.envs.fields import pack_field
 from leapnav.envs.maps import check_discs, disc_arena, read_movingai, rectangles
-from leapnav.envs.obstacles import clearance, pack_field
+from leapnav.envs.obstacles import clearance
 
 # Squares of larger numbers, in metres or seconds, would leave nothing of a double's precision for the robot.
 LARGEST = 1e6
@@ -159,7 +160,7 @@ class Scenario(_Frozen):
 
     @cached_property
     def field(self) -> np.ndarray:
-        """The obstacle field packed for the kernels of `leapnav.envs.obstacles` (read-only)."""
+        """The obstacle field packed for the kernels, see `leapnav.envs.fields` (read-only)."""
         cost = self.cost
         shapes = [obstacle.shape for obstacle in self.obstacles]
         return pack_field(shapes, self.arena, self.robot.radius, cost.proximity_weight, cost.proximity_scale)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import float64, int64, njit, types
 
-from leapnav.envs.obstacles import ARENA, CIRCLES, POLYGONS, SHAPES, polygon_distance
+from leapnav.envs.fields import ARENA, CIRCLES, POLYGONS, SHAPES
+from leapnav.envs.obstacles import polygon_distance
 
 _field = types.Array(types.float64, 1, "C", readonly=True)
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from leapnav.envs.obstacles import blend_fields
+from leapnav.envs.fields import blend_fields
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal, SolveError
 from leapnav.experts.methods import Method, solve

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from leapnav.envs.obstacles import obstacle_centres
+from leapnav.envs.fields import obstacle_centres
 
 Side = Literal["left", "right"]
 Mode = Literal["forward", "backward"]
