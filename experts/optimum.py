@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -97,9 +97,12 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
         An `Optimum`; if nothing is certified, a failure whose status says why.
 
     Raises:
+        TypeError: no scenario.
         ValueError: candidates < 1.
 
     """
+    if not isinstance(cast(object, scenario), Scenario):
+        raise TypeError(f"scenario: expected a Scenario, got {type(scenario).__name__}; a problem is for `solve`")
     if candidates < 1:
         raise ValueError(f"candidates: expected at least 1, got {candidates!r}")
     problem = OptimalControlProblem.from_scenario(scenario)

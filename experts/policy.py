@@ -274,5 +274,5 @@ def _environments(env: Any) -> list[NavigateEnv | NavigateVectorEnv]:
     inner = [getattr(one, "unwrapped", one) for one in getattr(env, "envs", [env])]
     for one in inner:
         if not isinstance(one, (NavigateEnv, NavigateVectorEnv)):
-            raise TypeError(f"env: expected leapnav's environment, got {one}")
+            raise TypeError(f"env: expected leapnav's environment, got {type(one).__name__}")
     return inner

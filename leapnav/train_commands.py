@@ -60,16 +60,18 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
     """The command as a type whose defaults depend on the family, the warm start and the run that the words ask for.
 
     Raises:
-        ValueError: the run to resume has a damaged configuration.
+        ValueError: there is no such family, or the run to resume has a damaged configuration.
 
     """
     arguments = [word.replace("_", "-") if word.startswith("--") and "=" not in word else word for word in arguments]
-    family, out = _option(arguments, "--family") or "clutter", _option(arguments, "--out")
+    meant = arguments[:1] == ["train"]  # the other commands have families and folders of their own
+    family = (_option(arguments, "--family") if meant else None) or RunConfig.family
+    out = _option(arguments, "--out")
     warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
     defaults: dict[str, Any] = {
         name: replace(kind.tuned(family, warm=warm), out=tyro.MISSING) for name, kind in ALGORITHMS.items()
     }
-    if "--resume" in arguments and out is not None and "train" in arguments[:1]:
+    if meant and "--resume" in arguments and out is not None:
         algorithm, config = read_config(Path(out))
         if algorithm in defaults:
             defaults[algorithm] = replace(config, out=tyro.MISSING)

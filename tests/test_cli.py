@@ -402,7 +402,7 @@ def test_closing_the_window_ends_the_watching(capsys, monkeypatch):
         (["--video", "film.mp4", "--index", "3", "--split", "fresh"], "index: a newly drawn scenario has no number"),
         (["--video", "film.mp4", "--episodes", "0"], "episodes: expected at least 1, got 0"),
         (["--video", "film.mp4", "--family", "maze"], "family: expected one of open, .*got 'maze'"),
-        (["--video", "film.mp4", "--policy", "nowhere"], "nowhere/policy.json: No such file"),
+        (["--video", "film.mp4", "--policy", "nowhere"], "nowhere: no such policy"),
         (["--video", "film.mp4", "--disturbance", "-1"], "disturbance: expected a number >= 0, got -1.0"),
     ],
 )

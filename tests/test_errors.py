@@ -1,13 +1,34 @@
-# ruff: noqa: E501
-"""What the command line says to bad input: the words, and the one line that is printed. Nothing is written."""
+"""What is said to bad input, in two tables: the input, and below it the line that comes of it. Nothing is written.
+
+`data/errors_on_the_command_line.txt` has words for `leapnav`, `data/errors_in_python.txt` expressions, whose names are
+the public ones and those of `names` below.
+"""
 
 import json
+import math
+import shutil
+from dataclasses import replace
 
+import gymnasium as gym
+import h5py
+import numpy as np
 import pytest
-from helpers import scenario_fields
+import sympy as sp
+from helpers import DATA, SMALL, scenario_fields
+from stable_baselines3 import PPO
 
+import leapnav.envs
+import leapnav.experts
+import leapnav.training
 from leapnav.cli import main
+from leapnav.envs import NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
+from leapnav.envs.settings import Settings
+from leapnav.experts import ControlAffineSystem, ExpertPolicy, OptimalControlProblem, find_optimum, solve, unicycle
+from leapnav.experts import Path as Guess
+from leapnav.experts.rollouts import rollout
+from leapnav.training import Dataset, evaluate, make_policy, make_vec_env
 
+BANK = ScenarioBank.shipped("open", "test")
 FILES = {
     "good.json": scenario_fields(),
     "empty.json": "",
@@ -26,187 +47,119 @@ FILES = {
     "missing.json": {"name": "m"},
     "radius.json": scenario_fields(robot={"radius": "big"}),
     "model.json": scenario_fields(robot={"model": "tank"}),
-    "data.bank": "no bank",
+    "text.bank": "no bank",
+    "good.map": "type octile\nheight 2\nwidth 3\nmap\n...\n.@.\n",
+    "head.map": "height 2\n",
+    "size.map": "type octile\nheight two\nwidth 3\nmap\n...\n...\n",
+    "short.map": "type octile\nheight 2\nwidth 3\nmap\n...\n",
+    "cell.map": "type octile\nheight 1\nwidth 3\nmap\n.x.\n",
+    "utf8.map": "type octile\nheight 1\nwidth 3\nmap\n.é.\n",
+    "data/x": "",
 }
-TABLE = """
-solve nowhere.json
-    nowhere.json: No such file or directory
-solve empty
-    empty: Is a directory
-solve empty.json
-    scenario empty.json: not valid JSON: Expecting value: line 1 column 1 (char 0)
-solve list.json
-    a scenario is a JSON object, got [1]
-solve text.json
-    scenario text.json: not valid JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)
-solve horizon.json
-    Scenario 'small': horizon: input should be greater than 0, got -1
-solve nan.json
-    Scenario 'small': horizon: input should be a finite number, got nan
-solve unknown.json
-    Scenario 'small': speed: extra inputs are not permitted, got 3
-solve inside.json
-    Scenario 'small': goal: (4, 4.5) is inside obstacles[0] (clearance -1.05 m)
-solve wall.json
-    Scenario 'small': start: (0.1, 5) is inside the arena wall (clearance -0.15 m)
-solve star.json
-    Scenario 'small': obstacles[0].polygon.vertices: the polygon is not strictly convex; write a non-convex obstacle as several convex ones, got ((0, 0), (1, 1), (1, 0), (0, 1))
-solve two.json
-    Scenario 'small': obstacles[0].polygon.vertices: a polygon needs at least 3 vertices, this one has 2, got ((3, 3), (4, 3))
-solve both.json
-    Scenario 'small': obstacles[0]: an obstacle is exactly one of 'circle' or 'polygon', got {}
-solve arena.json
-    Scenario 'small': arena: the arena needs x_min < x_max and y_min < y_max, got (5, 0, 0, 5)
-solve twice.json
-    scenario: name: the key appears more than once
-solve missing.json
-    Scenario 'm': arena: field required (and 3 more)
-solve radius.json
-    Scenario 'small': robot.radius: input should be a valid number, got 'big'
-solve model.json
-    Scenario 'small': robot.model: input should be 'unicycle', got 'tank'
-solve good.json --plot path.gif
-    path.gif: expected a name that ends in .png, .pdf, .svg
-solve good.json --plot nowhere/path.png
-    nowhere/path.png: its folder does not exist
-solve good.json --json empty
-    empty: is a folder
-solve good.json --json nowhere/out.json
-    nowhere/out.json: its folder does not exist
-bank build --family moon --out x.bank
-    family: expected one of open, clutter, polygons, rooms, slalom, got 'moon'
-bank build --count 0 --out x.bank
-    count: expected at least 1, got 0
-bank build --seed -1 --out x.bank
-    seed: expected at least 0, got -1
-bank build --workers 0 --out x.bank
-    workers: expected at least 1, got 0
-bank build --out nowhere/x.bank
-    nowhere: no such folder
-bank build --out data.bank
-    {folder}/data.bank: no scenario bank, or damaged: Unable to synchronously open file (file signature not found)
-bank show nowhere.bank
-    {folder}/nowhere.bank: no such bank
-bank show data.bank
-    {folder}/data.bank: no scenario bank, or damaged: Unable to synchronously open file (file signature not found)
-bank show rooms-test --count -1
-    count: expected at least 0, got -1
-bank show rooms-test --plot sheet.txt
-    sheet.txt: expected a name that ends in .png, .pdf, .svg
-rollout --family moon --out demos
-    family: expected one of open, clutter, polygons, rooms, slalom or all, got 'moon'
-rollout --count 0 --out demos
-    count: expected at least 1, got 0
-rollout --seed 1 --out demos
-    seed: expected at least 2, got 1
-rollout --recoveries -1 --out demos
-    recoveries: expected at least 0, got -1
-rollout --noise -0.1 --out demos
-    noise: expected at least 0.0, got -0.1
-rollout --noise nan --out demos
-    noise: expected at least 0.0, got nan
-rollout --workers 0 --out demos
-    workers: expected at least 1, got 0
-rollout --check --out empty
-    empty: expected one Minari dataset, found 0
-rollout --check --out nowhere
-    nowhere: expected one Minari dataset, found 0
-train bc --family moon --out run
-    family: expected one of open, clutter, polygons, rooms, slalom or all, got 'moon'
-train bc --demos nowhere --out run
-    nowhere: expected one Minari dataset, found 0
-train bc --hidden 0 --out run
-    hidden: expected widths of at least 1, got (0,)
-train bc --seed -1 --out run
-    seed: expected a number from 0 to 2^32 - 1, got -1
-train bc --lidar-beams 7 --out run
-    lidar_beams: expected an even number from 2 on, got 7
-train bc --cloning.epochs 0 --out run
-    cloning.epochs: expected a positive number, got 0
-train bc --cloning.learning-rate -1 --out run
-    cloning.learning_rate: expected a positive number, got -1.0
-train bc --cloning.validation-share 1 --out run
-    cloning.validation_share: expected a number in [0, 1), got 1.0
-train bc --resume --out nowhere
-    nowhere/config.json: there is no run in this folder
-train dagger --dagger.rounds 0 --out run
-    dagger.rounds: expected at least 1, got 0
-train dagger --policy nowhere --out run
-    nowhere/policy.json: No such file or directory
-train ppo --total-timesteps 0 --out run
-    total_timesteps: expected at least 1, got 0
-train ppo --warm-start nowhere --out run
-    warm_start: nowhere: no such folder of demonstrations or of a policy
-train ppo --divergence 0.5 --out run
-    divergence: without a clone there is nothing to diverge from, got 0.5
-train ppo --gamma 2 --out run
-    gamma: expected a number in [0, 1], got 2.0
-train ppo --penalty -1 --out run
-    penalty: expected a number >= 0, got -1.0
-train sac --demonstrations 1 --out run
-    demonstrations: expected a number in [0, 1), got 1.0
-train sac --ent-coef loud --out run
-    ent_coef: expected a number >= 0, or auto or auto_NUMBER for SAC, got 'loud'
-evaluate nowhere
-    nowhere/policy.json: No such file or directory
-evaluate moon
-    moon/policy.json: No such file or directory
-evaluate expert --family moon
-    family: expected one of open, clutter, polygons, rooms, slalom or all, got 'moon'
-evaluate expert --count 0
-    count: expected at least 1, got 0
-evaluate expert expert
-    policies: expert: named more than once
-evaluate expert --bank nowhere.bank
-    {folder}/nowhere.bank: no such bank
-evaluate expert --bank data.bank
-    {folder}/data.bank: no scenario bank, or damaged: Unable to synchronously open file (file signature not found)
-evaluate empty
-    empty/policy.json: No such file or directory
-evaluate expert --plot scores.txt
-    scores.txt: expected a name that ends in .png, .pdf, .svg
-report nowhere
-    nowhere/policy.json: No such file or directory
-report empty
-    empty/policy.json: No such file or directory
-report nowhere --out report.txt
-    report.txt: expected a name that ends in .html
-watch --episodes 0 --video x.mp4
-    episodes: expected at least 1, got 0
-watch --family moon --video x.mp4
-    family: expected one of open, clutter, polygons, rooms, slalom or all, got 'moon'
-watch --policy nowhere --video x.mp4
-    nowhere/policy.json: No such file or directory
-watch --index 3 --split fresh --video x.mp4
-    index: a newly drawn scenario has no number, got 3
-watch --index 200 --video x.mp4
-    index: the bank has scenarios 0 to 199, got 200 to 202
-watch --video x.gif
-    x.gif: expected a name that ends in .mp4
-watch --disturbance -1 --video x.mp4
-    disturbance: expected a number >= 0, got -1.0
-play --port 65536 --no-browser
-    port: expected 0 to 65535, got 65536
-play --scenario nowhere.json --no-browser
-    nowhere.json: No such file or directory
-play --scenario horizon.json --no-browser
-    Scenario 'small': horizon: input should be greater than 0, got -1
-play --policies nowhere --no-browser
-    nowhere/policy.json: No such file or directory
-doctor --json nowhere/x.json
-    nowhere/x.json: its folder does not exist
-"""
-LINES = TABLE.strip().splitlines()
-ROWS = [(words, line.strip()) for words, line in zip(LINES[::2], LINES[1::2], strict=True)]
 
 
-@pytest.mark.parametrize(("words", "line"), ROWS, ids=[words for words, _ in ROWS])
-def test_the_line_that_is_printed(words, line, tmp_path, monkeypatch, capsys):
+def rows(name):
+    """Pairs of an input and what comes of it."""
+    lines = (DATA / name).read_text().splitlines()
+    return [pytest.param(text, found.strip(), id=text) for text, found in zip(lines[::2], lines[1::2], strict=True)]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with files of all kinds, and in the end still those alone."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "data").mkdir()
     for name, content in FILES.items():
-        (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
+        text = content if isinstance(content, str) else json.dumps(content)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    with h5py.File(tmp_path / "hdf5.bank", "w") as file:
+        file["x"] = 1
+    for name in ("newer.bank", "cut.bank"):
+        shutil.copy(BANK.path, tmp_path / name)
+    with h5py.File(tmp_path / "newer.bank", "a") as file:
+        file.attrs["version"] = 99
+    with h5py.File(tmp_path / "cut.bank", "a") as file:
+        del file["costs"]
     before = sorted(tmp_path.rglob("*"))
-    assert main(words.split()) == 2
-    assert capsys.readouterr().err == f"leapnav: {line.replace('{folder}', str(tmp_path))}\n"
+    yield tmp_path
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("words", "line"), rows("errors_on_the_command_line.txt"))
+def test_the_line_that_is_printed(words, line, folder, capsys):
+    assert main(words.split()) == 2
+    assert capsys.readouterr().err == f"leapnav: {line.replace('{folder}', str(folder))}\n"
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory):
+    """What the expressions speak of."""
+    public = {
+        name: getattr(package, name)
+        for package in (leapnav.envs, leapnav.experts, leapnav.training)
+        for name in package.__all__
+    }
+    deep: list = []
+    for _ in range(2000):
+        deep = [deep]
+    env, vector = NavigateEnv("open", split="test"), NavigateVectorEnv(2, "open", split="test")
+    env.reset(seed=0)
+    vector.reset(seed=0)
+    x, y, z = sp.symbols("x y z")
+    problem = OptimalControlProblem(unicycle(), (0, 0, 0), (1, 0.5, 1), 1.0, (1, 1))
+    enclosed = Scenario.from_dict(
+        scenario_fields(obstacles=[{"polygon": {"vertices": [[4, 0], [5, 0], [5, 10], [4, 10]]}}])
+    )
+    shut = NavigateEnv(scenario=enclosed)
+    shut.reset()
+    demonstrations = tmp_path_factory.mktemp("demonstrations") / "open"
+    rollout("open", 2, demonstrations, progress=False)
+    data = Dataset.of(demonstrations)
+    robots = make_vec_env(n_envs=2, seed=0, family="open", split="fresh")
+    motors = make_vec_env(n_envs=2, seed=0, family="open", split="fresh", actuation="motor")
+    return {
+        **public,
+        "Path": Guess,
+        "Settings": Settings,
+        "replace": replace,
+        "rollout": rollout,
+        "nan": math.nan,
+        "FIELDS": Scenario.from_dict(scenario_fields()).model_dump(),
+        "DEEP": deep,
+        "BANK": BANK,
+        "ENV": env,
+        "VECTOR": vector,
+        "POSE": np.zeros((3, 4)),
+        "X": x,
+        "Y": y,
+        "Z": z,
+        "UNICYCLE": unicycle(),
+        "PROBLEM": problem,
+        "BOUNDED": replace(problem, control_bounds=((-9, 9), (-9, 9))),
+        "FREE": replace(problem, goal=(1, 0.5, None)),
+        "OTHER_SYSTEM": OptimalControlProblem(ControlAffineSystem([x], [0], [[1]]), (0,), (1,), 1.0, (1,)),
+        "EXTREMAL": solve(problem),
+        "PATHLESS": find_optimum(enclosed),
+        "SHUT_ENV": shut,
+        "CARTPOLE": gym.make("CartPole-v1"),
+        "POLICY": make_policy(env.observation_space, env.action_space, hidden=SMALL),
+        "PPO_MODEL": PPO("MlpPolicy", robots, device="cpu"),
+        "DATA": data,
+        "OTHER_DATA": data.observed(replace(data.settings, lidar_beams=8)),
+        "PLAIN_DATA": replace(data, costates=math.nan * data.costates, returns=math.nan * data.returns),
+        "VENV": robots,
+        "EXPERT": ExpertPolicy(robots),
+        "EXPERT_ONE": ExpertPolicy(env),
+        "MOTORS": motors,
+        "MOTOR_EXPERT": ExpertPolicy(motors),
+        "FEW_EPISODES": evaluate(ExpertPolicy, BANK, count=1, progress=False),
+        "MORE_EPISODES": evaluate(ExpertPolicy, BANK, count=2, progress=False),
+    }
+
+
+@pytest.mark.parametrize(("expression", "line"), rows("errors_in_python.txt"))
+def test_the_exception_that_is_raised(expression, line, folder, names):
+    with pytest.raises(Exception) as raised:  # noqa: PT011 (which one, and what it says, is below)
+        eval(expression, dict(names))
+    assert f"{raised.type.__name__}: {raised.value}" == line.replace("{folder}", str(folder))

@@ -46,12 +46,15 @@ class GoToGoal:
     Args:
         env: the environment that is driven, single or vector; its scenarios' speed limits are read.
 
+    Raises:
+        TypeError: it is not leapnav's.
+
     """
 
     def __init__(self, env: Any) -> None:
-        self._env = env.unwrapped
+        self._env = getattr(env, "unwrapped", env)
         if not isinstance(self._env, (NavigateEnv, NavigateVectorEnv)):
-            raise TypeError(f"env: expected leapnav's environment, got {env}")
+            raise TypeError(f"env: expected leapnav's environment, got {type(self._env).__name__}")
 
     def predict(
         self,

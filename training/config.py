@@ -121,7 +121,14 @@ class RunConfig:
             warm: whether those for a warm start; None: if `changes` have a `warm_start`.
             changes: of any settings.
 
+        Raises:
+            ValueError: there is no such family.
+
         """
+        if family != cls.family:  # the default is one; whoever only asks for help need not wait for the others
+            from leapnav.envs.families import check_family
+
+            check_family(family)
         if warm is None:
             warm = bool(changes.get("warm_start"))
         config = cls(out=Path(), family=family)

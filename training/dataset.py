@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 
@@ -217,6 +218,8 @@ class Dataset:
             ValueError: it is damaged, or of another format.
 
         """
+        if Path(path).is_file() and not is_zipfile(path):  # of which numpy says that it might be a pickle
+            raise ValueError(f"{os.fspath(path)}: not a dataset's file")
         try:
             with np.load(path, allow_pickle=False) as file:
                 found = int(file["format"])

@@ -153,10 +153,13 @@ def evaluate(
         progress: show it.
 
     Raises:
+        TypeError: the policy is none.
         ValueError: an argument is impossible, or the policy's observations are not the environment's.
 
     """
-    if isinstance(bank, str):
+    if not (hasattr(policy, "predict") or callable(policy)):
+        raise TypeError(f"policy: expected one, or a function that makes one for an environment, got {policy!r}")
+    if not isinstance(bank, ScenarioBank):
         if bank not in FAMILIES:
             raise ValueError(f"bank: expected a ScenarioBank or one of {', '.join(FAMILIES)}, got {bank!r}")
         bank = ScenarioBank.shipped(bank, "test")

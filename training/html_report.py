@@ -70,9 +70,11 @@ def write_report(
 
     Raises:
         FileNotFoundError: a folder holds no run.
-        ValueError: a run is damaged.
+        ValueError: there are no runs, or one is damaged.
 
     """
+    if not runs:
+        raise ValueError("runs: expected at least one, got none")
     found = [_read(os.fspath(run)) for run in runs]
     trained = {name for run in found for name in (FAMILIES if run.config.family == ALL else (run.config.family,))}
     families = [family for family in FAMILIES if family in trained]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -124,9 +125,11 @@ def make_policy(
 
 
 def _check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
-    box = isinstance(observation_space, spaces.Box) and observation_space.shape[0] > GOAL_ENTRIES
-    if not box or not isinstance(action_space, spaces.Box):
-        raise ValueError(f"observation_space: expected one of {ENVIRONMENT} with a lidar, got {observation_space}")
+    if not (isinstance(observation_space, spaces.Box) and observation_space.shape[0] > GOAL_ENTRIES):
+        of = observation_space.shape or type(observation_space).__name__
+        raise ValueError(f"observation_space: expected that of {ENVIRONMENT} with a lidar, got one of {of}")
+    if not (isinstance(action_space, spaces.Box) and action_space.shape == (2,)):
+        raise ValueError(f"action_space: expected that of {ENVIRONMENT}, got {action_space}")
 
 
 def save_policy(
@@ -194,6 +197,9 @@ def read_description(folder: str | Path) -> dict[str, Any]:
 
     """
     path = policy_folder(folder) / "policy.json"
+    if not path.parent.is_dir():
+        shipped = ", ".join(shipped_policies())
+        raise FileNotFoundError(errno.ENOENT, f"no such policy; those that ship are {shipped}", str(folder))
     text = path.read_text()
     try:
         description = json.loads(text)

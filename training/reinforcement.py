@@ -149,7 +149,7 @@ def _train(
 
 def _start(config: Config) -> tuple[list[Path], BasePolicy | None]:
     """The folders of demonstrations, and the policy, among what a warm start is given."""
-    places = config.warm_start
+    places = [Path(place) for place in config.warm_start]
     policies = [place for place in places if (policy_folder(place) / "policy.json").is_file()]
     if len(policies) > 1:
         raise ValueError(f"warm_start: expected at most one policy, got {policies[0]} and {policies[1]}")

@@ -105,7 +105,12 @@ def profile(runs: Sequence[Evaluation], ratios: np.ndarray, seed: int = 0) -> np
     Returns:
         value, low, high (3, len(ratios)): with the intervals of `score`.
 
+    Raises:
+        ValueError: there are no runs.
+
     """
+    if not runs:
+        raise ValueError("runs: expected at least one, got none")
     values = np.array([[episode.ratio for episode in run] for run in runs])
     families = np.array([episode.family for episode in runs[0]])
     rows = []

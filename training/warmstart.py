@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -70,10 +70,13 @@ def warm_start(
         progress: show progress bars.
 
     Raises:
+        TypeError: the model is no algorithm.
         FileNotFoundError: there is no such dataset.
         ValueError: the dataset does not fit, or a setting is impossible.
 
     """
+    if not isinstance(cast(object, model), BaseAlgorithm):
+        raise TypeError(f"model: expected an algorithm of Stable-Baselines3, got {type(model).__name__}")
     config = config or WarmStartConfig()
     check_warm_start(config)
     if not (math.isfinite(reward_scale) and reward_scale > 0):
