@@ -25,7 +25,7 @@ from leapnav.training import (
 )
 
 DEMONSTRATIONS, DEMONSTRATION_SEED = 2000, 50_000
-PPO_STEPS, SAC_STEPS = 400_000, 40_000
+PPO_STEPS, SAC_STEPS = 400_000, 20_000
 CLONE_ONLY = WarmStartConfig(critic=False)
 
 
@@ -51,9 +51,10 @@ def variants(clone: Path, demos: Path) -> dict[str, PPOConfig | SACConfig]:
         "PPO: all three, divergence 0.1": replace(full, divergence=0.1),
         "PPO: all three, jump-start 0.8": replace(full, jump_start=0.8),
         "SAC from scratch": SACConfig.tuned("clutter", total_timesteps=SAC_STEPS, lidar_beams=32, **every),
-        "SAC: actor": replace(sac, start=CLONE_ONLY, demonstrations=0.0),
-        "SAC: actor, critic, gradient": replace(sac, demonstrations=0.0),
-        "SAC: all three, demonstrations": sac,
+        "SAC: actor": replace(sac, start=CLONE_ONLY, demonstrations=0.0, imitation=0.0),
+        "SAC: actor, critic, gradient": replace(sac, demonstrations=0.0, imitation=0.0),
+        "SAC: all three, demonstrations": replace(sac, imitation=0.0),
+        "SAC: all three, demonstrations, imitation": sac,
     }
 
 

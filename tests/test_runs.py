@@ -176,6 +176,7 @@ def run(name, out, demos, resume):
         changes = {
             "learning_starts": 200,
             "checkpoint_every": 40,
+            "imitation": 5.0,
             "warm_start": (demos,),
             "reward": "cost",
             "start": start,

@@ -1,18 +1,19 @@
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
 from leapnav.envs import NavigateEnv, ScenarioBank, sample_scenario
 from leapnav.envs.observer import Observer
 from leapnav.experts import ExpertPolicy
 from leapnav.experts.rollouts import rollout
-from leapnav.training import CloningConfig, Dataset, make_vec_env, network, warm_start
+from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_vec_env, network, warm_start
+from leapnav.training.actors import mean_action
 from leapnav.training.anchored import AnchoredPolicy
 from leapnav.training.config import WarmStartConfig
 from leapnav.training.jump_start import JumpStart
-from leapnav.training.replay import DemonstrationReplayBuffer
+from leapnav.training.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.rewards import ScaledReward
 
 
@@ -256,6 +257,29 @@ def test_batches_hold_their_share_of_demonstrations(dataset):
         DemonstrationReplayBuffer(100, venv.observation_space, venv.action_space, dataset=dataset, share=1.0)
     with pytest.raises(ValueError, match="VecNormalize"):
         buffer.sample(8, env=VecNormalize(venv))
+
+
+@pytest.mark.parametrize("kind", [SAC, TD3])
+def test_imitation_holds_an_actor_to_the_demonstrations(kind, dataset):
+    """With a critic that knows nothing the actor drifts from a clone, unless its errors are in its loss."""
+    error = {}
+    for weight in (0.0, 100.0):
+        venv = make_vec_env(n_envs=2, seed=0, family="open", split="fresh")
+        model = kind("MlpPolicy", venv, policy_kwargs=small(), seed=0, learning_starts=0, batch_size=64)
+        behaviour_clone(model, dataset, CLONING, progress=False)
+        if weight > 0:
+            imitate(model, dataset, weight)
+        model.learn(200)
+        with th.no_grad():
+            actions = mean_action(model.policy, th.as_tensor(dataset.observations))
+        error[weight] = float(np.abs(actions.numpy() - dataset.actions).mean())
+    assert error[100.0] < 0.5 * error[0.0]
+
+
+def test_imitation_needs_the_models_observations(dataset):
+    model = SAC("MlpPolicy", make_vec_env(n_envs=2, lidar_beams=8), policy_kwargs=small())
+    with pytest.raises(ValueError, match="dataset: its observations have 41 numbers, the policy's 17"):
+        imitate(model, dataset, 1.0)
 
 
 def test_scaled_rewards_are_multiples():

@@ -29,7 +29,7 @@ COUNTS = (
 )
 POSITIVE = ("learning_rate", "reward_scale", "clip_range", "std", "control_period")
 SHARES = ("jump_start", "jump_start_until", "divergence_until", "gamma", "gae_lambda")
-NOT_NEGATIVE = ("divergence", "learning_starts", "penalty", "last_std", "quiet")
+NOT_NEGATIVE = ("divergence", "imitation", "learning_starts", "penalty", "last_std", "quiet")
 
 
 def check_config(config: RunConfig) -> None:

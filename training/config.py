@@ -272,6 +272,9 @@ class SACConfig(_LearnerConfig):
     """Weight of the entropy: a number, or "auto" with the first value."""
     demonstrations: float = 0.25
     """Share of each batch that is demonstrations, if a warm start has some."""
+    imitation: float = 0.0
+    """Weight, in the actor's loss, of the error of the demonstrations' actions. What an action of a tenth of a second
+    is worth is small beside the critic's errors, which would soon spoil a clone."""
     evaluate_every: int = 20_000
     """Steps between evaluations."""
     checkpoint_every: int = 50_000

@@ -30,7 +30,7 @@ from leapnav.training.evaluation import Evaluation
 from leapnav.training.imitation import robot_of, settings_of, show
 from leapnav.training.jump_start import JumpStart
 from leapnav.training.policies import load_policy, network, policy_folder
-from leapnav.training.replay import DemonstrationReplayBuffer
+from leapnav.training.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.rewards import GradedMiss, ScaledReward
 from leapnav.training.runs import Run
 from leapnav.training.vec_env import environment_seed, make_vec_env
@@ -117,6 +117,8 @@ def _train(
     demos, start = _start(config)
     if demos and config.reward != "cost":
         raise ValueError(f"reward: demonstrations have the rewards of 'cost', got {config.reward!r}")
+    if isinstance(config, SACConfig) and config.imitation > 0 and not demos:
+        raise ValueError(f"imitation: there are no demonstrations to imitate, got {config.imitation!r}")
     if isinstance(config, PPOConfig) and config.divergence > 0 and not (config.warm_start and config.start.actor):
         raise ValueError(f"divergence: without a clone there is nothing to diverge from, got {config.divergence!r}")
     dataset = Dataset.of(demos).observed(settings_of(config)) if demos else None
@@ -132,6 +134,9 @@ def _train(
     else:
         model = _load(type(model), found[0], venv, dataset, config)
     model.set_logger(run.logger)
+    if isinstance(config, SACConfig) and isinstance(model, OffPolicyAlgorithm) and config.imitation > 0:
+        assert dataset is not None  # as was checked
+        imitate(model, dataset, config.imitation)
     callback = _Keeper(run, config, venv, found[1] if found else None, progress)
     if found is not None:
         run.restore_generators()

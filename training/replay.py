@@ -1,15 +1,19 @@
-"""Demonstrations in the replay buffer of an off-policy learner."""
+"""Demonstrations for an off-policy learner: in the batches of its replay buffer, and in the loss of its actor."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+from torch.nn import functional
 
+from leapnav.training.actors import mean_action, policy_of
+from leapnav.training.cloning import ROBUST, check_observations
 from leapnav.training.dataset import Dataset
 
 
@@ -81,3 +85,38 @@ class DemonstrationReplayBuffer(ReplayBuffer):
     def __getstate__(self) -> dict[str, Any]:
         # A checkpoint need not hold the demonstrations again.
         return {name: value for name, value in self.__dict__.items() if name != "_demonstrated"}
+
+
+def imitate(model: OffPolicyAlgorithm, dataset: Dataset, weight: float, batch_size: int = 256) -> None:
+    """Gives the loss of an off-policy learner's actor a term for its errors where the expert has been.
+
+    After A. Nair et al., "Overcoming exploration in reinforcement learning with demonstrations" (ICRA 2018), and
+    S. Fujimoto and S. Gu, "A minimalist approach to offline reinforcement learning" (NeurIPS 2021). Its gradient is
+    added before each step of the actor's optimiser, so it goes with SAC, TD3 and their kin as they are.
+
+    Args:
+        model: whose actor it is; one that is loaded from a file needs it anew.
+        dataset: the demonstrations.
+        weight: of Huber's loss of the actions, beside the values in units of the rewards that the model sees.
+        batch_size: demonstrated samples per step.
+
+    Raises:
+        ValueError: the dataset's observations are not the model's.
+
+    """
+    policy = policy_of(model)
+    check_observations(policy, dataset)
+    optimiser: Any = cast(Any, policy).actor.optimizer
+
+    def add(*_: Any) -> None:
+        # Drawn as the replay buffer draws, so that a resumed run draws the same.
+        rows = np.random.randint(0, len(dataset), size=batch_size)  # noqa: NPY002
+        observations, actions = (
+            th.as_tensor(column[rows], dtype=th.float32, device=policy.device)
+            for column in (dataset.observations, dataset.actions)
+        )
+        with th.enable_grad():
+            error = mean_action(policy, observations) - actions
+            (weight * functional.huber_loss(error, th.zeros_like(error), delta=ROBUST)).backward()
+
+    optimiser.register_step_pre_hook(add)
