@@ -457,6 +457,12 @@ def merge(flow, times, Z, goal, free, data, field, tolerance, accuracy, costs, k
     return work
 
 
+def telling_sweeps(count: int, first: int, most: int) -> list[int]:
+    """Which of so many sweeps to show: the first ones, which change most, and an even selection of the rest."""
+    rest = np.linspace(first, count - 1, most - first).round().astype(int) if count > first else []
+    return sorted({*range(min(first, count)), *map(int, rest)})
+
+
 def dense_path(
     problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, points: int
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from leapnav.envs.bank import ScenarioBank
 from leapnav.envs.obstacles import clearance
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal, Iteration
-from leapnav.experts.feasible_path import dense_path
+from leapnav.experts.feasible_path import dense_path, telling_sweeps
 from leapnav.experts.optimum import Optimum
 from leapnav.experts.problem import OptimalControlProblem
 
@@ -35,7 +35,7 @@ FIELD_POINTS = 200  # per side, of an obstacle field
 BOUND_SHOWN = 3.0  # times the largest control
 SMALLEST_DRIFT = 1e-9  # below it the Hamiltonian's deviations are drawn small, as what they are
 SWEEPS = ("sweep", "reduce")  # Leapfrog's phases, whose rows carry a feasible path
-SWEEPS_DRAWN, FIRST_SWEEPS = 12, 4  # the first ones change most
+SWEEPS_DRAWN, FIRST_SWEEPS = 12, 4
 SMALLEST_DISTANCE = 1e-10  # of costs, relative: the end error that Leapfrog allows an arc
 SPREAD = 100.0  # costs further apart, in smallest distances, are drawn as distances on a logarithmic axis
 
@@ -324,11 +324,8 @@ def _draw_sweeps(
 
 
 def _chosen(sweeps: Sequence[Iteration]) -> dict[int, Any]:
-    """Which sweeps to draw, the first ones and an even selection of the rest, and their colours from light to dark."""
-    last = len(sweeps) - 1
-    first = min(FIRST_SWEEPS, len(sweeps))
-    rest = np.linspace(first, last, SWEEPS_DRAWN - first).round().astype(int) if last >= first else []
-    numbers = sorted({*range(first), *map(int, rest)})
+    """Which sweeps to draw, and their colours from light to dark."""
+    numbers = telling_sweeps(len(sweeps), FIRST_SWEEPS, SWEEPS_DRAWN)
     return dict(zip(numbers, colormaps["viridis_r"](np.linspace(0.12, 0.92, len(numbers))), strict=True))
 
 

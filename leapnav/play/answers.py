@@ -16,7 +16,7 @@ from leapnav.envs.families import check_family
 from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario
 from leapnav.experts.extremal import Extremal
-from leapnav.experts.feasible_path import dense_path
+from leapnav.experts.feasible_path import dense_path, telling_sweeps
 from leapnav.experts.methods import solve
 from leapnav.experts.optimum import Optimum, as_optimum, find_optimum
 
@@ -62,12 +62,8 @@ class Answers:
         with self._lock:
             extremal = solve(scenario, method="leapfrog", polish=False)
         rows = [row for row in extremal.history if row.times is not None]
-        last = len(rows) - 1
-        chosen = {*range(min(FIRST_SWEEPS, len(rows)))} | {
-            round(number) for number in np.linspace(0, last, MOST_SWEEPS - FIRST_SWEEPS) if last >= 0
-        }
         sweeps = []
-        for number in sorted(chosen):
+        for number in telling_sweeps(len(rows), FIRST_SWEEPS, MOST_SWEEPS):
             times, nodes = rows[number].times, rows[number].nodes
             assert times is not None and nodes is not None
             _, states = dense_path(extremal.problem, times, nodes, POINTS_OF_OTHERS)
