@@ -12,6 +12,7 @@ from leapnav.envs.obstacles import (
     proximity,
     proximity_value,
     proximity_values,
+    rough_proximity,
 )
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
@@ -200,6 +201,14 @@ def test_a_grid_of_obstacles_changes_nothing(count, size):
         expected -= (len(range(0, count, 10)) - 1) * walls
         scale = 1.0 + np.abs(expected).max() + np.abs(walls).max()
         assert np.abs(np.array(proximity(x, y, scenario.field)) - expected).max() <= 1e-12 * scale
+        # The curvature of what is left out is 100 times its value, for a scale of 0.1 m.
+        assert np.abs(np.array(rough_proximity(x, y, scenario.field)) - expected).max() <= 1e-7 * count * scale
+
+
+def test_among_few_obstacles_rough_is_exact():
+    scenario = SCENARIOS[0]
+    for x, y in points(scenario, 50):
+        assert rough_proximity(x, y, scenario.field) == proximity(x, y, scenario.field)
 
 
 def test_points_far_away_or_not_numbers_are_survived():
