@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 
-from numba import float64, njit, types
+from numba import float64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.obstacles import clearance, proximity_values, sinc
 
 PANEL = 1.5  # proximity scales that one Gauss rule spans

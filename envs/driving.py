@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types
+from numba import boolean, float64, int64, types
 
 from leapnav.envs.arcs import arc_proximity, follow_arc
+from leapnav.envs.compiling import njit
 from leapnav.envs.obstacles import clearance, sinc
 from leapnav.envs.scenario import GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, START, TURN_WEIGHT
 from leapnav.envs.settings import (

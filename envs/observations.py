@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numba import float32, float64, int64, njit, types
+from numba import float32, float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.driving import SPIN, TIME, VX, VY
 from leapnav.envs.scenario import GOAL, HORIZON, LARGEST
 from leapnav.envs.sensing import WALL_ENTRIES, scan, survey

@@ -9,8 +9,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.fields import ARENA, CIRCLES, CUTOFF, GRID, POLYGONS, SHAPES
 
 VALUE_CUTOFF = 25.0  # where nothing is differentiated

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import pymunk
 import pymunk.batch
-from numba import float64, njit, types
+from numba import float64, types
 
 from leapnav.envs.arcs import follow_arc
+from leapnav.envs.compiling import njit
 from leapnav.envs.fields import ARENA, unpack_field
 from leapnav.envs.obstacles import clearance, proximity_value
 

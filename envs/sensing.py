@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.fields import ARENA, CIRCLES, POLYGONS, SHAPES
 from leapnav.envs.obstacles import polygon_distance
 

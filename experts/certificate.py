@@ -6,9 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float64, int64, types
 from scipy.integrate import solve_ivp
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.obstacles import clearance
 from leapnav.experts.conjugate_points import (
     NO_RANK,

@@ -7,9 +7,10 @@ the compiled flow, its analytic Jacobian, and costates that are consistent with 
 from __future__ import annotations
 
 import numpy as np
-from numba import int64, njit
+from numba import int64
 from scipy.integrate import solve_bvp
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.certificate import certify
 from leapnav.experts.extremal import Extremal, Iteration, Status
 from leapnav.experts.integrator import FLOW, constant, cube, matrix

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import cast
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float64, int64, types
 from scipy.optimize import brentq, minimize_scalar
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.extremal import Extremal
 from leapnav.experts.integrator import FLOW, constant, cube, matrix, propagate, vector
 

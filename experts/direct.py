@@ -18,8 +18,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types
+from numba import boolean, float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.obstacles import rough_proximity
 from leapnav.experts.integrator import constant, cube, matrix, vector
 from leapnav.experts.problem import OptimalControlProblem, Path

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.integrator import CONTROL, FLOW, constant, cube, matrix, vector
 from leapnav.experts.linear import solve_dense
 

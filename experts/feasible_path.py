@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types
+from numba import boolean, float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.extremal import CONVERGED, Iteration
 from leapnav.experts.initial_path import local_minima
 from leapnav.experts.integrator import FLOW, constant, matrix, propagate, vector

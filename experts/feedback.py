@@ -6,8 +6,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.envs.obstacles import clearances
 from leapnav.envs.scenario import Scenario, ScenarioError
 from leapnav.experts.extremal import CONVERGED

@@ -15,8 +15,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import boolean, float64, njit, types
+from numba import boolean, float64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.integrator import CONTROL, FLOW, constant, cube, matrix, vector
 from leapnav.experts.linear import solve_positive
 from leapnav.experts.problem import OptimalControlProblem, Path

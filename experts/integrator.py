@@ -12,8 +12,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types
+from numba import boolean, float64, int64, types
 from scipy.integrate import DOP853
+
+from leapnav.envs.compiling import njit
 
 vector = float64[::1]
 matrix = float64[:, ::1]

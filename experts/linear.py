@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import boolean, int64, njit
+from numba import boolean, int64
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.integrator import matrix, vector
 
 SMALLEST_PIVOT = 1e-14  # relative to the largest entry: rounding

@@ -11,8 +11,9 @@ import heapq
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types
+from numba import boolean, float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.integrator import matrix, vector
 
 # 16 headings whose directions are exact lattice vectors, so a straight move never drifts off its line.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types
+from numba import boolean, float64, int64, types
 
+from leapnav.envs.compiling import njit
 from leapnav.experts.certificate import certify
 from leapnav.experts.extremal import (
     CONVERGED,

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import inspect
 import os
 import sys
 import tempfile
@@ -27,10 +26,11 @@ from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.pycode import PythonCodePrinter
 from sympy.simplify.cse_main import tree_cse
 
-from leapnav.envs import obstacles
+from leapnav.envs.compiling import source_stamp
 from leapnav.experts.integrator import CONTROL, FLOW
 
 GENERATOR_VERSION = "3"  # part of the file name: raise it whenever the generated text changes
+CALLED = "leapnav.envs.obstacles", "leapnav.experts.integrator"  # what that text imports
 
 
 @dataclass(frozen=True)
@@ -212,8 +212,8 @@ def compile_flow(
     declaration = sp.srepr(
         (system.state, system.parameters, system.drift, system.fields, system.position, state_cost, in_field)
     )
-    # The kernel that the generated text calls is compiled into it, so its source belongs to the key.
-    identity = "\n".join([GENERATOR_VERSION, declaration, inspect.getsource(obstacles)])
+    # What the generated text calls is compiled into it, so its source belongs to the key.
+    identity = "\n".join([GENERATOR_VERSION, declaration, *map(source_stamp, CALLED)])
     name = f"flow_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
     path = cache_directory() / f"{name}.py"
     if not path.exists():

@@ -1,0 +1,65 @@
+"""Numba's `njit` with a cache that knows what a kernel is made of.
+
+A kernel has those it calls compiled into it, but Numba's cache looks at a kernel's own file only: after a change in
+another one, of a developer or of a new version, it would go on with the old code
+(https://numba.readthedocs.io/en/stable/developer/caching.html#known-issues). So the kernels of a module are kept in a
+folder that is named after its source and that of all modules whose kernels and constants it imports.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import os
+import re
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numba
+import platformdirs
+
+IMPORT = re.compile(rb"^from (leapnav\.[\w.]+) import ", re.MULTILINE)
+KERNEL = re.compile(rb"^ *@njit\(", re.MULTILINE)
+
+
+def njit(*arguments: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit` for a kernel of leapnav."""
+
+    def compile_(function: Callable[..., Any]) -> Any:
+        # Numba settles where a function is cached when it is decorated.
+        chosen = numba.config.CACHE_DIR
+        numba.config.CACHE_DIR = str(kernel_directory(function, chosen))
+        try:
+            return numba.njit(*arguments, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = chosen
+
+    return compile_
+
+
+def kernel_directory(function: Callable[..., Any], chosen: str) -> Path:
+    """Where the kernels of a function's module are kept: as `chosen`, beside the module, or in the user's cache."""
+    source = Path(inspect.getfile(function))
+    if chosen:
+        folder = Path(chosen)
+    else:
+        folder = source.parent / "__pycache__"
+        if not os.access(folder if folder.exists() else source.parent, os.W_OK):
+            folder = Path(platformdirs.user_cache_dir("leapnav", appauthor=False))
+    return folder / f"{source.stem}-{source_stamp(function.__module__)[:12]}"
+
+
+@cache
+def source_stamp(name: str) -> str:
+    """A hash of the source of a module, and of what it imports from leapnav if it has kernels."""
+    spec = find_spec(name)
+    assert spec is not None and spec.origin is not None
+    source = Path(spec.origin).read_bytes()
+    stamp = hashlib.sha256(source)
+    if KERNEL.search(source):
+        for imported in IMPORT.findall(source):
+            stamp.update(source_stamp(imported.decode()).encode())
+    return stamp.hexdigest()

@@ -1,0 +1,64 @@
+"""Compiled kernels are found again, but not those that are made of something else by now."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from leapnav.envs import compiling
+from leapnav.envs.compiling import source_stamp
+
+KERNEL = """
+from leapnav.envs.compiling import njit
+from leapnav.called import SCALE, called
+
+@njit("float64(float64)", cache=True)
+def kernel(x):
+    return SCALE * called(x)
+"""
+CALLED = """
+from leapnav.envs.compiling import njit
+
+SCALE = {}
+
+@njit("float64(float64)", cache=True)
+def called(x):
+    return x + {}
+"""
+RUN = """
+import sys
+import leapnav
+leapnav.__path__.append(sys.argv[1])
+from leapnav.kernel import kernel
+print(kernel(1.0), sum(kernel.stats.cache_hits.values()))
+"""
+
+
+@pytest.mark.parametrize("chosen", [False, True], ids=["beside the module", "NUMBA_CACHE_DIR"])
+def test_a_kernel_is_compiled_anew_when_another_module_changes(chosen, tmp_path):
+    (tmp_path / "kernel.py").write_text(KERNEL)
+    variables = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache") if chosen else ""}
+
+    def run(scale, shift):
+        (tmp_path / "called.py").write_text(CALLED.format(scale, shift))
+        command = [sys.executable, "-c", RUN, str(tmp_path)]
+        return subprocess.run(command, env=variables, check=True, capture_output=True, text=True).stdout.split()
+
+    assert run(2.0, 1.0) == ["4.0", "0"]
+    assert run(2.0, 1.0) == ["4.0", "1"]
+    assert run(2.0, 3.0) == ["8.0", "0"]
+    assert run(5.0, 3.0) == ["20.0", "0"]
+    assert (tmp_path / "cache").exists() == chosen
+
+
+def test_a_stamp_holds_what_a_kernel_calls(monkeypatch):
+    whole = source_stamp("leapnav.experts.direct")
+    called = source_stamp("leapnav.envs.fields")
+    try:
+        source_stamp.cache_clear()
+        monkeypatch.setattr(compiling, "IMPORT", compiling.re.compile(b"nothing"))
+        assert source_stamp("leapnav.experts.direct") != whole
+        assert source_stamp("leapnav.envs.fields") == called  # no kernels: its own source alone
+    finally:
+        source_stamp.cache_clear()
