@@ -8,7 +8,7 @@ maps it into memory. With n scenarios and N_i points of the i-th optimum, evenly
 | `scenarios` | (bytes,) uint8 | the scenarios' JSON texts, one after the other |
 | `scenario_ends` | (n,) int64 | where each text ends |
 | `tasks` | (n, 11) float64 | start (3), goal (3, heading NaN if free), horizon, limits (2), weights (2) |
-| `fields` | (sum of the lengths,) float64 | the scenarios' packed, see `leapnav.envs.fields` |
+| `fields` | (sum of the lengths,) float64 | the scenarios' obstacles, packed, see `leapnav.envs.fields` |
 | `field_ends` | (n,) int64 | where each field ends |
 | `draws` | (n,) int64 | number of the random draw that gave the scenario |
 | `costs` | (n,) float64 | J* |

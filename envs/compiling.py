@@ -16,12 +16,14 @@ from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import numba
 import platformdirs
 
 IMPORT = re.compile(rb"^from (leapnav\.[\w.]+) import ", re.MULTILINE)
+_LOCK = RLock()
 KERNEL = re.compile(rb"^ *@njit\(", re.MULTILINE)
 
 
@@ -29,13 +31,14 @@ def njit(*arguments: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]
     """`numba.njit` for a kernel of leapnav."""
 
     def compile_(function: Callable[..., Any]) -> Any:
-        # Numba settles where a function is cached when it is decorated.
-        chosen = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = str(kernel_directory(function, chosen))
-        try:
-            return numba.njit(*arguments, **options)(function)
-        finally:
-            numba.config.CACHE_DIR = chosen
+        # Numba settles where a function is cached when it is decorated, from this setting alone.
+        with _LOCK:
+            chosen = numba.config.CACHE_DIR
+            numba.config.CACHE_DIR = str(kernel_directory(function, chosen))
+            try:
+                return numba.njit(*arguments, **options)(function)
+            finally:
+                numba.config.CACHE_DIR = chosen
 
     return compile_
 

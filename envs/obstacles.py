@@ -15,7 +15,7 @@ from leapnav.envs.compiling import njit
 from leapnav.envs.fields import ARENA, CIRCLES, CUTOFF, GRID, POLYGONS, SHAPES
 
 VALUE_CUTOFF = 25.0  # where nothing is differentiated
-ROUGH_CUTOFF = 20.0  # where a billionth of k is nothing
+ROUGH_CUTOFF = 20.0  # where 2e-9 k is nothing
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
 
@@ -155,7 +155,7 @@ def proximity(x, y, field):
 
 @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
 def rough_proximity(x, y, field):
-    """`proximity`; among so many obstacles that they have a grid, to 1e-9 of the weight for each, in half the time."""
+    """`proximity`; among so many obstacles that they have a grid, to 2e-9 of the weight for each, in half the time."""
     grid = int(field[GRID])
     if field[grid + 3] * field[grid + 4] > 1.0:
         return _rough_proximity(x, y, field)

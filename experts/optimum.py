@@ -23,8 +23,9 @@ MOST_ROUNDS = 4
 # margin shuts, and a gap or a short way may need smaller cells. The last one covers all of an arena that is too large
 # for the others.
 LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, False), (1, None, True))
-# Evaluations of the flow, for each candidate asked for, that may go to what is dearer than the best path for certain:
-# several times what it takes among a dozen obstacles. Among hundreds a single one takes 50,000.
+# Evaluations of the flow, for each candidate asked for, that may go to what is dearer than the best path. In most
+# families all of it takes a tenth of that, in slalom now and then twice as much, and among hundreds of obstacles a
+# single path takes half.
 WORK_ON_ALTERNATIVES = 8_000
 
 
@@ -33,8 +34,9 @@ class Optimum(Extremal):
     """A local optimum of a scenario; what `find_optimum` returns is the best one, and knows the others.
 
     Attributes:
-        alternatives: the other distinct local optima found, certified, in order of cost (theirs are empty). Among
-            hundreds of obstacles, where each takes long, two or three; more `candidates` find more.
+        alternatives: the other distinct local optima found, certified, in order of cost (theirs are empty). Where
+            each takes long, on long ways or among hundreds of obstacles, some are left out (not if there are more
+            `candidates`).
         doubts: solutions found that are cheaper than this one but not certified: their status is COLLISION for those
             that cut into an obstacle by up to 0.4 of the robot's radius (a path that just touches may then be cheaper
             than this optimum), or says why there is no certificate. Extremals that cut deeper are no doubts: where the
@@ -89,7 +91,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
 
     Args:
         candidates: how many distinct paths to try at once; more are tried only as long as none of them is certified, or
-            a better one may have been missed.
+            a better one may have been missed. The work that goes to alternatives grows with it.
         thorough: False tries no more than these. Mostly the best path is among them, and where there is none this says
             so fifty times sooner; but it may miss the only one, and a status of failure is then a guess.
 
@@ -102,9 +104,9 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
 
     """
     if not isinstance(cast(object, scenario), Scenario):
-        raise TypeError(f"scenario: expected a Scenario, got {type(scenario).__name__}; a problem is for `solve`")
-    if candidates < 1:
-        raise ValueError(f"candidates: expected at least 1, got {candidates!r}")
+        raise TypeError(f"scenario: expected a Scenario, got {type(scenario).__name__}")
+    if not isinstance(cast(object, candidates), (int, np.integer)) or candidates < 1:
+        raise ValueError(f"candidates: expected a whole number of at least 1, got {candidates!r}")
     problem = OptimalControlProblem.from_scenario(scenario)
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.max_speed * scenario.horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))

@@ -27,8 +27,8 @@ REFINEMENTS = 3
 # same if their costs agree as well.
 SAME_PATH, SAME_COST = 0.15, 1e-6
 SHORT = 4.0  # m between start and goal; where it is less, paths nearer to each other are distinct
-# The cost of a direct path is off by less than the first share, and that of a refined one too high by at most half the
-# second: what is dearer by more is no better path.
+# The cost of a direct path is off by less than the first share, and that of a refined one by less than the second. Of
+# 6,000 refined paths six were dearer than that beside their extremals, which were others than those near them.
 DIRECT_ERROR, REFINED_ERROR = 0.01, 0.002
 # How deep, in robot radii, an extremal may cut into an obstacle for a path near it that just touches to be thinkable.
 SLIGHT = TOLERATED_DEPTH
@@ -44,7 +44,7 @@ class Search:
     """The local optima found so far in a scenario.
 
     Args:
-        work: evaluations of the flow that may go to what is dearer than the best path for certain.
+        work: evaluations of the flow that may go to what is dearer than the best path.
 
     """
 

@@ -50,6 +50,7 @@ indices = types.Array(types.int32, 1, "C")
 links_type = types.Array(types.int32, 2, "C")
 # A ring of buckets, and how many of them the least cost of a path from end to end fills.
 BUCKETS, BUCKETS_PER_COST = 4096, 2000
+FARTHEST = 1e15
 
 
 @njit(vector(matrix, numbers, vector, float64, float64), cache=True, error_model="numpy", nogil=True)
@@ -170,7 +171,7 @@ def tree(
         # From a seed without a way to the targets `rest` is infinite, as is the limit as long as it is not known.
         if seed_costs[k] < cost[node] and bound <= limit and bound < np.inf:
             cost[node] = seed_costs[k]
-            waiting += _enqueue(bucket, links, node, min(int((bound - first) / width), BUCKETS - 1))
+            waiting += _enqueue(bucket, links, node, int(min((bound - first) / width, BUCKETS - 1.0)))
     best = np.inf
     while waiting > 0:
         node = bucket[current % BUCKETS]
@@ -197,7 +198,8 @@ def tree(
                     cost[following] = total
                     parent[following] = node
                     # Farther ahead than the ring of buckets is long is treated as less far: early, but not wrong.
-                    place = min(max(int((bound - first) / width), current), current + BUCKETS - 1)
+                    # (Held below what an integer can be: deep in an obstacle whose scale is tiny a cost is 1e40.)
+                    place = min(max(int(min((bound - first) / width, FARTHEST)), current), current + BUCKETS - 1)
                     waiting += _enqueue(bucket, links, following, place % BUCKETS)
     return cost, parent, limit
 

@@ -60,13 +60,17 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
     """The command as a type whose defaults depend on the family, the warm start and the run that the words ask for.
 
     Raises:
-        ValueError: there is no such family, or the run to resume has a damaged configuration.
+        ValueError: there is no such family, nothing to start from, or the run to resume has a damaged configuration.
 
     """
     arguments = [word.replace("_", "-") if word.startswith("--") and "=" not in word else word for word in arguments]
     meant = arguments[:1] == ["train"]  # the other commands have families and folders of their own
     family = (_option(arguments, "--family") if meant else None) or RunConfig.family
     out = _option(arguments, "--out")
+    if meant and "--warm-start" in arguments:
+        following = arguments[arguments.index("--warm-start") + 1 :][:1]
+        if not following or following[0].startswith("--"):
+            raise ValueError("warm_start: expected demonstrations or a policy, got none")
     warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
     defaults: dict[str, Any] = {
         name: replace(kind.tuned(family, warm=warm), out=tyro.MISSING) for name, kind in ALGORITHMS.items()

@@ -1,11 +1,15 @@
 """Compiled kernels are found again, but not those that are made of something else by now."""
 
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import leapnav.envs
+import leapnav.experts
 from leapnav.envs import compiling
 from leapnav.envs.compiling import source_stamp
 
@@ -52,12 +56,25 @@ def test_a_kernel_is_compiled_anew_when_another_module_changes(chosen, tmp_path)
     assert (tmp_path / "cache").exists() == chosen
 
 
+def test_modules_with_kernels_import_what_they_call_in_the_form_that_is_followed():
+    with_kernels = 0
+    for package in (leapnav.envs, leapnav.experts):
+        for path in Path(package.__path__[0]).glob("*.py"):
+            source = path.read_bytes()
+            if compiling.KERNEL.search(source):
+                with_kernels += 1
+                assert not re.search(
+                    rb"^ *(import leapnav|from leapnav(\.envs|\.experts)? import|from \.)", source, re.M
+                )
+    assert with_kernels > 15
+
+
 def test_a_stamp_holds_what_a_kernel_calls(monkeypatch):
     whole = source_stamp("leapnav.experts.direct")
     called = source_stamp("leapnav.envs.fields")
     try:
         source_stamp.cache_clear()
-        monkeypatch.setattr(compiling, "IMPORT", compiling.re.compile(b"nothing"))
+        monkeypatch.setattr(compiling, "IMPORT", re.compile(b"nothing"))
         assert source_stamp("leapnav.experts.direct") != whole
         assert source_stamp("leapnav.envs.fields") == called  # no kernels: its own source alone
     finally:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from helpers import DATA, SMALL, scenario_fields
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 
 import leapnav.envs
 import leapnav.experts
@@ -145,6 +145,7 @@ def names(tmp_path_factory):
         "CARTPOLE": gym.make("CartPole-v1"),
         "POLICY": make_policy(env.observation_space, env.action_space, hidden=SMALL),
         "PPO_MODEL": PPO("MlpPolicy", robots, device="cpu"),
+        "SAC_MODEL": SAC("MlpPolicy", robots, buffer_size=1, device="cpu"),
         "DATA": data,
         "OTHER_DATA": data.observed(replace(data.settings, lidar_beams=8)),
         "PLAIN_DATA": replace(data, costates=math.nan * data.costates, returns=math.nan * data.returns),

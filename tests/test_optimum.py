@@ -81,6 +81,22 @@ def test_the_same_scenario_gives_the_same_optimum_bit_for_bit():
     assert one.cost == other.cost
 
 
+@pytest.mark.parametrize("scale", [2e-3, 1e-3, 5e-4])
+def test_an_obstacle_that_is_hardly_felt_outside_is_gone_round(scale):
+    """Inside it the proximity cost is 1e40 and more, beyond any integer; the search once did not end."""
+    scenario = Scenario.from_discs(
+        [[7.0, 5.0, 1.0]],
+        arena=(0.0, 0.0, 10.0, 10.0),
+        start=(5.0, 5.0, 0.0),
+        goal=(9.0, 5.0, 0.0),
+        horizon=5.0,
+        cost={"proximity_scale": scale},
+    )
+    optimum = find_optimum(scenario)
+    assert optimum.success
+    assert 3.15 < optimum.cost < 3.19
+
+
 def test_alternatives_get_only_so_much_work(monkeypatch):
     """Among hundreds of obstacles the dearer ones would take most of the time; the optimum does not depend on them."""
     scenario = sample_scenario("clutter", 2)
@@ -179,7 +195,7 @@ def test_a_goal_at_the_start_is_no_crash_and_no_wrong_success():
 
 
 def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="candidates: expected at least 1, got 0"):
+    with pytest.raises(ValueError, match="candidates: expected a whole number of at least 1, got 0"):
         find_optimum(BEST_KNOWN[0][0], candidates=0)
 
 

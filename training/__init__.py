@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         shipped_policies,
     )
     from leapnav.training.reinforcement import train_ppo, train_sac
+    from leapnav.training.replay import DemonstrationReplayBuffer, imitate
     from leapnav.training.scores import Interval, Score, profile, score
     from leapnav.training.vec_env import NavigateVecEnv, make_vec_env
     from leapnav.training.warmstart import WarmStart, warm_start
@@ -41,6 +42,7 @@ __all__ = [
     "DAggerConfig",
     "DAggerRunConfig",
     "Dataset",
+    "DemonstrationReplayBuffer",
     "Episode",
     "EpochLoss",
     "Evaluation",
@@ -57,6 +59,7 @@ __all__ = [
     "WarmStartConfig",
     "behaviour_clone",
     "evaluate",
+    "imitate",
     "load_policy",
     "make_policy",
     "make_vec_env",
@@ -102,6 +105,7 @@ _MODULES = {
     "html_report": ("write_report",),
     "imitation": ("train_bc", "train_dagger"),
     "reinforcement": ("train_ppo", "train_sac"),
+    "replay": ("DemonstrationReplayBuffer", "imitate"),
     "scores": ("Interval", "Score", "profile", "score"),
     "vec_env": ("NavigateVecEnv", "make_vec_env"),
     "warmstart": ("WarmStart", "warm_start"),

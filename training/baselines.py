@@ -52,6 +52,8 @@ class GoToGoal:
     """
 
     def __init__(self, env: Any) -> None:
+        while hasattr(env, "venv"):  # Stable-Baselines3's wrappers, and leapnav's adapter
+            env = env.venv
         self._env = getattr(env, "unwrapped", env)
         if not isinstance(self._env, (NavigateEnv, NavigateVectorEnv)):
             raise TypeError(f"env: expected leapnav's environment, got {type(self._env).__name__}")

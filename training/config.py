@@ -179,7 +179,7 @@ class _LearnerConfig(RunConfig):
     """Factor of the rewards."""
     graded_miss: bool = True
     """While it learns a miss costs from a fifth of the penalty on, by how far from the goal the episode ends. Otherwise
-    nothing says where success lies, and standing still is best; who starts warm knows."""
+    nothing says where success lies, and standing still is best. PPO from a clone knows where."""
     warm_start: tuple[Path, ...] = ()
     """Demonstrations (folders that `leapnav rollout` wrote) and at most one policy (a run's folder) to start from: the
     actor is a clone of the demonstrations, or the policy's; the critic is fitted to the demonstrations, if any."""
@@ -273,8 +273,9 @@ class SACConfig(_LearnerConfig):
     demonstrations: float = 0.25
     """Share of each batch that is demonstrations, if a warm start has some."""
     imitation: float = 0.0
-    """Weight, in the actor's loss, of the error of the demonstrations' actions. What an action of a tenth of a second
-    is worth is small beside the critic's errors, which would soon spoil a clone."""
+    """Weight, in the actor's loss, of the error of the demonstrations' actions, if a warm start has some; beside values
+    in units of `reward_scale`. What a single action is worth is small beside the critic's errors, which would soon
+    spoil a clone."""
     evaluate_every: int = 20_000
     """Steps between evaluations."""
     checkpoint_every: int = 50_000

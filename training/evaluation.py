@@ -158,10 +158,14 @@ def evaluate(
 
     """
     if not (hasattr(policy, "predict") or callable(policy)):
-        raise TypeError(f"policy: expected one, or a function that makes one for an environment, got {policy!r}")
+        raise TypeError(
+            "policy: expected one with `predict`, or a function that makes one for an environment, got "
+            f"{type(policy).__name__}"
+        )
     if not isinstance(bank, ScenarioBank):
-        if bank not in FAMILIES:
-            raise ValueError(f"bank: expected a ScenarioBank or one of {', '.join(FAMILIES)}, got {bank!r}")
+        if not isinstance(bank, str) or bank not in FAMILIES:
+            got = repr(bank) if isinstance(bank, str) else type(bank).__name__
+            raise ValueError(f"bank: expected a ScenarioBank or one of {', '.join(FAMILIES)}, got {got}")
         bank = ScenarioBank.shipped(bank, "test")
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
@@ -274,6 +278,8 @@ def _made(entrant: Entrant, env: Any, space: Any) -> Policy:
     """The policy for an environment."""
     made: Any = entrant
     policy: Policy = made if hasattr(made, "predict") and not isinstance(made, type) else made(env)
+    if not hasattr(policy, "predict"):
+        raise TypeError(f"policy: expected one with `predict`, got {type(policy).__name__}")
     learned = getattr(policy, "observation_space", None)
     if learned is not None and learned != space:
         raise ValueError(

@@ -125,9 +125,10 @@ def make_policy(
 
 
 def _check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
-    if not (isinstance(observation_space, spaces.Box) and observation_space.shape[0] > GOAL_ENTRIES):
-        of = observation_space.shape or type(observation_space).__name__
-        raise ValueError(f"observation_space: expected that of {ENVIRONMENT} with a lidar, got one of {of}")
+    shape = observation_space.shape if isinstance(observation_space, spaces.Box) else ()
+    if not (len(shape) == 1 and shape[0] > GOAL_ENTRIES):
+        got = f"a Box of shape {shape}" if shape else type(observation_space).__name__
+        raise ValueError(f"observation_space: expected that of {ENVIRONMENT} with a lidar, got {got}")
     if not (isinstance(action_space, spaces.Box) and action_space.shape == (2,)):
         raise ValueError(f"action_space: expected that of {ENVIRONMENT}, got {action_space}")
 
@@ -197,9 +198,9 @@ def read_description(folder: str | Path) -> dict[str, Any]:
 
     """
     path = policy_folder(folder) / "policy.json"
-    if not path.parent.is_dir():
+    if not path.parent.exists():
         shipped = ", ".join(shipped_policies())
-        raise FileNotFoundError(errno.ENOENT, f"no such policy; those that ship are {shipped}", str(folder))
+        raise FileNotFoundError(errno.ENOENT, f"no such policy, and none of that name ships ({shipped})", str(folder))
     text = path.read_text()
     try:
         description = json.loads(text)

@@ -7,7 +7,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3 import PPO, SAC
@@ -46,9 +46,12 @@ def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
         The last evaluation, of each family.
 
     Raises:
+        TypeError: the configuration is another algorithm's.
         FileNotFoundError, FileExistsError, ValueError: see `Run`, `Dataset.of` and `load_policy`.
 
     """
+    if not isinstance(cast(object, config), PPOConfig):
+        raise TypeError(f"config: expected a PPOConfig, got {type(config).__name__}")
 
     def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
         return PPO(
@@ -82,6 +85,10 @@ def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
         ModuleNotFoundError: TQC without the extra `contrib`.
 
     """
+    if not isinstance(cast(object, config), SACConfig):
+        raise TypeError(f"config: expected a SACConfig, got {type(config).__name__}")
+    if config.algorithm not in ("sac", "tqc"):
+        raise ValueError(f"algorithm: expected sac or tqc, got {config.algorithm!r}")
     kind: Any = SAC
     if config.algorithm == "tqc":
         try:
@@ -117,8 +124,6 @@ def _train(
     demos, start = _start(config)
     if demos and config.reward != "cost":
         raise ValueError(f"reward: demonstrations have the rewards of 'cost', got {config.reward!r}")
-    if isinstance(config, SACConfig) and config.imitation > 0 and not demos:
-        raise ValueError(f"imitation: there are no demonstrations to imitate, got {config.imitation!r}")
     if isinstance(config, PPOConfig) and config.divergence > 0 and not (config.warm_start and config.start.actor):
         raise ValueError(f"divergence: without a clone there is nothing to diverge from, got {config.divergence!r}")
     dataset = Dataset.of(demos).observed(settings_of(config)) if demos else None
@@ -134,8 +139,7 @@ def _train(
     else:
         model = _load(type(model), found[0], venv, dataset, config)
     model.set_logger(run.logger)
-    if isinstance(config, SACConfig) and isinstance(model, OffPolicyAlgorithm) and config.imitation > 0:
-        assert dataset is not None  # as was checked
+    if isinstance(config, SACConfig) and config.imitation > 0 and dataset is not None:
         imitate(model, dataset, config.imitation)
     callback = _Keeper(run, config, venv, found[1] if found else None, progress)
     if found is not None:
@@ -154,7 +158,8 @@ def _train(
 
 def _start(config: Config) -> tuple[list[Path], BasePolicy | None]:
     """The folders of demonstrations, and the policy, among what a warm start is given."""
-    places = [Path(place) for place in config.warm_start]
+    given: Any = config.warm_start
+    places = [Path(place) for place in ([given] if isinstance(given, (str, Path)) else given)]
     policies = [place for place in places if (policy_folder(place) / "policy.json").is_file()]
     if len(policies) > 1:
         raise ValueError(f"warm_start: expected at most one policy, got {policies[0]} and {policies[1]}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import os
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -11,6 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional
+from torch.utils.hooks import RemovableHandle
 
 from leapnav.training.actors import mean_action, policy_of
 from leapnav.training.cloning import ROBUST, check_observations
@@ -87,36 +91,54 @@ class DemonstrationReplayBuffer(ReplayBuffer):
         return {name: value for name, value in self.__dict__.items() if name != "_demonstrated"}
 
 
-def imitate(model: OffPolicyAlgorithm, dataset: Dataset, weight: float, batch_size: int = 256) -> None:
+def imitate(
+    model: OffPolicyAlgorithm,
+    dataset: Dataset | str | os.PathLike[str] | Sequence[Any],
+    weight: float,
+    batch_size: int = 256,
+) -> RemovableHandle:
     """Gives the loss of an off-policy learner's actor a term for its errors where the expert has been.
 
     After A. Nair et al., "Overcoming exploration in reinforcement learning with demonstrations" (ICRA 2018), and
     S. Fujimoto and S. Gu, "A minimalist approach to offline reinforcement learning" (NeurIPS 2021). Its gradient is
-    added before each step of the actor's optimiser, so it goes with SAC, TD3 and their kin as they are.
+    added before each step of the actor's optimiser, so it goes with SAC, TD3 and their kin as they are; the log has it
+    as `train/imitation_loss`.
 
     Args:
         model: whose actor it is; one that is loaded from a file needs it anew.
-        dataset: the demonstrations.
+        dataset: a `Dataset`, a folder that `leapnav rollout` wrote, or demonstrations.
         weight: of Huber's loss of the actions, beside the values in units of the rewards that the model sees.
         batch_size: demonstrated samples per step.
 
+    Returns:
+        What takes the term away again: its method `remove`.
+
     Raises:
-        ValueError: the dataset's observations are not the model's.
+        TypeError: the model is no off-policy algorithm, or has no actor.
+        ValueError: the dataset's observations are not the model's, or a number is impossible.
 
     """
-    policy = policy_of(model)
-    check_observations(policy, dataset)
-    optimiser: Any = cast(Any, policy).actor.optimizer
+    policy: Any = policy_of(model)
+    if not isinstance(cast(object, model), OffPolicyAlgorithm) or not hasattr(policy, "actor"):
+        raise TypeError(f"model: expected an off-policy algorithm with an actor, got {type(model).__name__}")
+    if not (math.isfinite(weight) and weight > 0):
+        raise ValueError(f"weight: expected a positive number, got {weight!r}")
+    if batch_size < 1:
+        raise ValueError(f"batch_size: expected at least 1, got {batch_size!r}")
+    samples = Dataset.of(dataset)
+    check_observations(policy, samples)
 
     def add(*_: Any) -> None:
         # Drawn as the replay buffer draws, so that a resumed run draws the same.
-        rows = np.random.randint(0, len(dataset), size=batch_size)  # noqa: NPY002
+        rows = np.random.randint(0, len(samples), size=batch_size)  # noqa: NPY002
         observations, actions = (
             th.as_tensor(column[rows], dtype=th.float32, device=policy.device)
-            for column in (dataset.observations, dataset.actions)
+            for column in (samples.observations, samples.actions)
         )
         with th.enable_grad():
             error = mean_action(policy, observations) - actions
-            (weight * functional.huber_loss(error, th.zeros_like(error), delta=ROBUST)).backward()
+            loss = functional.huber_loss(error, th.zeros_like(error), delta=ROBUST)
+            (weight * loss).backward()
+        model.logger.record("train/imitation_loss", float(loss.detach()))
 
-    optimiser.register_step_pre_hook(add)
+    return policy.actor.optimizer.register_step_pre_hook(add)
