@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from threading import RLock
@@ -23,6 +24,7 @@ import numba
 import platformdirs
 
 IMPORT = re.compile(rb"^from (leapnav\.[\w.]+) import ", re.MULTILINE)
+_CONFIG: Any = import_module("numba.core.config")  # which is `numba.config`
 _LOCK = RLock()
 KERNEL = re.compile(rb"^ *@njit\(", re.MULTILINE)
 
@@ -33,12 +35,12 @@ def njit(*arguments: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]
     def compile_(function: Callable[..., Any]) -> Any:
         # Numba settles where a function is cached when it is decorated, from this setting alone.
         with _LOCK:
-            chosen = numba.config.CACHE_DIR
-            numba.config.CACHE_DIR = str(kernel_directory(function, chosen))
+            chosen = _CONFIG.CACHE_DIR
+            _CONFIG.CACHE_DIR = str(kernel_directory(function, chosen))
             try:
                 return numba.njit(*arguments, **options)(function)
             finally:
-                numba.config.CACHE_DIR = chosen
+                _CONFIG.CACHE_DIR = chosen
 
     return compile_
 

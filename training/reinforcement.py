@@ -140,7 +140,7 @@ def _train(
         model = _load(type(model), found[0], venv, dataset, config)
     model.set_logger(run.logger)
     if isinstance(config, SACConfig) and config.imitation > 0 and dataset is not None:
-        imitate(model, dataset, config.imitation)
+        imitate(cast(OffPolicyAlgorithm, model), dataset, config.imitation)
     callback = _Keeper(run, config, venv, found[1] if found else None, progress)
     if found is not None:
         run.restore_generators()
