@@ -36,8 +36,8 @@ ROWS = {
     "bc": "clone of {demos:,}",
     "scratch": "PPO from scratch, {steps:.1f} M steps",
     "warm": "PPO from a clone",
-    "sac": "SAC from scratch, 0.1 M steps",
-    "sacwarm": "SAC from a clone, 0.02 M steps",
+    "sac": "SAC from scratch, {sac:,} steps",
+    "sacwarm": "SAC from a clone, {sacwarm:,} steps",
 }
 
 
@@ -68,7 +68,7 @@ def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> Non
 
 def entrants(family: str, runs: Path) -> list[str]:
     """What the table of a family compares, each with its row's name."""
-    values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6}
+    values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6, **SAC_STEPS}
     found = [
         f"{ROWS[method].format(**values)}={folder}"
         for method in METHODS
