@@ -1,9 +1,9 @@
 """Numba's `njit` with a cache that knows what a kernel is made of.
 
 A kernel has those it calls compiled into it, but Numba's cache looks at a kernel's own file only: after a change in
-another one, of a developer or of a new version, it would go on with the old code
-(https://numba.readthedocs.io/en/stable/developer/caching.html#known-issues). So the kernels of a module are kept in a
-folder that is named after its source and that of all modules whose kernels and constants it imports.
+another one, of a developer or of a new version, it would go on with the old code ("Caching Limitations" in
+https://numba.readthedocs.io/en/stable/developer/caching.html). So the kernels of a module are kept in a folder that is
+named after its source and that of all modules whose kernels and constants it imports.
 """
 
 from __future__ import annotations
