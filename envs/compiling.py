@@ -30,9 +30,18 @@ KERNEL = re.compile(rb"^ *@njit\(", re.MULTILINE)
 
 
 def njit(*arguments: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit` for a kernel of leapnav."""
+    """`numba.njit` for a kernel of leapnav.
+
+    Raises:
+        TypeError: the function is nested in another one. In machine code a kernel is known by its module, its name and
+            a number that a process counts up; two kernels of one name, one of them compiled here and the other found
+            in the cache of a process that counted otherwise, may get the same number, and then one is called for both.
+
+    """
 
     def compile_(function: Callable[..., Any]) -> Any:
+        if "<" in function.__qualname__:
+            raise TypeError(f"{function.__qualname__}: a kernel needs a name that no other has in its module")
         # Numba settles where a function is cached when it is decorated, from this setting alone.
         with _LOCK:
             chosen = _CONFIG.CACHE_DIR

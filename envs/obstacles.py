@@ -25,7 +25,7 @@ def sinc(angle):
     return 1.0 - angle * angle / 6.0 if abs(angle) < 1e-4 else math.sin(angle) / angle
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(float64(float64, float64, _field, int64, int64), cache=True, error_model="numpy", nogil=True)
 def polygon_distance(x, y, field, rows, edges):
     """Euclidean distance to a convex polygon, negative inside."""
     inside = -np.inf
@@ -43,10 +43,9 @@ def polygon_distance(x, y, field, rows, edges):
     return inside if inside < 0 else outside
 
 
-def _proximity_kernel(derivatives: bool, cutoff: float) -> Any:
+def _proximity_kernel(name: str, derivatives: bool, cutoff: float) -> Any:
     """The proximity cost with or without its derivatives, of the obstacles up to `cutoff` scales away."""
 
-    @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
     def kernel(x, y, field):
         k, radius = field[0], field[2]
         reach = cutoff * field[1]
@@ -140,11 +139,14 @@ def _proximity_kernel(derivatives: bool, cutoff: float) -> Any:
                     hyy += bend * (2 * my * my - syy * part)
         return value, gx, gy, hxx, hxy, hyy
 
-    return kernel
+    kernel.__name__ = kernel.__qualname__ = name
+    signature = types.UniTuple(float64, 6)(float64, float64, _field)
+    return njit(signature, cache=True, error_model="numpy", nogil=True)(kernel)
 
 
-_proximity, _proximity_value = _proximity_kernel(True, CUTOFF), _proximity_kernel(False, VALUE_CUTOFF)
-_rough_proximity = _proximity_kernel(True, ROUGH_CUTOFF)
+_proximity = _proximity_kernel("_proximity", derivatives=True, cutoff=CUTOFF)
+_proximity_value = _proximity_kernel("_proximity_value", derivatives=False, cutoff=VALUE_CUTOFF)
+_rough_proximity = _proximity_kernel("_rough_proximity", derivatives=True, cutoff=ROUGH_CUTOFF)
 
 
 @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)

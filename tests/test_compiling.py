@@ -4,9 +4,11 @@ import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 import leapnav.envs
 import leapnav.experts
@@ -67,6 +69,27 @@ def test_modules_with_kernels_import_what_they_call_in_the_form_that_is_followed
                     rb"^ *(import leapnav|from leapnav(\.envs|\.experts)? import|from \.)", source, re.M
                 )
     assert with_kernels > 15
+
+
+def test_no_two_kernels_have_one_name():
+    kernels = {}
+    for package in (leapnav.envs, leapnav.experts):
+        for path in Path(package.__path__[0]).glob("*.py"):
+            if compiling.KERNEL.search(path.read_bytes()):
+                module = import_module(f"{package.__name__}.{path.stem}")
+                found = [value for value in vars(module).values() if isinstance(value, Dispatcher)]
+                kernels.update({id(kernel): kernel.py_func for kernel in found})
+    names = [(function.__module__, function.__qualname__) for function in kernels.values()]
+    assert len(names) > 60
+    assert len(set(names)) == len(names)
+
+
+def test_a_nested_kernel_is_refused():
+    def make(shift):
+        return compiling.njit("float64(float64)", cache=True)(lambda x: x + shift)
+
+    with pytest.raises(TypeError, match=r"make\.<locals>\.<lambda>: a kernel needs a name that no other has"):
+        make(1.0)
 
 
 def test_a_stamp_holds_what_a_kernel_calls(monkeypatch):
