@@ -12,6 +12,7 @@ import hashlib
 import inspect
 import os
 import re
+import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -45,7 +46,10 @@ def njit(*arguments: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]
         # Numba settles where a function is cached when it is decorated, from this setting alone.
         with _LOCK:
             chosen = _CONFIG.CACHE_DIR
-            _CONFIG.CACHE_DIR = str(kernel_directory(function, chosen))
+            folder = kernel_directory(function, chosen)
+            if not folder.exists():
+                _say_what_takes_so_long()
+            _CONFIG.CACHE_DIR = str(folder)
             try:
                 return numba.njit(*arguments, **options)(function)
             finally:
@@ -64,6 +68,13 @@ def kernel_directory(function: Callable[..., Any], chosen: str) -> Path:
         if not os.access(folder if folder.exists() else source.parent, os.W_OK):
             folder = Path(platformdirs.user_cache_dir("leapnav", appauthor=False))
     return folder / f"{source.stem}-{source_stamp(function.__module__)[:12]}"
+
+
+@cache
+def _say_what_takes_so_long() -> None:
+    """Once in a process, and only to somebody who looks at it."""
+    if sys.stderr.isatty():
+        print("leapnav: compiling, once after an installation: about a minute", file=sys.stderr)
 
 
 @cache

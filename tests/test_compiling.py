@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib import import_module
@@ -14,6 +15,7 @@ import leapnav.envs
 import leapnav.experts
 from leapnav.envs import compiling
 from leapnav.envs.compiling import source_stamp
+from leapnav.envs.obstacles import sinc
 
 KERNEL = """
 from leapnav.envs.compiling import njit
@@ -90,6 +92,21 @@ def test_a_nested_kernel_is_refused():
 
     with pytest.raises(TypeError, match=r"make\.<locals>\.<lambda>: a kernel needs a name that no other has"):
         make(1.0)
+
+
+@pytest.mark.parametrize("looked_at", [True, False])
+def test_who_looks_is_told_why_the_first_import_takes_long(looked_at, tmp_path, monkeypatch, capsys):
+    def announced():
+        compiling.njit("float64(float64)", cache=True)(sinc.py_func)
+        return capsys.readouterr().err
+
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: looked_at)
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path))
+    compiling._say_what_takes_so_long.cache_clear()
+    assert announced() == "leapnav: compiling, once after an installation: about a minute\n" * looked_at
+    assert announced() == ""
+    shutil.rmtree(tmp_path)
+    assert announced() == ""  # once in a process
 
 
 def test_a_stamp_holds_what_a_kernel_calls(monkeypatch):
