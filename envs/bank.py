@@ -19,7 +19,7 @@ maps it into memory. With n scenarios and N_i points of the i-th optimum, evenly
 | `controls` | (sum of N_i, 2) float32 | speed (m/s), turn rate (rad/s) |
 | `costates` | (sum of N_i, 3) float32 | lambda, the gradient of the cost-to-go |
 
-Attributes of the file: `format` ("leapnav-bank"), `version` (2), `family`, `seed`, `drawn` (how many scenarios were
+Attributes of the file: `format` ("leapnav-bank"), `version` (3), `family`, `seed`, `drawn` (how many scenarios were
 drawn for the n that were admitted), `rejected` (JSON: how many were not, by reason) and `software` (the leapnav version
 that built it).
 """
@@ -39,7 +39,7 @@ import numpy as np
 
 from leapnav.envs.scenario import TASK_COLUMNS, Scenario
 
-FORMAT, VERSION = "leapnav-bank", 2
+FORMAT, VERSION = "leapnav-bank", 3
 INTERVAL = 0.1  # s between points of an optimum, at most
 SPLITS = ("train", "test")
 FOLDER = Path(__file__).parent / "banks"

@@ -7,10 +7,13 @@ One array can pass through any compiled function:
     then per circle:   x, y, r
     then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
     then the obstacles' numbers in the scenario, since circles are packed before polygons
-    then the grid:     x, y, cell size, columns, lines, then where each cell's list begins (and the last one ends), then
-                       the lists: positions in the packed field of the obstacles that are felt somewhere in the cell
+    then the grid:     x, y, cell size, columns, lines, then where each cell is, counted from the grid's beginning, then
+                       the cells: number of circles n, of polygons p, of their edges m; then n times x, y, r, column by
+                       column, and m times p rows (n_x, n_y, c), also column by column
 
-The grid keeps the proximity cost of a point independent of obstacles far away; up to FEW obstacles it has one cell.
+A cell holds the obstacles that are felt somewhere in it, which keeps the proximity cost of a point independent of those
+far away. n and p are multiples of LANES, filled up with obstacles that are felt nowhere; polygons of fewer edges than m
+are filled up with edges that are felt nowhere. Up to FEW obstacles there is no grid: columns and lines are 0.
 """
 
 from __future__ import annotations
@@ -23,7 +26,9 @@ import numpy as np
 # A term whose distance exceeds 30 sigma is below 1e-13 k, a tenth of what the integrator is asked for, and is skipped.
 CUTOFF = 30.0
 CIRCLES, POLYGONS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # positions in the packed field
-FEW, MOST_CELLS = 16, 32  # obstacles without a grid; columns or lines of one
+FEW, MOST_CELLS = 16, 16  # obstacles without a grid; columns or lines of one
+LANES = 8  # numbers that a processor takes at once
+NOWHERE = 1e30  # m
 
 
 def pack_field(
@@ -104,36 +109,46 @@ def obstacle_centres(packed: np.ndarray) -> np.ndarray:
 
 def _pack_grid(packed: np.ndarray) -> np.ndarray:
     """The grid of a field; obstacles are felt up to CUTOFF scales from the robot's rim."""
-    reach = packed[2] + CUTOFF * packed[1]
     circles, polygons = unpack_field(packed)
-    positions = [SHAPES + 3 * i for i in range(len(circles))]
-    at = SHAPES + 3 * len(circles)
-    for polygon in polygons:
-        positions.append(at)
-        at += 1 + polygon.size
+    if len(circles) + len(polygons) <= FEW:
+        return np.zeros(5)
+    reach = packed[2] + CUTOFF * packed[1]
     # Obstacles may reach out of the arena. A point beyond the grid belongs to the cell nearest to it, where everything
     # that it feels is listed: the way to the nearest point of a convex set shortens the distances to all in the set.
     corners = [packed[ARENA : ARENA + 4].reshape(2, 2)]
     corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
     corners += [polygon[:, 3:] for polygon in polygons]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-    if len(positions) <= FEW:
-        shape, size = np.array([1, 1]), float(np.max(high - low))
-    else:
-        size = float(np.max(high - low)) / MOST_CELLS
-        shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
+    size = float(np.max(high - low)) / MOST_CELLS
+    shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
-    felt = np.empty((len(first), len(positions)), dtype=bool)
-    if len(circles):
-        nearest = np.clip(circles[:, :2], first[:, None], first[:, None] + size)
-        felt[:, : len(circles)] = np.linalg.norm(nearest - circles[:, :2], axis=2) - circles[:, 2] < reach
+    nearest = np.clip(circles[:, :2], first[:, None], first[:, None] + size)
+    felt_circles = np.linalg.norm(nearest - circles[:, :2], axis=2) - circles[:, 2] < reach
+    felt_polygons = np.empty((len(first), len(polygons)), dtype=bool)
     for k, polygon in enumerate(polygons):
         # The smallest value of each half-plane's distance in the cell; their largest bounds the polygon's from below.
         offsets = np.minimum(polygon[:, :2] * size, 0.0).sum(axis=1) - polygon[:, 2]
-        felt[:, len(circles) + k] = (first @ polygon[:, :2].T + offsets).max(axis=1) < reach
-    cells, numbers = np.nonzero(felt)
-    begins = np.searchsorted(cells, np.arange(len(first) + 1))
-    return np.concatenate([low, [size], shape, begins, np.array(positions, dtype=float)[numbers]])
+        felt_polygons[:, k] = (first @ polygon[:, :2].T + offsets).max(axis=1) < reach
+    cells = [
+        _pack_cell(circles[a], [polygons[k] for k in np.flatnonzero(b)])
+        for a, b in zip(felt_circles, felt_polygons, strict=True)
+    ]
+    begins = 5 + len(first) + np.cumsum([0, *map(len, cells[:-1])])
+    return np.concatenate([low, [size], shape, begins, *cells])
+
+
+def _pack_cell(circles: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray:
+    n, p = (-(-len(felt) // LANES) * LANES for felt in (circles, polygons))
+    m = max(map(len, polygons), default=0)
+    columns = np.zeros((3, n))
+    columns[0] = NOWHERE
+    columns[:, : len(circles)] = circles.T
+    rows = np.zeros((m, 3, p))
+    rows[:, 2] = -NOWHERE  # every half-plane is that far away
+    for k, polygon in enumerate(polygons):
+        rows[: len(polygon), :, k] = polygon[:, :3]
+        rows[len(polygon) :, 2, k] = NOWHERE  # the robot is that deep within the half-plane
+    return np.concatenate([[n, p, m], columns.ravel(), rows.ravel()])
 
 
 def _pack_polygon(vertices: np.ndarray) -> list[float]:

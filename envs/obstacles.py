@@ -12,10 +12,10 @@ import numpy as np
 from numba import float64, int64, types
 
 from leapnav.envs.compiling import njit
+from leapnav.envs.crowds import crowd_proximity
 from leapnav.envs.fields import ARENA, CIRCLES, CUTOFF, GRID, POLYGONS, SHAPES
 
 VALUE_CUTOFF = 25.0  # where nothing is differentiated
-ROUGH_CUTOFF = 20.0  # where 2e-9 k is nothing
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
 
@@ -44,7 +44,7 @@ def polygon_distance(x, y, field, rows, edges):
 
 
 def _proximity_kernel(name: str, derivatives: bool, cutoff: float) -> Any:
-    """The proximity cost with or without its derivatives, of the obstacles up to `cutoff` scales away."""
+    """The proximity cost with or without its derivatives; if few, of the obstacles up to `cutoff` scales away."""
 
     def kernel(x, y, field):
         k, radius = field[0], field[2]
@@ -65,78 +65,74 @@ def _proximity_kernel(name: str, derivatives: bool, cutoff: float) -> Any:
                 else:
                     gy -= slope
                     hyy += sign * slope * steepness
-        grid = int(field[GRID])
-        columns, lines = int(field[grid + 3]), int(field[grid + 4])
-        begins = grid + 5
-        if columns * lines > 1:
-            column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
-            line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
-            begins += column * lines + line
-        lists = grid + 6 + columns * lines
-        polygons = SHAPES + 3 * int(field[CIRCLES])
-        for entry in range(lists + int(field[begins]), lists + int(field[begins + 1])):
-            at = int(field[entry])
-            if at < polygons:
-                dx, dy = x - field[at], y - field[at + 1]
-                rim = field[at + 2] + radius
-                square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
-                if square < (rim + reach) ** 2:
-                    smooth = math.sqrt(square)
-                    term = k * math.exp((rim - smooth) * steepness)
-                    value += term
-                    if not derivatives:
-                        continue
-                    inverse = 1.0 / smooth
-                    nx, ny = dx * inverse, dy * inverse
-                    slope = term * steepness
-                    curl = slope * inverse
-                    bend = slope * steepness + curl
-                    gx -= slope * nx
-                    gy -= slope * ny
-                    hxx += bend * nx * nx - curl
-                    hxy += bend * nx * ny
-                    hyy += bend * ny * ny - curl
-            else:
-                edges = int(field[at])
-                rows = at + 1
-                farthest = -np.inf
+        if field[int(field[GRID]) + 3] > 0.0:
+            found = crowd_proximity(x, y, field)
+            gx, gy = gx + found[1], gy + found[2]
+            return value + found[0], gx, gy, hxx + found[3], hxy + found[4], hyy + found[5]
+        at = SHAPES
+        for _ in range(int(field[CIRCLES])):
+            dx, dy = x - field[at], y - field[at + 1]
+            rim = field[at + 2] + radius
+            at += 3
+            square = dx * dx + dy * dy + 1e-6  # differentiable at the centre
+            if square < (rim + reach) ** 2:
+                smooth = math.sqrt(square)
+                term = k * math.exp((rim - smooth) * steepness)
+                value += term
+                if not derivatives:
+                    continue
+                inverse = 1.0 / smooth
+                nx, ny = dx * inverse, dy * inverse
+                slope = term * steepness
+                curl = slope * inverse
+                bend = slope * steepness + curl
+                gx -= slope * nx
+                gy -= slope * ny
+                hxx += bend * nx * nx - curl
+                hxy += bend * nx * ny
+                hyy += bend * ny * ny - curl
+        for _ in range(int(field[POLYGONS])):
+            edges = int(field[at])
+            rows = at + 1
+            at = rows + 5 * edges
+            farthest = -np.inf
+            for j in range(edges):
+                row = rows + 5 * j
+                farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
+            distance = farthest - radius
+            if distance < reach:
+                # An edge's share of a term that is small itself may be the smaller.
+                least = distance * steepness - cutoff
+                total = mx = my = sxx = sxy = syy = 0.0
                 for j in range(edges):
                     row = rows + 5 * j
-                    farthest = max(farthest, field[row] * x + field[row + 1] * y - field[row + 2])
-                distance = farthest - radius
-                if distance < reach:
-                    # An edge's share of a term that is small itself may be the smaller.
-                    least = distance * steepness - cutoff
-                    total = mx = my = sxx = sxy = syy = 0.0
-                    for j in range(edges):
-                        row = rows + 5 * j
-                        nx, ny = field[row], field[row + 1]
-                        # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
-                        exponent = (nx * x + ny * y - field[row + 2] - farthest) * steepness
-                        if exponent < least:
-                            continue
-                        share = math.exp(exponent)
-                        total += share
-                        if not derivatives:
-                            continue
-                        mx += share * nx
-                        my += share * ny
-                        sxx += share * nx * nx
-                        sxy += share * nx * ny
-                        syy += share * ny * ny
-                    part = 1.0 / total
-                    term = k * math.exp(-distance * steepness) * part
-                    value += term
+                    nx, ny = field[row], field[row + 1]
+                    # Shifted by the largest half-plane distance: exp() of the plain distances overflows.
+                    exponent = (nx * x + ny * y - field[row + 2] - farthest) * steepness
+                    if exponent < least:
+                        continue
+                    share = math.exp(exponent)
+                    total += share
                     if not derivatives:
                         continue
-                    mx, my = mx * part, my * part
-                    slope = term * steepness
-                    bend = slope * steepness
-                    gx -= slope * mx
-                    gy -= slope * my
-                    hxx += bend * (2 * mx * mx - sxx * part)
-                    hxy += bend * (2 * mx * my - sxy * part)
-                    hyy += bend * (2 * my * my - syy * part)
+                    mx += share * nx
+                    my += share * ny
+                    sxx += share * nx * nx
+                    sxy += share * nx * ny
+                    syy += share * ny * ny
+                part = 1.0 / total
+                term = k * math.exp(-distance * steepness) * part
+                value += term
+                if not derivatives:
+                    continue
+                mx, my = mx * part, my * part
+                slope = term * steepness
+                bend = slope * steepness
+                gx -= slope * mx
+                gy -= slope * my
+                hxx += bend * (2 * mx * mx - sxx * part)
+                hxy += bend * (2 * mx * my - sxy * part)
+                hyy += bend * (2 * my * my - syy * part)
         return value, gx, gy, hxx, hxy, hyy
 
     kernel.__name__ = kernel.__qualname__ = name
@@ -146,21 +142,11 @@ def _proximity_kernel(name: str, derivatives: bool, cutoff: float) -> Any:
 
 _proximity = _proximity_kernel("_proximity", derivatives=True, cutoff=CUTOFF)
 _proximity_value = _proximity_kernel("_proximity_value", derivatives=False, cutoff=VALUE_CUTOFF)
-_rough_proximity = _proximity_kernel("_rough_proximity", derivatives=True, cutoff=ROUGH_CUTOFF)
 
 
 @njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
 def proximity(x, y, field):
     """Proximity cost at a point: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
-    return _proximity(x, y, field)
-
-
-@njit(types.UniTuple(float64, 6)(float64, float64, _field), cache=True, error_model="numpy", nogil=True)
-def rough_proximity(x, y, field):
-    """`proximity`; among so many obstacles that they have a grid, to 2e-9 of the weight for each, in half the time."""
-    grid = int(field[GRID])
-    if field[grid + 3] * field[grid + 4] > 1.0:
-        return _rough_proximity(x, y, field)
     return _proximity(x, y, field)
 
 
@@ -181,8 +167,7 @@ def proximity_values(xa, ya, xb, yb, xc, yc, field):
 
     One look at an obstacle serves all three, which takes half the time of three calls.
     """
-    grid = int(field[GRID])
-    if field[grid + 3] * field[grid + 4] > 1.0:  # the grid knows better what to look at
+    if field[int(field[GRID]) + 3] > 0.0:  # the grid knows better what to look at
         first, second = proximity_value(xa, ya, field), proximity_value(xb, yb, field)
         return first, second, proximity_value(xc, yc, field)
     radius, steepness = field[2], 1.0 / field[1]

@@ -21,7 +21,7 @@ import numpy as np
 from numba import boolean, float64, int64, types
 
 from leapnav.envs.compiling import njit
-from leapnav.envs.obstacles import rough_proximity
+from leapnav.envs.obstacles import proximity
 from leapnav.experts.integrator import constant, cube, matrix, vector
 from leapnav.experts.problem import OptimalControlProblem, Path
 
@@ -133,7 +133,7 @@ def _cost(h, q, u, turn_weight, unit, field):
     cost = 0.0
     for k in range(intervals + 1):
         weight = 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
-        cost += unit * weight * rough_proximity(q[k, 0], q[k, 1], field)[0]
+        cost += unit * weight * proximity(q[k, 0], q[k, 1], field)[0]
     for k in range(intervals):
         cost += 0.5 * h[k] * (u[k, 0] * u[k, 0] + turn_weight * u[k, 1] * u[k, 1])
     return cost
@@ -184,7 +184,7 @@ def _expand(h, q, u, costates, goal, turn_weight, unit, field, near, A, B, gaps,
     intervals = len(h)
     for k in range(intervals + 1):
         weight = unit * 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
-        _, gx, gy, hxx, hxy, hyy = rough_proximity(q[k, 0], q[k, 1], field)
+        _, gx, gy, hxx, hxy, hyy = proximity(q[k, 0], q[k, 1], field)
         near[k, 0], near[k, 1] = weight * gx, weight * gy
         near[k, 2], near[k, 3], near[k, 4] = weight * hxx, weight * hxy, weight * hyy
     for k in range(intervals):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import cache, partial
 from itertools import islice
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -23,10 +25,9 @@ MOST_ROUNDS = 4
 # margin shuts, and a gap or a short way may need smaller cells. The last one covers all of an arena that is too large
 # for the others.
 LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, False), (1, None, True))
-# Evaluations of the flow, for each candidate asked for, that may go to what is dearer than the best path. In most
-# families all of it takes a tenth of that, in slalom now and then twice as much, and among hundreds of obstacles a
-# single path takes half.
-WORK_ON_ALTERNATIVES = 8_000
+# Evaluations of the flow, for each candidate asked for, that may go to what is dearer than the best path. In the
+# scenarios that ship all of it takes less, in most a twentieth, and among hundreds of obstacles a single path a third.
+WORK_ON_ALTERNATIVES = 12_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,6 +82,13 @@ class Optimum(Extremal):
         return heading_winding(self.states[:, 2])
 
 
+class Grids(NamedTuple):
+    """What is sampled of a scenario, once each: a lattice by its arguments, and whether there is a way at all."""
+
+    lattice: Callable[..., Lattice]
+    connected: Callable[[], bool]
+
+
 def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = True) -> Optimum:
     """The reference of a scenario: the cheapest certified extremal among many.
 
@@ -111,19 +119,20 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.max_speed * scenario.horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
     search = Search(scenario, problem, WORK_ON_ALTERNATIVES * candidates)
-    failed = _search(search, candidates, thorough)
+    grids = Grids(cache(partial(Lattice, scenario)), cache(partial(is_connected, scenario)))
+    failed = _search(search, grids, candidates, thorough)
     if not search.certified and search.shut:  # the only way may lead close by a place that was shut
         search.shut, search.shutting = [], False
-        failed = _search(search, candidates, thorough)
+        failed = _search(search, grids, candidates, thorough)
     return _result(search) if failed is None else as_optimum(failure(problem, failed))
 
 
-def _search(search: Search, candidates: int, thorough: bool) -> Status | None:
+def _search(search: Search, grids: Grids, candidates: int, thorough: bool) -> Status | None:
     """Lattice after lattice, until the best path can be told to be found; why there is none, or None."""
     scenario = search.scenario
     shortest_time, cropped = np.inf, False
     for refinement, margin, whole in LATTICES[: None if thorough else 1]:
-        lattice = Lattice(scenario, refinement, margin, whole=whole).without(search.shut)
+        lattice = grids.lattice(refinement, margin, whole=whole).without(search.shut)
         if whole and (search.certified or not cropped):
             break
         cropped = cropped or lattice.cropped
@@ -147,7 +156,7 @@ def _search(search: Search, candidates: int, thorough: bool) -> Status | None:
                 lattice = lattice.without(search.shut)
                 paths, first = lattice.candidates(), None
         # Looked at when it is in doubt: lattice paths may lead through gaps that are a little too narrow.
-        if thorough and not search.certified and not is_connected(scenario):
+        if thorough and not search.certified and not grids.connected():
             return Status.NO_PATH
     if search.certified:
         return None

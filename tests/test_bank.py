@@ -14,7 +14,7 @@ import pytest
 
 import leapnav
 from leapnav.envs import FAMILIES, BankError, ScenarioBank, sample_scenario
-from leapnav.envs.bank import SPLITS, BankEntry, write_bank
+from leapnav.envs.bank import SPLITS, VERSION, BankEntry, write_bank
 from leapnav.envs.obstacles import clearances
 from leapnav.experts import ExpertPolicy, Path, build_bank, find_optimum, solve
 from leapnav.experts.banks import Rejection, judge
@@ -75,7 +75,7 @@ def test_other_programs_can_read_it(bank):
     """By the module's own description, with nothing but an HDF5 reader."""
     with h5py.File(bank.path) as file:
         assert file.attrs["format"] == "leapnav-bank"
-        assert file.attrs["version"] == 2
+        assert file.attrs["version"] == 3
         ends = file["scenario_ends"][:]
         text = file["scenarios"][ends[0] : ends[1]].tobytes().decode()
         assert json.loads(text) == bank[1].to_dict()
@@ -100,7 +100,7 @@ def test_neither_workers_nor_a_half_done_build_change_a_bit(bank, tmp_path):
     content = bank.path.read_bytes()
     assert build(tmp_path / "two.bank", workers=2).path.read_bytes() == content
     # What a build leaves that is killed while it writes a line: whole lines, and half of one.
-    header = {"format": 2, "software": bank.software, "family": "clutter", "seed": 3}
+    header = {"format": VERSION, "software": bank.software, "family": "clutter", "seed": 3}
     from leapnav.experts.banks import draw
 
     lines = [json.dumps(header), *(json.dumps(draw("clutter", 3, number)) for number in (4, 0, 2))]
@@ -137,7 +137,7 @@ def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
 def test_two_builds_of_one_bank_do_not_get_in_each_other_s_way(tmp_path):
     from leapnav.experts.banks import _Journal
 
-    header = {"format": 2, "software": leapnav.__version__, "family": "clutter", "seed": 3}
+    header = {"format": VERSION, "software": leapnav.__version__, "family": "clutter", "seed": 3}
     with _Journal(tmp_path / "x.bank.journal", header), pytest.raises(BankError, match="another process is building"):
         build(tmp_path / "x.bank")
     assert len(build(tmp_path / "x.bank")) == 6
@@ -170,7 +170,7 @@ def test_what_is_complete_is_not_built_again_and_nothing_else_is_overwritten(ban
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"format": 2, "software": "0", "family": "clutter", "seed": 3}\n', "of a build with software '0' instead"),
+        ('{"format": 3, "software": "0", "family": "clutter", "seed": 3}\n', "of a build with software '0' instead"),
         ("not a journal\n", "line 1 is no record of a build"),
         ('{"draw": 1}\n', "line 1 is no record of a build"),
         ("notes without an end of line", "line 1 is no record of a build"),
@@ -180,7 +180,7 @@ def test_what_is_complete_is_not_built_again_and_nothing_else_is_overwritten(ban
 )
 def test_a_foreign_journal_is_refused_and_kept(content, message, tmp_path):
     journal = tmp_path / "new.bank.journal"
-    header = {"format": 2, "software": leapnav.__version__, "family": "clutter", "seed": 3}
+    header = {"format": VERSION, "software": leapnav.__version__, "family": "clutter", "seed": 3}
     content = content.replace("HEADER", json.dumps(header) + "\n")
     journal.write_text(content)
     with pytest.raises(BankError, match=message):
@@ -229,7 +229,7 @@ def without_costs(path):
         (lambda path: path.write_text("text"), "no scenario bank, or damaged"),
         (lambda path: path.write_bytes(path.read_bytes()[:-5000]), "no scenario bank, or damaged"),
         (lambda path: path.write_bytes(b""), "no scenario bank, or damaged"),
-        (with_attribute("version", 1), "version 1 of the format; this leapnav reads 2"),
+        (with_attribute("version", 1), "version 1 of the format; this leapnav reads 3"),
         (with_attribute("format", "other"), "an HDF5 file, but no scenario bank"),
         (without_costs, "no scenario bank, or damaged: .*costs"),
     ],
