@@ -9,6 +9,7 @@ fit's. PPO from a clone starts with the first one; SAC, which squashes its actio
 """
 
 import argparse
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,12 @@ def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> Non
         train_ppo(replace(config, evaluate_every=config.total_timesteps // EVALUATIONS))
 
 
+def is_finished(run: Path) -> bool:
+    """Whether a run came to its end: during it, its folder holds the policy of the last evaluation."""
+    evaluations = run / "evaluations.jsonl"
+    return evaluations.exists() and json.loads(evaluations.read_text().splitlines()[-1])["final"]
+
+
 def entrants(family: str, runs: Path) -> list[str]:
     """What the table of a family compares, each with its row's name."""
     values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6, **SAC_STEPS}
@@ -73,7 +80,7 @@ def entrants(family: str, runs: Path) -> list[str]:
         f"{ROWS[method].format(**values)}={folder}"
         for method in METHODS
         for folder in sorted((runs / family).glob(f"{method}-*"))
-        if (folder / "policy.json").exists()
+        if is_finished(folder)
     ]
     return [*found, f"DAgger (ships)={family}", "go-to-goal"]
 
