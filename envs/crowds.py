@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import carray, float64, types
+from numba import float64, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np.numpy_support import carray
 
 from leapnav.envs.compiling import njit
 from leapnav.envs.fields import GRID, LANES
@@ -29,8 +30,7 @@ SUMS = 6  # over a polygon's edges: weights, with normals, with their products
 _field = types.Array(types.float64, 1, "C", readonly=True)
 
 
-@intrinsic
-def _power_of_two(context: Any, shifted: Any) -> Any:
+def _as_exponent(context: Any, shifted: Any) -> Any:
     """2^k from the float k + BIAS + WHOLE: its last bits become the exponent."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -40,8 +40,10 @@ def _power_of_two(context: Any, shifted: Any) -> Any:
     return float64(float64), generate
 
 
-@intrinsic
-def _on_the_stack(context: Any) -> Any:
+_power_of_two: Any = intrinsic(_as_exponent)
+
+
+def _room(context: Any) -> Any:
     """Room for SUMS numbers of LANES polygons, which costs nothing to get."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -49,6 +51,9 @@ def _on_the_stack(context: Any) -> Any:
         return builder.bitcast(room, ir.DoubleType().as_pointer())
 
     return types.CPointer(float64)(), generate
+
+
+_on_the_stack: Any = intrinsic(_room)
 
 
 # Products and sums may be fused, but not reordered: WHOLE is added to be taken off again.
