@@ -120,6 +120,7 @@ def crowd_proximity(x, y, field):
                 i = np.uint64(lane)
                 nx, ny = field[row + i], field[row + polygons + i]
                 distance = nx * x + ny * y - field[row + polygons + polygons + i]
+                # Not shifted by the largest distance, as it has to be for exp(): this one does not overflow.
                 share = exponential((distance - radius) * steepness)
                 sums[i] += share
                 sums[LANES + i] += share * nx
