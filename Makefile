@@ -1,22 +1,36 @@
 # `make demo` and `make test` work in a fresh clone; both set up .venv first.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-SOURCES := $(sort $(wildcard leapnav/* leapnav/play/* envs/*.py envs/banks/*.bank experts/*.py \
-    training/*.py training/*.toml training/*.jinja training/pretrained/*/*))
+SOURCES := $(sort $(shell find leapnav envs experts training -type f -not -path "*/__pycache__/*"))
+# The build backend only warns that the installation refers to this directory.
+INSTALL := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --constraint constraints.txt --config-settings editable_mode=strict --editable
+# One process per core; torch's threads would only compete with them.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
-.PHONY: demo test lint types docs bench clean
+.PHONY: demo compile test test-all lint types docs bench coverage clean
 .DELETE_ON_ERROR:
 
-demo: .venv/installed
+demo: compile
 	$(BIN)/leapnav demo
 
-# A process for each core: torch's threads would only be in each other's way.
-test: lint types .venv/examples
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
+# Compiles what is not in the cache, on all cores.
+compile: .venv/installed
+	$(BIN)/leapnav compile
+
+test: lint types compile .venv/examples
+	$(PYTEST)
+
+# What takes long by nature: see CONTRIBUTING.md.
+test-all: test
+	$(PYTEST) -m "slow"
+	HYPOTHESIS_PROFILE=long $(PYTEST) tests/test_fuzz.py
+	$(BIN)/python scripts/check_banks.py
+	$(BIN)/python scripts/check_installations.py
 
 lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	cd build/__editable__.leapnav-*/ && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-cache
 
 types: .venv/installed
 	$(BIN)/basedpyright
@@ -27,11 +41,14 @@ docs: .venv/installed
 	@echo "wrote build/site/index.html"
 
 bench: .venv/installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[bench]" --config-settings editable_mode=strict
+	$(INSTALL) ".[bench]"
 	$(BIN)/python benchmarks/environment.py
 	$(BIN)/python benchmarks/expert.py
 	$(BIN)/python benchmarks/solvers.py
 	$(BIN)/python benchmarks/optima.py
+
+coverage: compile .venv/examples
+	$(PYTEST) --cov=envs --cov=experts --cov=training --cov=leapnav --cov-report=term
 
 clean:
 	rm -rf .venv build *.egg-info
@@ -39,7 +56,7 @@ clean:
 # A strict editable install, so that type checkers and editors resolve every import; it links the files that exist, so
 # it is made again whenever one is added or removed.
 .venv/installed: pyproject.toml constraints.txt .venv/sources
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]" --config-settings editable_mode=strict
+	$(INSTALL) ".[dev]"
 	touch $@
 
 .venv/examples: examples/requirements.txt .venv/bin/python

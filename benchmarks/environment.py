@@ -1,7 +1,7 @@
-"""Steps per second of the environment, beside Gymnasium's Pendulum-v1 in one process, and replays of the optima in it.
+"""Steps per second of the environment compared with Gymnasium's Pendulum-v1, and replays of optima.
 
-Rates are those of Gymnasium's own benchmarks: random actions, resets and the sampling of the actions included. The two
-environments take turns, so that what else the machine does hits both; the figures are medians.
+Rates are measured by Gymnasium's own benchmark functions: random actions, including resets and action sampling. The two
+environments alternate in one process, so that other load affects both; the results are medians.
 """
 
 import statistics
@@ -14,11 +14,11 @@ from tqdm.auto import tqdm
 import leapnav  # noqa: F401
 from leapnav.envs import FAMILIES, NavigateVectorEnv, ScenarioBank
 from leapnav.experts import find_optimum
-from leapnav.experts.policy import plan_actions
+from leapnav.experts.acting.policy import plan_actions
 
-ID, ROUNDS, SECONDS, ROBOTS = "leapnav/Navigate-v0", 7, 1.0, 1024
+ENV_ID, ROUNDS, SECONDS, ROBOTS = "leapnav/Navigate-v0", 7, 1.0, 1024
 RATES = [
-    # What is measured, robots (None: the single environment), arguments, the bar in times Pendulum's rate.
+    # Name, robots (None: the single environment), arguments, target of the ratio to Pendulum-v1.
     ("vector, state", ROBOTS, {"observation": "state"}, 25.0),
     ("vector, 32 lidar beams", ROBOTS, {}, 10.0),
     ("vector, map", ROBOTS, {"observation": "map"}, None),
@@ -32,10 +32,10 @@ RATES = [
 
 
 def rate(robots: int | None, arguments: dict, seed: int) -> float:
-    """Robot-steps per second."""
+    """Environment steps per second of all robots."""
     if robots is None:
-        return benchmark_step(gym.make(ID, family="clutter", **arguments), SECONDS, seed)
-    venv = gym.make_vec(ID, num_envs=robots, vectorization_mode="vector_entry_point", family="clutter", **arguments)
+        return benchmark_step(gym.make(ENV_ID, family="clutter", **arguments), SECONDS, seed)
+    venv = gym.make_vec(ENV_ID, num_envs=robots, vectorization_mode="vector_entry_point", family="clutter", **arguments)
     return benchmark_vector_step(venv, SECONDS, seed)
 
 
@@ -45,25 +45,25 @@ def measure_rates() -> None:
     for seed in tqdm(range(ROUNDS + 1), desc="Steps per second", unit="round"):
         for name, robots, arguments, _ in RATES:
             pair = rate(robots, arguments, seed), benchmark_step(peer, SECONDS, seed)
-            if seed > 0:  # the first round loads and warms
+            if seed > 0:  # the first round loads the kernels
                 rows[name].append(pair)
-    print(f"{'':36}{'steps/s':>12}{'Pendulum-v1':>14}{'ratio':>8}{'bar':>8}")
-    for name, _, _, bar in RATES:
+    print(f"{'':36}{'steps/s':>12}{'Pendulum-v1':>14}{'ratio':>8}{'target':>8}")
+    for name, _, _, target in RATES:
         ours, theirs = (statistics.median(column) for column in zip(*rows[name], strict=True))
         ratio = statistics.median(a / b for a, b in rows[name])
-        print(f"{name:36}{ours:12,.0f}{theirs:14,.0f}{ratio:8.2f}{'' if bar is None else f'{bar:8.1f}'}")
+        print(f"{name:36}{ours:12,.0f}{theirs:14,.0f}{ratio:8.2f}{'' if target is None else f'{target:8.1f}'}")
 
 
 def replay(bank: ScenarioBank, plans: list[np.ndarray], **arguments: object) -> tuple[float, float]:
-    """The share of successes when the optima are driven open-loop, and the median cost over the optimal one."""
+    """Fraction of successes when the optima are driven open-loop, and median ratio to the reference cost."""
     venv = NavigateVectorEnv(len(bank), bank=bank, observation="state", autoreset_mode="SameStep", **arguments)
     venv.reset(seed=0, options={"index": list(range(len(bank)))})
     actions = np.zeros((max(map(len, plans)), len(bank), 2), np.float32)
     for i, plan in enumerate(plans):
         actions[: len(plan), i] = plan
     ended, success, cost = np.zeros(len(bank), bool), np.zeros(len(bank), bool), np.zeros(len(bank))
-    for now in actions:
-        _, _, terminated, _, infos = venv.step(now)
+    for step_actions in actions:
+        _, _, terminated, _, infos = venv.step(step_actions)
         for i in np.flatnonzero(terminated & ~ended):
             success[i], cost[i] = infos["final_info"]["is_success"][i], infos["final_info"]["cost"][i]
         ended |= terminated

@@ -1,4 +1,4 @@
-"""The expert in closed loop: time of a decision, success and regret by family and setting, and many robots at once."""
+"""The expert in closed loop: time of an action, success and regret by family and setting, and batches of robots."""
 
 import statistics
 import time
@@ -18,7 +18,7 @@ SETTINGS = [
 
 
 def measure_time(family: str, feedback: str) -> tuple[float, float, float]:
-    """Median and 99th percentile (ms) of a decision, and the median of an episode's first."""
+    """Median and 99th percentile of the time of an action, and the median of the first in an episode (ms)."""
     env = NavigateEnv(family, split="test", observation="state")
     expert = ExpertPolicy(env, feedback=feedback, workers=1)
     first, later = [], []
@@ -34,7 +34,7 @@ def measure_time(family: str, feedback: str) -> tuple[float, float, float]:
 
 
 def measure_success(family: str, settings: dict) -> tuple[int, float]:
-    """Successes and median regret over the first test scenarios."""
+    """Number of successes and median regret on the first test scenarios."""
     bank = ScenarioBank.shipped(family, "test")
     venv = NavigateVectorEnv(EPISODES, bank=bank, observation="state", **settings)
     expert = ExpertPolicy(venv)
@@ -49,7 +49,7 @@ def measure_success(family: str, settings: dict) -> tuple[int, float]:
 
 
 def measure_batch() -> tuple[float, float]:
-    """Time (ms) of a decision for many robots, at once and in a loop over as many environments."""
+    """Time of the actions of all robots (ms), as a batch and in a loop over single environments."""
     arguments = {"family": "clutter", "split": "test", "observation": "state"}
     venv = NavigateVectorEnv(ROBOTS, **arguments)
     envs = [NavigateEnv(**arguments) for _ in range(ROBOTS)]
@@ -57,32 +57,32 @@ def measure_batch() -> tuple[float, float]:
     observations, _ = venv.reset(seed=0)
     for i, env in enumerate(envs):
         env.reset(seed=i)
-    at_once, one_by_one = [], []
+    batched, looped = [], []
     for _ in range(ROUNDS):
         start = time.perf_counter()
         actions, _ = expert.predict(observations)
         middle = time.perf_counter()
-        alone = [each.predict(observations[0])[0] for each in experts]
+        single = [one.predict(observations[0])[0] for one in experts]
         end = time.perf_counter()
-        assert np.array_equal(actions, alone)
+        assert np.array_equal(actions, single)
         observations, *_ = venv.step(actions)
-        for env, action in zip(envs, alone, strict=True):
+        for env, action in zip(envs, single, strict=True):
             env.step(action)
-        at_once.append(1e3 * (middle - start))
-        one_by_one.append(1e3 * (end - middle))
-    return statistics.median(at_once[1:]), statistics.median(one_by_one[1:])  # the first finds the references
+        batched.append(1e3 * (middle - start))
+        looped.append(1e3 * (end - middle))
+    return statistics.median(batched[1:]), statistics.median(looped[1:])  # the first step searches for the optima
 
 
 def main() -> None:
-    at_once, one_by_one = measure_batch()
-    ratio = one_by_one / at_once
-    print(f"{ROBOTS} robots: {at_once:.1f} ms at once, {one_by_one:.1f} ms in a loop, ratio {ratio:.2f} (bar 1.5)\n")
-    print(f"{'':10}{'feedback':>10}{'median ms':>12}{'99 % ms':>10}{'first ms':>10}   (bars 2 and 30)")
+    batched, looped = measure_batch()
+    ratio = looped / batched
+    print(f"{ROBOTS} robots: {batched:.1f} ms as a batch, {looped:.1f} ms in a loop, ratio {ratio:.2f} (target 1.5)\n")
+    print(f"{'':10}{'feedback':>10}{'median ms':>12}{'99 % ms':>10}{'first ms':>10}   (targets 2 and 30)")
     for family in FAMILIES:
         for feedback in ("resolve", "gains"):
             median, slow, first = measure_time(family, feedback)
             print(f"{family:10}{feedback:>10}{median:12.3f}{slow:10.2f}{first:10.1f}")
-    print(f"\n{'success of ' + str(EPISODES) + ', median regret':32}" + "".join(f"{name:>24}" for name, _ in SETTINGS))
+    print(f"\n{f'successes of {EPISODES}, median regret':32}" + "".join(f"{name:>24}" for name, _ in SETTINGS))
     for family in FAMILIES:
         cells = [measure_success(family, settings) for _, settings in tqdm(SETTINGS, desc=family, leave=False)]
         print(f"{family:32}" + "".join(f"{f'{success}, {100 * regret:.3f} %':>24}" for success, regret in cells))

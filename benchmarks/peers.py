@@ -1,9 +1,9 @@
-"""The same problem for the tools that people use now: scipy's solve_bvp, and CasADi with IPOPT.
+"""The peers of the benchmark: SciPy's solve_bvp, and CasADi with IPOPT, on the same problem.
 
-Both get what their documentation recommends, and nothing that a user would have to invent: solve_bvp a vectorised
-right-hand side in NumPy (or, as a second entry, our compiled flow with its analytic Jacobian); IPOPT the trapezoidal
-transcription with exact derivatives, as its Opti stack builds them for each new scenario, or (as a second entry) built
-once with the scenario's numbers as parameters, before the clock starts.
+Both are used as their documentation recommends. solve_bvp gets a vectorised right-hand side in NumPy or, in a second
+variant, leapnav's compiled flow with its analytic Jacobian. IPOPT solves the trapezoidal transcription with exact
+derivatives, built by CasADi's Opti stack for each scenario or, in a second variant, prebuilt with the numbers of the
+scenario as parameters, which is not timed.
 """
 
 import functools
@@ -15,21 +15,26 @@ import numpy as np
 from scipy.integrate import solve_bvp
 
 from leapnav.envs import Scenario
-from leapnav.envs.obstacles import clearances
-from leapnav.experts import Path, Status, certify
-from leapnav.experts.nodes import default_segments, start_nodes
-from leapnav.experts.problem import OptimalControlProblem
+from leapnav.envs.shapes.clearance import clearances
+from leapnav.experts import Status, Trajectory, certify
+from leapnav.experts.problem.problem import OptimalControlProblem
+from leapnav.experts.solvers.nodes import default_segments, start_nodes
 
-MOST_NODES = 5000
+MAX_NODES = 5000
 IPOPT_TOLERANCE = 1e-6
-POINTS = 4000  # at which a returned path is looked at
+POINTS = 4000  # of the dense path that is checked for collisions
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a solver returned.
+    """The result of a solver.
 
-    Did it say success and is its path clear, the cost, how long it took (s), and does the path pass our certificate.
+    Attributes:
+        success: whether the solver reports success and the path is collision-free.
+        cost: cost of the path.
+        seconds: time of the solve (s).
+        certified: whether the path passes leapnav's certificate.
+
     """
 
     success: bool
@@ -39,7 +44,7 @@ class Result:
 
 
 def bvp(scenario: Scenario, states: np.ndarray, costates: np.ndarray, tol: float, compiled: bool = False) -> Result:
-    """solve_bvp from a guess on an even mesh."""
+    """Solve by solve_bvp from a guess on a uniform mesh."""
     problem = OptimalControlProblem.from_scenario(scenario).with_winding_of(states)
     goal, start_state = np.array(problem.goal), np.array(problem.start)
     rates, jacobian = _compiled(problem) if compiled else (_in_numpy(scenario), None)
@@ -64,7 +69,7 @@ def bvp(scenario: Scenario, states: np.ndarray, costates: np.ndarray, tol: float
             fun_jac=jacobian,
             bc_jac=end_jacobians if compiled else None,
             tol=tol,
-            max_nodes=MOST_NODES,
+            max_nodes=MAX_NODES,
         )
     seconds = time.perf_counter() - start
     dense = np.linspace(0.0, scenario.horizon, POINTS)
@@ -75,25 +80,25 @@ def bvp(scenario: Scenario, states: np.ndarray, costates: np.ndarray, tol: float
     return Result(bool(found.success) and bool(clear), cost, seconds, certified)
 
 
-def path_guess(scenario: Scenario, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """States of the path and costates estimated along it, as our own methods get them."""
+def path_guess(scenario: Scenario, path: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """States of a path and costates estimated along it, the initial guess of leapnav's methods."""
     problem = OptimalControlProblem.from_scenario(scenario).with_winding_of(path.states)
     _, nodes = start_nodes(problem, path, default_segments(path))
     return nodes[:, :3], nodes[:, 3:]
 
 
 def line_guess(scenario: Scenario, points: int = 33) -> tuple[np.ndarray, np.ndarray]:
-    """The straight line, and costates -r v (cos, sin, 0) of driving along it at constant speed."""
+    """The straight line, with the costates -r v (cos, sin, 0) of driving along it at constant speed."""
     problem = OptimalControlProblem.from_scenario(scenario)
     states = problem.with_winding_of(np.array([scenario.start])).straight_line(points).states
-    way = np.subtract(scenario.goal[:2], scenario.start[:2])
+    displacement = np.subtract(scenario.goal[:2], scenario.start[:2])
     costates = np.zeros_like(states)
-    costates[:, :2] = -scenario.cost.speed_weight * way / scenario.horizon
+    costates[:, :2] = -scenario.cost.speed_weight * displacement / scenario.horizon
     return states, costates
 
 
 def _in_numpy(scenario: Scenario):
-    """The extremal flow of a scenario of discs as its user would write it: vectorised over the mesh."""
+    """The extremal flow of a scenario with discs, vectorised over the mesh as a user would write it."""
     cost, robot = scenario.cost, scenario.robot
     centers = np.array([o.circle.center for o in scenario.obstacles])[:, :, None]
     rims = np.array([o.circle.radius for o in scenario.obstacles])[:, None] + robot.radius
@@ -120,21 +125,21 @@ def _in_numpy(scenario: Scenario):
 
 
 def _compiled(problem: OptimalControlProblem):
-    """Our flow and its Jacobian, column by column."""
+    """Leapnav's compiled flow and its Jacobian, column by column."""
     arrays = problem.arrays
     none, dz, identity, block = np.empty((6, 0)), np.empty(6), np.eye(6), np.empty((6, 6))
 
     def rates(_: np.ndarray, z: np.ndarray) -> np.ndarray:
         out = np.empty_like(z)
         for k, column in enumerate(np.ascontiguousarray(z.T)):
-            arrays.flow(column, arrays.data, arrays.field, none, dz, none)
+            arrays.flow.function(column, arrays.data, arrays.field, none, dz, none)
             out[:, k] = dz
         return out
 
     def jacobian(_: np.ndarray, z: np.ndarray) -> np.ndarray:
         out = np.empty((6, 6, z.shape[1]))
         for k, column in enumerate(np.ascontiguousarray(z.T)):
-            arrays.flow(column, arrays.data, arrays.field, identity, dz, block)
+            arrays.flow.function(column, arrays.data, arrays.field, identity, dz, block)
             out[:, :, k] = block
         return out
 
@@ -143,12 +148,12 @@ def _compiled(problem: OptimalControlProblem):
 
 def _running_cost(problem: OptimalControlProblem, z: np.ndarray) -> np.ndarray:
     arrays, none, dz = problem.arrays, np.empty((6, 0)), np.empty(6)
-    return np.array([arrays.flow(row, arrays.data, arrays.field, none, dz, none) for row in z])
+    return np.array([arrays.flow.function(row, arrays.data, arrays.field, none, dz, none) for row in z])
 
 
 @functools.cache
 def transcription(obstacles: int, intervals: int) -> tuple[casadi.Function, int]:
-    """IPOPT for scenarios of so many discs with their numbers as parameters, and its number of constraints."""
+    """An IPOPT solver for scenarios with this number of discs, whose parameters are inputs; number of constraints."""
     q, u = casadi.SX.sym("q", 3, intervals + 1), casadi.SX.sym("u", 2, intervals + 1)
     numbers = casadi.SX.sym("numbers", 16 + 3 * obstacles)
     horizon, sigma, weight, radius, speed_weight, turn_weight = casadi.vertsplit(numbers[:6])
@@ -157,13 +162,13 @@ def transcription(obstacles: int, intervals: int) -> tuple[casadi.Function, int]
     v, w = u[0, :], u[1, :]
     h = horizon / intervals
     rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
-    near = 0
+    proximity = 0
     for d in (q[0, :] - arena[0], arena[2] - q[0, :], q[1, :] - arena[1], arena[3] - q[1, :]):
-        near += casadi.exp(-(d - radius) / sigma)
+        proximity += casadi.exp(-(d - radius) / sigma)
     for i in range(obstacles):
         d = casadi.sqrt((q[0, :] - discs[0, i]) ** 2 + (q[1, :] - discs[1, i]) ** 2 + 1e-6) - discs[2, i] - radius
-        near += casadi.exp(-d / sigma)
-    running = (speed_weight * v**2 + turn_weight * w**2) / 2 + weight * near
+        proximity += casadi.exp(-d / sigma)
+    running = (speed_weight * v**2 + turn_weight * w**2) / 2 + weight * proximity
     steps = q[:, 1:] - q[:, :-1] - h / 2 * (rates[:, 1:] + rates[:, :-1])
     constraints = casadi.vertcat(casadi.vec(steps), q[:, 0] - start, q[:, -1] - goal)
     program = {
@@ -176,23 +181,23 @@ def transcription(obstacles: int, intervals: int) -> tuple[casadi.Function, int]
     return casadi.nlpsol("solver", "ipopt", program, options), constraints.shape[0]
 
 
-def ipopt(scenario: Scenario, path: Path, intervals: int, prebuilt: bool = False) -> Result:
-    """IPOPT on the trapezoidal transcription, from the path's states and the speeds along it."""
+def ipopt(scenario: Scenario, path: Trajectory, intervals: int, prebuilt: bool = False) -> Result:
+    """Solve by IPOPT on the trapezoidal transcription, from the states of a path and the speeds along it."""
     times = np.linspace(0.0, scenario.horizon, intervals + 1)
     states = path.resample(times).states
-    along = np.gradient(states, times, axis=0)
-    speed = along[:, 0] * np.cos(states[:, 2]) + along[:, 1] * np.sin(states[:, 2])
-    speeds = np.stack([speed, along[:, 2]], axis=1)
+    rates = np.gradient(states, times, axis=0)
+    speed = rates[:, 0] * np.cos(states[:, 2]) + rates[:, 1] * np.sin(states[:, 2])
+    speeds = np.stack([speed, rates[:, 2]], axis=1)
     values, cost, success, seconds = (_prebuilt if prebuilt else _opti)(scenario, times, states, speeds)
-    dense = Path(times, values).resample(np.linspace(0.0, scenario.horizon, POINTS)).states
+    dense = Trajectory(times, values).resample(np.linspace(0.0, scenario.horizon, POINTS)).states
     clear = clearances(np.ascontiguousarray(dense), scenario.field).min() > 0
     return Result(success and bool(clear), cost, seconds)
 
 
-Solved = tuple[np.ndarray, float, bool, float]
+Solution = tuple[np.ndarray, float, bool, float]
 
 
-def _prebuilt(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solved:
+def _prebuilt(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
     solver, count = transcription(len(scenario.obstacles), len(times) - 1)
     robot, cost = scenario.robot, scenario.cost
     discs = [value for o in scenario.obstacles for value in (*o.circle.center, o.circle.radius)]
@@ -207,7 +212,7 @@ def _prebuilt(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds:
     return values, float(found["f"]), bool(solver.stats()["success"]), seconds
 
 
-def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solved:
+def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
     intervals, cost, robot = len(times) - 1, scenario.cost, scenario.robot
     h = scenario.horizon / intervals
     opti = casadi.Opti()
@@ -216,14 +221,14 @@ def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.
     rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
     opti.subject_to(q[:, 1:] == q[:, :-1] + h / 2 * (rates[:, 1:] + rates[:, :-1]))
     x_min, y_min, x_max, y_max = scenario.arena
-    near = 0
+    proximity = 0
     for d in (q[0, :] - x_min, x_max - q[0, :], q[1, :] - y_min, y_max - q[1, :]):
-        near += casadi.exp(-(d - robot.radius) / cost.proximity_scale)
+        proximity += casadi.exp(-(d - robot.radius) / cost.proximity_scale)
     for obstacle in scenario.obstacles:
         (cx, cy), r = obstacle.circle.center, obstacle.circle.radius
         d = casadi.sqrt((q[0, :] - cx) ** 2 + (q[1, :] - cy) ** 2 + 1e-6) - r - robot.radius
-        near += casadi.exp(-d / cost.proximity_scale)
-    running = (cost.speed_weight * v**2 + cost.turn_weight * w**2) / 2 + cost.proximity_weight * near
+        proximity += casadi.exp(-d / cost.proximity_scale)
+    running = (cost.speed_weight * v**2 + cost.turn_weight * w**2) / 2 + cost.proximity_weight * proximity
     objective = h * (casadi.sum2(running) - (running[0] + running[-1]) / 2)
     opti.minimize(objective)
     opti.subject_to(q[:, 0] == np.array(scenario.start))
@@ -234,7 +239,7 @@ def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.
     opti.set_initial(u, speeds.T)
     options = {"print_level": 0, "sb": "yes", "tol": IPOPT_TOLERANCE}
     opti.solver("ipopt", {"print_time": False, "expand": True}, options)
-    # Writing the problem down in Python is not counted, making its derivatives and solving it is.
+    # The time includes the derivatives and the solve, but not the construction of the expressions above.
     start = time.perf_counter()
     try:
         solution = opti.solve()

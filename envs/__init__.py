@@ -1,9 +1,9 @@
-"""Gymnasium environments of a two-wheeled robot among obstacles, and the scenarios that they play."""
+"""Gymnasium environments of a two-wheeled robot among obstacles, and the scenarios played in them."""
 
-from leapnav.envs.bank import BankError, Reference, ScenarioBank
-from leapnav.envs.families import FAMILIES, sample_scenario
 from leapnav.envs.navigation import NavigateEnv, NavigateGoalEnv
-from leapnav.envs.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario, ScenarioError
+from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
+from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
+from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario, ScenarioError
 from leapnav.envs.settings import Disturbance, Motor
 from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 

@@ -1,135 +1,158 @@
-"""The environment `leapnav/Navigate-v0`, and `leapnav/NavigateGoal-v0` for learners that choose their goals."""
+"""The environments `leapnav/Navigate-v0` and `leapnav/NavigateGoal-v0` (goal-conditioned)."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 
-from leapnav.envs import driving
-from leapnav.envs.bank import ScenarioBank
-from leapnav.envs.fleet import Fleet
+from leapnav.envs.checks import check_actions, check_options, check_render_mode
 from leapnav.envs.goals import GoalConditioned
-from leapnav.envs.scenario import Scenario
-from leapnav.envs.settings import Disturbance, Motor, Settings
-from leapnav.envs.tasks import Tasks, scenario_of
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
+from leapnav.envs.settings import Disturbance, EnvironmentSettings, Motor
+from leapnav.envs.simulation import state as columns
+from leapnav.envs.simulation.simulator import BatchSimulator
 
 if TYPE_CHECKING:
-    from leapnav.envs.rendering import Window
+    from leapnav.envs.simulation.rendering import Window
 
 __all__ = ["NavigateEnv", "NavigateGoalEnv"]
 
-DISTURBANCE_STREAM = 1  # of the environment's seed
+NOISE_STREAM = 1  # of the environment's seed; the stream of the scenarios is the seed itself
 
 
 class NavigateEnv(gym.Env[Any, np.ndarray]):
-    r"""A two-wheeled robot drives to a pose among obstacles, on time and at the least cost.
+    r"""A two-wheeled robot drives to a goal pose among obstacles, in a fixed time and at minimum cost.
 
     ## Description
-    The robot has a fixed time, the horizon, to reach a pose without touching anything. What it pays is the cost of the
-    optimal control problem, so the optimum that `leapnav.experts.find_optimum` finds is the return of the best possible
-    policy, up to the square of the control period. pymunk moves the robot; in `actuation="velocity"` the exact arc of
-    each command is driven while nothing is touched.
+    The robot has a fixed time, the horizon, to reach the goal pose without a collision. The reward is minus the running
+    cost of an optimal control problem, with penalties for a collision and for missing the goal. The return of an
+    optimal policy is therefore `-J*`, up to terms of second order in the control period, where `J*` is the minimum cost
+    of the scenario. `leapnav.experts.find_optimum` computes the best known value of `J*`, and scenario banks store it.
 
-    `gym.make_vec("leapnav/Navigate-v0", num_envs=1024)` steps many robots at once, see `NavigateVectorEnv`;
-    `leapnav/NavigateGoal-v0` is the same task for learners that choose their goals, see `NavigateGoalEnv`.
+    The motion is simulated with pymunk. With `actuation="velocity"` and without contact, the robot follows the exact
+    circular arc of each action.
+
+    `gym.make_vec("leapnav/Navigate-v0", num_envs=1024)` simulates many robots in one process, see `NavigateVectorEnv`.
+    `leapnav/NavigateGoal-v0` is the same task for goal-conditioned learners, see `NavigateGoalEnv`.
 
     ## Action space
-    `Box(-1, 1, (2,), float32)`, held for one control period (values outside are clipped):
+    `Box(-1, 1, (2,), float32)`. The action is held for one control period. Values outside the bounds are clipped.
 
     | Index | Action | Unit | -1 | +1 |
     |---|---|---|---|---|
     | 0 | speed | m/s | `-max_speed` (backwards) | `max_speed` |
     | 1 | turn rate | rad/s | `-max_turn_rate` (clockwise) | `max_turn_rate` |
 
-    With `actuation="velocity"` the robot moves so at once. With `"motor"` it has mass and inertia: its wheels' motors
-    work towards the commanded motion with limited force, and its tyres can slip sideways, see `Motor`.
+    With `actuation="velocity"`, the robot reaches the commanded speed and turn rate immediately. With `"motor"`, it has
+    mass and inertia: motors with a limited force drive the wheels towards the commanded motion, and the tyres can slip
+    sideways, see `Motor`.
 
     ## Observation space
-    `Box(n, float32)` of these parts, one after the other, or with `dict_observation=True` a `Dict` of them. Values
-    beyond the range are clipped.
+    `Box(n, float32)`: the following parts, concatenated. With `dict_observation=True`, a `Dict` with one `Box` for each
+    part. Values outside the range are clipped.
 
     | Part | Index in the part | Observation | Unit | Range |
     |---|---|---|---|---|
     | `goal` | 0, 1 | goal position in the robot's frame: ahead, to the left | m | -1000 to 1000 |
-    | | 2, 3 | cosine and sine of the goal heading minus the heading; 0, 0 if it is free | 1 | -1 to 1 |
+    | | 2, 3 | cosine and sine of the goal heading relative to the robot's heading; 0, 0 if the goal heading is free | 1 | -1 to 1 |
     | | 4 | time left | s | 0 to 10000 |
-    | | 5, 6 | velocity needed to arrive on time in a straight line: ahead, to the left | m/s | -20 to 20 |
-    | | 7 | speed needed to arrive on time in a straight line | m/s | 0 to 20 |
-    | | 8 | turn rate needed to arrive on time with the goal heading | rad/s | -20 to 20 |
-    | `motion` (`"motor"` only) | 0, 1 | velocity: ahead, to the left | m/s | -20 to 20 |
+    | | 5, 6 | goal position divided by the time left: ahead, to the left | m/s | -20 to 20 |
+    | | 7 | distance to the goal divided by the time left | m/s | 0 to 20 |
+    | | 8 | angle to the goal heading divided by the time left; 0 if the goal heading is free | rad/s | -20 to 20 |
+    | `motion` (`"motor"` only) | 0, 1 | velocity in the robot's frame: ahead, to the left | m/s | -20 to 20 |
     | | 2 | turn rate | rad/s | -20 to 20 |
-    | `lidar` (`"lidar"` only) | k | range of beam k from the robot's centre, counter-clockwise from ahead | m | 0 to `lidar_range` |
-    | `walls` (`"map"` only) | 0 to 3 | distances to the walls: left, bottom, right, top of the arena | m | -1000 to 1000 |
+    | `lidar` (`"lidar"` only) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
+    | `walls` (`"map"` only) | 0 to 3 | distances to the left, bottom, right and top wall of the arena | m | -1000 to 1000 |
     | | 4, 5 | cosine and sine of the heading | 1 | -1 to 1 |
-    | `obstacles` (`"map"` only) | per obstacle: 0 | 1 if there is one, else the row is zeros | 1 | 0 to 1 |
-    | | 1 | radius by which its outline is rounded: a disc's radius, 0 for a polygon | m | 0 to 1000 |
-    | | 2 ... | vertices in the robot's frame: ahead, to the left; a disc's is its centre; repeated to fill up | m | -1000 to 1000 |
+    | `obstacles` (`"map"` only) | per obstacle: 0 | 1; in a row without an obstacle, all entries are 0 | 1 | 0 to 1 |
+    | | 1 | radius of a disc, 0 for a polygon | m | 0 to 1000 |
+    | | 2 ... | vertices in the robot's frame: ahead, to the left; for a disc, its centre; repeated to fill the row | m | -1000 to 1000 |
 
-    `observation="lidar"` has `lidar_beams` ranges, `"map"` the `map_obstacles` nearest obstacles, nearest first, of
-    `map_vertices` vertices each, and `"state"` neither: it suits tasks without obstacles, and tests.
+    `observation="lidar"` contains `lidar_beams` ranges. `"map"` contains the `map_obstacles` nearest obstacles, in
+    order of distance, with `map_vertices` vertices each. `"state"` contains neither; it suits scenarios without
+    obstacles.
 
     ## Rewards
-    With `reward="cost"` the return is `-J` minus the penalties; `info["reward_parts"]` has the parts of each step:
+    With `reward="cost"`, the return is `-J` minus the penalties. `info["reward_parts"]` contains the parts of each
+    reward:
 
     | Part | Value | When |
     |---|---|---|
-    | `effort` | minus the integral of 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
-    | `proximity` | minus the integral of Phi, the scenario's proximity cost | always |
-    | `collision` | `-collision_penalty` | the first time that something is touched |
-    | `miss` | `-miss_penalty` | the episode ends away from the goal, by the horizon or by a touch |
-    | `shaping` (`reward="shaped"` only) | `discount` times the potential after the step, minus the one before | always |
+    | `effort` | minus the integral of 1/2 (speed_weight v^2 + turn_weight omega^2) over the step | always |
+    | `proximity` | minus the integral of the proximity cost Phi over the step | always |
+    | `collision` | `-collision_penalty` | at the first collision of the episode |
+    | `miss` | `-miss_penalty` | if the episode ends without reaching the goal, at the horizon or by a collision |
+    | `shaping` (`reward="shaped"` only) | `discount` times the potential after the step, minus the potential before it | always |
 
-    `reward="shaped"` adds the last: potential-based shaping, which leaves the optimal policy as it is (Ng, Harada and
-    Russell, 1999) if `discount` is the learner's. The potential is minus the cost of driving at an even pace along the
-    reference path (without a reference, straight) to the goal, at least `-miss_penalty`, and 0 once the episode is over.
-    v and omega are those driven: in `"motor"`, in contact and under a disturbance not quite those commanded.
+    v and omega are the actual speed and turn rate, which differ from the commanded ones with motors, in contact and
+    with noise.
+
+    `reward="shaped"` adds potential-based shaping. It leaves the optimal policy unchanged if `discount` is the
+    learner's discount factor (Ng, Harada and Russell, 1999). The potential is minus the cost of following the reference
+    path at constant speed, or a straight line to the goal if there is no reference. It is at least `-miss_penalty`, and
+    0 after the end of the episode.
 
     ## Starting state
-    The scenario's start, at rest in `"motor"`. The scenario is `options["scenario"]` (a `Scenario`, a dict in the
-    layout of its file, its JSON text, or the file), else the argument `scenario`; else number `options["index"]` of the bank, or
-    one that the environment's own generator draws from it; with `split="fresh"` that generator makes a new one.
+    The start of the scenario; at rest with `"motor"`. The scenario of an episode is the first of these that is given:
+
+    1. `options["scenario"]` of `reset`: a `Scenario`, a dict with the structure of a scenario file, JSON text, or the
+       path of a file;
+    2. the scenario with the index `options["index"]` in the bank;
+    3. the argument `scenario`;
+    4. a random scenario of the bank, or with `split="fresh"` a new random scenario of the family.
 
     ## Episode end
-    `terminated` at the horizon, which is part of the task (the time left is observed), or when something is touched:
-    the robot stops there. With `terminate_on_collision=False` it goes on in contact, as pymunk has it, and the episode
-    ends at the horizon. Never `truncated`. The episode is a success if at the horizon the robot stands within
-    `position_tolerance` and `heading_tolerance` of the goal and has touched nothing.
+    The episode is `terminated` at the horizon, which is part of the task (the time left is observed), or at a
+    collision. It is never `truncated`. With `terminate_on_collision=False`, the robot continues in contact with the
+    obstacle, as simulated by pymunk, until the horizon. The episode is a success if, at the horizon, the robot is
+    within `position_tolerance` and `heading_tolerance` of the goal and has not collided.
 
     ## Info
-    `cost` (J so far), `clearance` (m, the smallest during the step, to a millimetre or 2 %), `collision` (touched
-    something in this episode), `is_success`, `time` (s), `pose` (x, y, unwrapped heading) and `reward_parts`; after a
-    reset also `scenario`, and with a bank `index` and `reference_cost`, the cost of its optimum.
+    | Key | Content |
+    |---|---|
+    | `cost` | J so far |
+    | `clearance` | smallest clearance during the step (m), with an error of at most 1 mm or 2 %, whichever is larger |
+    | `collision` | whether the robot has collided in this episode |
+    | `is_success` | whether the episode is a success |
+    | `time` | time since the start of the episode (s) |
+    | `pose` | x, y (m), heading (rad, unwrapped) |
+    | `reward_parts` | see Rewards |
+    | `scenario` | after a reset: the `Scenario` |
+    | `index`, `reference_cost` | after a reset, with a bank: index of the scenario, and cost of its optimum |
 
     ## Arguments
     | Argument | Default | Meaning |
     |---|---|---|
-    | `family` | `"clutter"` | family of scenarios, see `leapnav.envs.FAMILIES`; `"all"` draws the family too, for `split="fresh"`, its default |
-    | `scenario` | None | the one scenario of all episodes |
-    | `split` | `"train"` | the family's bank that ships with leapnav, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` makes a new scenario (2 ms) for each episode |
+    | `family` | `"clutter"` | family of the scenarios, see `leapnav.envs.FAMILIES`; `"all"` samples the family for each episode, with `split="fresh"` only |
+    | `scenario` | None | the scenario of all episodes |
+    | `split` | `"train"` | the family's shipped bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
     | `observation` | `"lidar"` | `"lidar"`, `"state"` or `"map"` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |
     | `actuation` | `"velocity"` | `"velocity"` or `"motor"` |
-    | `disturbance` | None | noise on motion and sensing: a `Disturbance` or a dict of its attributes; a number d stands for `actuation` d, `slip` d and `sensing` d / 10 |
-    | `motor` | None | for `"motor"`: a `Motor` or a dict of its attributes |
-    | `dict_observation` | False | a `Dict` of the parts, for `MultiInputPolicy` |
-    | `control_period` | 0.05 | s that an action is held; the last period of an episode ends at the horizon |
-    | `position_tolerance` | 0.1 | m, of success |
-    | `heading_tolerance` | 0.1 | rad, of success |
-    | `collision_penalty`, `miss_penalty` | 50 | should exceed the optimum's cost, or standing still pays; 50 does, for the families |
-    | `discount` | 0.99 | of the learner, for `"shaped"` |
-    | `terminate_on_collision` | True | whether a touch ends the episode |
-    | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and m |
-    | `map_obstacles`, `map_vertices` | 8, 8 | obstacles in the map, and vertices of each; a polygon with more is refused |
+    | `disturbance` | None | noise on actuation and sensing: a `Disturbance` or a dict of its attributes; a number d means `actuation` d, `slip` d and `sensing` d / 10 |
+    | `motor` | None | parameters for `"motor"`: a `Motor` or a dict of its attributes |
+    | `dict_observation` | False | whether observations are dictionaries of the parts, for `MultiInputPolicy` |
+    | `control_period` | 0.05 | duration of an action (s); the last period of an episode ends at the horizon |
+    | `position_tolerance` | 0.1 | tolerance of success (m) |
+    | `heading_tolerance` | 0.1 | tolerance of success (rad) |
+    | `collision_penalty`, `miss_penalty` | 50 | should exceed the cost of the optimum, or else not moving is optimal; 50 is sufficient for the families |
+    | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
+    | `terminate_on_collision` | True | whether a collision ends the episode |
+    | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and maximum range (m) |
+    | `map_obstacles`, `map_vertices` | 8, 8 | number of obstacles in the map, and of vertices of each; a polygon with more vertices is an error |
     | `render_mode` | None | `"rgb_array"` or `"human"` |
 
     ## Errors
-    `ValueError` names the argument that is impossible, and its value; `ScenarioError` (one too) says what is wrong with
-    `scenario`; `FileNotFoundError` and `BankError` that `bank` is missing, no bank, or of another version.
+    `ValueError` for an invalid argument; the message states its name and value. `ScenarioError`, a `ValueError`, for an
+    invalid `scenario`. `FileNotFoundError` if the file of `bank` does not exist. `BankError`, a `ValueError`, if it is
+    not a bank or has another format version.
 
     ## Version history
     * v0: initial version.
@@ -165,12 +188,12 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         map_vertices: int = 8,
         render_mode: str | None = None,
     ) -> None:
-        self._tasks = Tasks(family, scenario, split, bank)
-        self.settings = Settings(
+        self._source = ScenarioSource(family, scenario, split, bank)
+        self.settings = EnvironmentSettings(
             observation=observation,
             reward=reward,
             actuation=actuation,
-            disturbance=disturbance,  # type: ignore[arg-type] (the settings take every form)
+            disturbance=disturbance,  # type: ignore[arg-type] (the settings accept all these forms)
             motor=motor,  # type: ignore[arg-type]
             dict_observation=dict_observation,
             control_period=control_period,
@@ -188,12 +211,12 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         )
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
-        # In real time; kept for the wrappers that write videos.
+        # Real time, also for the wrappers that record videos.
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / control_period))}
-        self._fleet = Fleet(1, self.settings)
-        self.observation_space = self._fleet.layout.space
+        self._simulator = BatchSimulator(1, self.settings)
+        self.observation_space = self._simulator.layout.space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self._fleet.check(self._tasks.scenario, self.bank)
+        self._simulator.check(self._source.scenario, self.bank)
         self._choice: Scenario | int | None = None
         self._playing = np.zeros(1, dtype=bool)
         self._noise_generator: np.random.Generator | None = None
@@ -201,26 +224,30 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self._window: Window | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode; `options={"scenario": ...}`, or with a bank `{"index": ...}`, chooses its scenario.
+        """Start an episode.
+
+        Args:
+            seed: seed of the scenarios and of the noise; None continues the random streams.
+            options: {"scenario": scenario}, or with a bank {"index": index}, selects the scenario.
 
         Raises:
-            ScenarioError: the scenario is not a valid one.
-            IndexError: the bank has fewer scenarios.
-            ValueError: an unknown or impossible option.
+            ScenarioError: the scenario is invalid.
+            IndexError: the index is out of range.
+            ValueError: an unknown or invalid option.
 
         """
         options = options or {}
         check_options(options, "scenario", "index")
-        choice = self._tasks.given(options.get("scenario"), options.get("index"))
+        choice = self._source.select(options.get("scenario"), options.get("index"))
         if choice is not None:
-            self._fleet.check(choice, self.bank)
-        super().reset(seed=seed)  # nothing can fail from here on
+            self._simulator.check(choice, self.bank)
+        super().reset(seed=seed)  # all checks are done: a failed reset changes nothing
         if choice is None:
-            choice = self._tasks.draw(self.np_random)
+            choice = self._source.draw(self.np_random)
         if self.settings.disturbed and (seed is not None or self._noise_generator is None):
-            self._noise_generator = disturbance_generator(self.np_random_seed)
+            self._noise_generator = make_noise_generator(self.np_random_seed)
         generators = [] if self._noise_generator is None else [self._noise_generator]
-        self._fleet.begin([0], [choice], self.bank, generators)
+        self._simulator.reset([0], [choice], self.bank, generators)
         self._choice = choice
         self._playing[0] = True
         self._trail = [self.pose]
@@ -234,28 +261,31 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Holds an action for one control period; after the end of an episode nothing moves and nothing is paid.
+        """Hold an action for one control period. After the end of an episode, the robot stays and the reward is 0.
 
         Raises:
             ResetNeeded: before the first reset.
-            ValueError: the action is not two finite numbers; nothing has changed then.
+            ValueError: the action is not two finite numbers; the state is unchanged then.
 
         """
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        self._fleet.step(check_actions(action, (2,)).reshape(1, 2), self._playing)
+        self._simulator.step(check_actions(action, (2,)).reshape(1, 2), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)
-        row = self._fleet.state[0]
+        row = self._simulator.state[0]
         observation, info = self._observe(), self._info()
-        terminated = bool(row[driving.TERMINATED])
+        terminated = bool(row[columns.TERMINATED])
         self._playing[0] = not terminated
         if self.render_mode == "human":
             self.render()
-        return observation, float(row[driving.REWARD]), terminated, False, info
+        return observation, float(row[columns.REWARD]), terminated, False, info
 
     def render(self) -> np.ndarray | None:
-        """The scene: an array (640, 600, 3) of uint8 for "rgb_array" (as wide as the arena asks), a window for "human".
+        """Render the scene.
+
+        Returns:
+            For "rgb_array" a frame of uint8, (640, 600, 3) for a square arena. For "human" None; a window shows it.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -266,9 +296,9 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
             return None
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before rendering it")
-        from leapnav.envs.rendering import Window, draw_scene, scene_of  # pygame loads only for those who look
+        from leapnav.envs.simulation.rendering import Window, draw_scene, make_scene  # imports pygame
 
-        frame = draw_scene(scene_of(self._fleet, 0, self._choice, self.bank, self._trail))
+        frame = draw_scene(make_scene(self._simulator, 0, self._choice, self.bank, self._trail))
         if self.render_mode == "rgb_array":
             return frame
         if self._window is None:
@@ -277,7 +307,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return None
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None
@@ -285,40 +315,40 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     @property
     def family(self) -> str:
         """The family of the scenarios."""
-        return self._tasks.family
+        return self._source.family
 
     @property
     def bank(self) -> ScenarioBank | None:
-        """The bank of the scenarios, None if they come from elsewhere."""
-        return self._tasks.bank
+        """The bank of the scenarios, or None."""
+        return self._source.bank
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of the episode."""
+        """The scenario of the current episode."""
         if self._choice is None:
-            raise gym.error.ResetNeeded("reset the environment before its scenario is asked for")
-        return scenario_of(self._choice, self.bank)
+            raise gym.error.ResetNeeded("reset the environment before reading its scenario")
+        return get_scenario(self._choice, self.bank)
 
     @property
     def index(self) -> int | None:
-        """The number of the episode's scenario in the bank, None if it is from elsewhere."""
+        """The index of the current scenario in the bank, None if it is not from a bank."""
         return self._choice if isinstance(self._choice, int) else None
 
     @property
     def control_period(self) -> float:
-        """How long an action is held, in s."""
+        """Duration of an action (s)."""
         return self.settings.control_period
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """(x, y, heading) in m and rad, the heading unwrapped."""
-        x, y, heading = self._fleet.poses[0].tolist()
+        """The robot's x, y (m) and heading (rad, unwrapped)."""
+        x, y, heading = self._simulator.poses[0].tolist()
         return x, y, heading
 
     @property
     def time(self) -> float:
-        """Seconds since the start of the episode."""
-        return float(self._fleet.state[0, driving.TIME])
+        """Time since the start of the episode (s)."""
+        return float(self._simulator.state[0, columns.TIME])
 
     @property
     def window_closed(self) -> bool:
@@ -327,52 +357,52 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
 
     @property
     def at_goal(self) -> bool:
-        """Whether the robot's pose is the goal's, within the tolerances."""
-        return self._fleet.at_goal(0)
+        """Whether the robot's pose equals the goal, within the tolerances."""
+        return self._simulator.at_goal(0)
 
     def _observe(self) -> Any:
-        out = np.empty((1, self._fleet.layout.size), np.float32)
-        self._fleet.observe(out)
-        return self._fleet.layout.divide(out[0])
+        out = np.empty((1, self._simulator.layout.size), np.float32)
+        self._simulator.observe(out)
+        return self._simulator.layout.divide(out[0])
 
     def _info(self) -> dict[str, Any]:
-        row = self._fleet.state[0].tolist()
-        parts = {name: -row[column] for name, column in driving.PARTS.items()}
+        row = self._simulator.state[0].tolist()
+        parts = {name: -row[column] for name, column in columns.PARTS.items()}
         if self.settings.reward == "shaped":
-            parts["shaping"] = row[driving.SHAPING]
-        info: dict[str, Any] = {name: row[column] for name, column in driving.INFOS.items()}
-        for name, column in driving.FLAGS.items():
+            parts["shaping"] = row[columns.SHAPING]
+        info: dict[str, Any] = {name: row[column] for name, column in columns.INFOS.items()}
+        for name, column in columns.FLAGS.items():
             info[name] = row[column] != 0.0
         info["pose"], info["reward_parts"] = self.pose, parts
         return info
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_window": None}  # a window stays where it is
+        return {**self.__dict__, "_window": None}  # windows cannot be pickled
 
 
 class NavigateGoalEnv(GoalConditioned, NavigateEnv):
-    """`NavigateEnv` for learners that choose their goals, such as hindsight experience replay.
+    """`NavigateEnv` for goal-conditioned learners, such as hindsight experience replay.
 
     ## Observation space
-    A `Dict` of three boxes, as Gymnasium-Robotics has it:
+    A `Dict` of three boxes, as in Gymnasium-Robotics:
 
     | Key | Index | Observation | Unit | Range |
     |---|---|---|---|---|
     | `achieved_goal` | 0, 1 | position | m | -1000 to 1000 |
     | | 2, 3 | cosine and sine of the heading | 1 | -1 to 1 |
     | `desired_goal` | 0, 1 | goal position | m | -1000 to 1000 |
-    | | 2, 3 | cosine and sine of the goal heading; 0, 0 if it is free | 1 | -1 to 1 |
+    | | 2, 3 | cosine and sine of the goal heading; 0, 0 if the goal heading is free | 1 | -1 to 1 |
     | `observation` | 0 | time left | s | 0 to 10000 |
-    | | 1 ... | the parts of `NavigateEnv` but `goal` | | |
+    | | 1 ... | the parts of `NavigateEnv` without `goal` | | |
 
     ## Rewards
     | `reward` | Value |
     |---|---|
-    | `"sparse"` (the default) | 1 in each step that ends at the goal, within the tolerances, else 0 |
-    | `"cost"` | as in `NavigateEnv`; `compute_reward` then needs the infos of the steps |
+    | `"sparse"` (the default) | 1 for each step that ends at the goal, within the tolerances; otherwise 0 |
+    | `"cost"` | that of `NavigateEnv`; `compute_reward` then needs the infos of the steps |
 
-    The sensing of a `Disturbance` blurs the lidar, not the goals, which decide the reward. The `info` of a step has
-    `terminated` and `at_horizon` in addition. Everything else is as in `NavigateEnv`.
+    The sensing noise of a `Disturbance` affects the lidar but not the goals, which determine the reward. The `info` of
+    a step also contains `terminated` and `at_horizon`. Everything else is the same as in `NavigateEnv`.
     """
 
     _goal_conditioned = True
@@ -381,47 +411,15 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
         super().__init__(*args, reward=reward, **arguments)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As `NavigateEnv.step`, with the reward of `compute_reward`."""
+        """Hold an action for one control period, see `NavigateEnv.step`; the reward is that of `compute_reward`."""
         playing = bool(self._playing[0])
         observation, _, terminated, truncated, info = super().step(action)
-        info["terminated"], info["at_horizon"] = terminated, self._fleet.at_horizon(0)
+        info["terminated"], info["at_horizon"] = terminated, self._simulator.at_horizon(0)
         reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
         reward = float(reward) if playing else 0.0
         return observation, reward, terminated, truncated, info
 
 
-def check_render_mode(mode: str | None, modes: Sequence[str]) -> None:
-    """Raises ValueError for a mode that is none of `modes`."""
-    if mode is not None and mode not in modes:
-        raise ValueError(f"render_mode: expected None or one of {', '.join(modes)}, got {mode!r}")
-
-
-def check_options(options: Mapping[str, Any], *known: str) -> None:
-    """Raises ValueError for an unknown option of a reset."""
-    for name in options:
-        if name not in known:
-            names = " or ".join(repr(name) for name in known)
-            raise ValueError(f"options: expected {names}, got {name!r}")
-
-
-def check_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Actions as float64 of the shape wanted.
-
-    Raises:
-        ValueError: they are of another shape, or no numbers.
-
-    """
-    try:
-        values = np.asarray(actions)
-    except (TypeError, ValueError):  # rows of different lengths
-        values = np.empty(0, dtype=object)
-    if values.shape != shape or values.dtype.kind not in "fiu":
-        wanted = "two finite numbers" if len(shape) == 1 else f"finite numbers of shape {shape}"
-        many = values.ndim > 1 and values.dtype.kind in "fiu"
-        raise ValueError(f"action: expected {wanted}, got {f'shape {values.shape}' if many else repr(actions)}")
-    return np.ascontiguousarray(values, dtype=np.float64)
-
-
-def disturbance_generator(seed: int | None) -> np.random.Generator:
-    """The generator of the disturbances of an environment with this seed."""
-    return np.random.default_rng(None if seed is None or seed < 0 else (seed, DISTURBANCE_STREAM))
+def make_noise_generator(seed: int | None) -> np.random.Generator:
+    """Return the generator of the noise of an environment with this seed."""
+    return np.random.default_rng(None if seed is None or seed < 0 else (seed, NOISE_STREAM))

@@ -1,28 +1,40 @@
-"""What the arguments of the environments mean, checked once and for all their forms."""
+"""Settings of the environments: the arguments shared by the single and the vector form, validated."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from leapnav.deprecated import deprecated_names
+from leapnav.envs.utils.validation import (
+    check_at_least,
+    check_choice,
+    check_flag,
+    check_fraction,
+    check_integer,
+    check_not_negative,
+    check_positive,
+    is_number,
+)
+
 OBSERVATIONS, REWARDS, ACTUATIONS = ("lidar", "state", "map"), ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS = ("sparse", "cost")
-SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")  # arguments that choose them
-SHORTEST_PERIOD = 1e-4  # s
-MOST = 10_000  # beams, obstacles or vertices
+# Arguments that determine what is observed.
+SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")
+MIN_PERIOD = 1e-4  # s
+MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
 
-# Positions in the array that the kernels read.
+# Indices into the packed settings, the array that the kernels read.
 (
     PERIOD,
     POSITION_TOLERANCE,
     HEADING_TOLERANCE,
     COLLISION_PENALTY,
     MISS_PENALTY,
-    ENDS_ON_TOUCH,
+    TERMINATE_ON_COLLISION,
     LIDAR_RANGE,
     SHAPED,
     DISCOUNT,
@@ -44,29 +56,18 @@ MOST = 10_000  # beams, obstacles or vertices
 ) = range(24)
 
 
-def _check_number(name: str, value: Any, *, positive: bool = False) -> None:
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not (number and math.isfinite(value) and (value > 0 if positive else value >= 0)):
-        raise ValueError(f"{name}: expected {'a positive number' if positive else 'a number >= 0'}, got {value!r}")
-
-
-def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-
-
 @dataclass(frozen=True)
 class Motor:
-    """Body, wheels and ground of a robot that is driven by forces.
+    """Parameters of the robot's body, motors and tyres, for `actuation="motor"`.
 
     Attributes:
-        mass: kg.
-        moment: of inertia, kg m^2.
-        track: m between the wheels.
-        wheel_force: N, the most that a wheel's motor exerts.
-        response: s, the time constant of the motors' speed control.
-        grip: coefficient of friction against sliding sideways; the tyres slip beyond it.
-        friction: coefficient of friction of the robot's rim against what it touches.
+        mass: mass (kg).
+        moment: moment of inertia (kg m^2).
+        track: distance between the wheels (m).
+        wheel_force: maximum force of each wheel's motor (N).
+        response: time constant of the motors' speed control (s).
+        grip: coefficient of friction of the tyres in the lateral direction; they slip when it is exceeded.
+        friction: coefficient of friction between the robot's rim and an obstacle or wall in contact.
 
     """
 
@@ -80,20 +81,20 @@ class Motor:
 
     def __post_init__(self) -> None:
         for name in ("mass", "moment", "track", "wheel_force", "response"):
-            _check_number(f"motor: {name}", getattr(self, name), positive=True)
+            check_positive(f"motor: {name}", getattr(self, name))
         for name in ("grip", "friction"):
-            _check_number(f"motor: {name}", getattr(self, name))
+            check_not_negative(f"motor: {name}", getattr(self, name))
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Noise on what the robot does and senses, drawn anew in each control period by the environment's own generator.
+    """Noise on actuation and sensing, sampled in each control period from a generator of the environment's own.
 
     Attributes:
-        actuation: standard deviation of the driven speed and turn rate, relative to the commanded ones.
-        slip: each wheel loses the share `slip * |n|` of its way, n standard normal.
-        sensing: standard deviation of the sensed position (m) and heading (rad), from which the goal and the map are
-            seen, and of the lidar's ranges (m), which it takes from where the robot is.
+        actuation: standard deviation of the executed speed and turn rate, relative to the commanded ones.
+        slip: scale of the wheel slip: each wheel loses the fraction `slip * |n|` of its distance, n standard normal.
+        sensing: standard deviation of the sensed position (m) and heading (rad), relative to which the goal and the map
+            are observed, and of the lidar ranges (m), which are measured from the true pose.
 
     """
 
@@ -103,15 +104,18 @@ class Disturbance:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            _check_number(f"disturbance: {field.name}", getattr(self, field.name))
+            check_not_negative(f"disturbance: {field.name}", getattr(self, field.name))
 
 
 @dataclass(frozen=True)
-class Settings:
-    """The arguments that `NavigateEnv` documents, but for those that choose scenarios.
+class EnvironmentSettings:
+    """The arguments of `NavigateEnv`, which documents them, without those that select scenarios.
+
+    Attributes:
+        goal_conditioned: whether the environment is `NavigateGoalEnv` or its vector form.
 
     Raises:
-        ValueError: an argument is impossible; the message names it and its value.
+        ValueError: an argument is invalid; the message states its name and value.
 
     """
 
@@ -135,45 +139,39 @@ class Settings:
     goal_conditioned: bool = False
 
     def __post_init__(self) -> None:
-        _check_choice("observation", self.observation, OBSERVATIONS)
-        _check_choice("reward", self.reward, GOAL_REWARDS if self.goal_conditioned else REWARDS)
-        _check_choice("actuation", self.actuation, ACTUATIONS)
+        check_choice("observation", self.observation, OBSERVATIONS)
+        check_choice("reward", self.reward, GOAL_REWARDS if self.goal_conditioned else REWARDS)
+        check_choice("actuation", self.actuation, ACTUATIONS)
         for name in ("control_period", "position_tolerance", "heading_tolerance", "lidar_range"):
-            _check_number(name, getattr(self, name), positive=True)
+            check_positive(name, getattr(self, name))
         for name in ("collision_penalty", "miss_penalty"):
-            _check_number(name, getattr(self, name))
-        if self.control_period < SHORTEST_PERIOD:
-            raise ValueError(f"control_period: expected at least {SHORTEST_PERIOD} s, got {self.control_period!r}")
-        _check_number("discount", self.discount, positive=True)
-        if self.discount > 1:
-            raise ValueError(f"discount: expected a number in (0, 1], got {self.discount!r}")
-        for name, least in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= MOST:
-                raise ValueError(f"{name}: expected an integer from {least} to {MOST}, got {value!r}")
+            check_not_negative(name, getattr(self, name))
+        check_at_least("control_period", self.control_period, MIN_PERIOD, unit="s")
+        check_fraction("discount", self.discount, zero=False)
+        for name, minimum in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
+            check_integer(name, getattr(self, name), minimum, MAX_COUNT)
         for name in ("terminate_on_collision", "dict_observation"):
-            if not isinstance(getattr(self, name), (bool, np.bool_)):
-                raise ValueError(f"{name}: expected True or False, got {getattr(self, name)!r}")
+            check_flag(name, getattr(self, name))
         object.__setattr__(self, "disturbance", _as_disturbance(self.disturbance))
-        object.__setattr__(self, "motor", _as_part("motor", Motor, self.motor))
+        object.__setattr__(self, "motor", _as_dataclass("motor", Motor, self.motor))
 
     @property
     def disturbed(self) -> bool:
-        """Whether anything is disturbed."""
+        """Whether there is any noise."""
         return self.disturbance != Disturbance()
 
     @property
     def motors(self) -> bool:
-        """Whether forces drive the robot."""
+        """Whether the robot is driven by forces."""
         return self.actuation == "motor"
 
     def packed(self) -> np.ndarray:
-        """The settings as the kernels read them."""
+        """Return the settings as the array that the kernels read."""
         values = np.zeros(PACKED)
         values[PERIOD] = self.control_period
         values[POSITION_TOLERANCE], values[HEADING_TOLERANCE] = self.position_tolerance, self.heading_tolerance
         values[COLLISION_PENALTY], values[MISS_PENALTY] = self.collision_penalty, self.miss_penalty
-        values[ENDS_ON_TOUCH], values[LIDAR_RANGE] = self.terminate_on_collision, self.lidar_range
+        values[TERMINATE_ON_COLLISION], values[LIDAR_RANGE] = self.terminate_on_collision, self.lidar_range
         values[SHAPED], values[DISCOUNT] = self.reward == "shaped", self.discount
         motor, noise = self.motor, self.disturbance
         values[MOTORS], values[MASS], values[MOMENT], values[TRACK] = self.motors, motor.mass, motor.moment, motor.track
@@ -185,15 +183,15 @@ class Settings:
 
 
 def _as_disturbance(value: Any) -> Disturbance:
-    if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
-        _check_number("disturbance", value)
+    if is_number(value):
+        check_not_negative("disturbance", value)
         size = float(value)
         return Disturbance(actuation=size, slip=size, sensing=size / 10)
-    return _as_part("disturbance", Disturbance, value)
+    return _as_dataclass("disturbance", Disturbance, value)
 
 
-def _as_part(name: str, kind: type, value: Any) -> Any:
-    """A part of the settings, given as itself, by a dict of its attributes, or by None for the defaults."""
+def _as_dataclass(name: str, kind: type, value: Any) -> Any:
+    """Return the dataclass `kind` for an instance of it, a dict of its attributes, or None (the defaults)."""
     if value is None:
         return kind()
     if isinstance(value, kind):
@@ -205,3 +203,6 @@ def _as_part(name: str, kind: type, value: Any) -> Any:
         if key not in known:
             raise ValueError(f"{name}: expected the attributes {', '.join(known)}, got {key!r}")
     return kind(**value)
+
+
+__getattr__ = deprecated_names(__name__, {"Settings": "EnvironmentSettings"})

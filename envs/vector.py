@@ -1,4 +1,4 @@
-"""Many robots at once: the vector form of the environments of `leapnav.envs.navigation`."""
+"""The vector environments: many robots simulated together in one process."""
 
 from __future__ import annotations
 
@@ -13,29 +13,26 @@ from gymnasium.utils import seeding
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from leapnav.envs import driving
-from leapnav.envs.bank import ScenarioBank
-from leapnav.envs.fleet import Fleet
+from leapnav.envs.checks import check_actions, check_options, check_render_mode
 from leapnav.envs.goals import GoalConditioned
-from leapnav.envs.navigation import (
-    check_actions,
-    check_options,
-    check_render_mode,
-    disturbance_generator,
-)
-from leapnav.envs.scenario import Scenario
-from leapnav.envs.settings import Settings
-from leapnav.envs.tasks import Tasks, scenario_of
+from leapnav.envs.navigation import make_noise_generator
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.simulation import state as columns
+from leapnav.envs.simulation.simulator import BatchSimulator
+from leapnav.envs.utils.validation import check_integer, is_integer
 
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode as AutoresetMode
 else:
     try:
         from gymnasium.vector import AutoresetMode
-    except ImportError:  # Gymnasium 1.0, which d3rlpy asks for
+    except ImportError:  # Gymnasium 1.0, which d3rlpy requires
 
         class AutoresetMode(Enum):
-            """As Gymnasium has it from 1.1 on."""
+            """The enum that Gymnasium provides since version 1.1."""
 
             NEXT_STEP = "NextStep"
             SAME_STEP = "SameStep"
@@ -43,23 +40,23 @@ else:
 
 
 class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
-    """`NavigateEnv` for many robots, stepped together; each one's episodes are those that it would have alone.
+    """`NavigateEnv` for many robots. The episodes of each are identical to those of a single environment.
+
+    Infos are arrays with masks, as in Gymnasium; `pose` is (num_envs, 3). With a bank, the infos of a reset contain
+    `index` and `reference_cost` but not `scenario`, see the property `scenarios`.
 
     Args:
         num_envs: number of robots.
         family, scenario, split, bank: see `NavigateEnv`.
-        autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after an episode's end starts the next
-            one. "SameStep": the last step starts it, and `infos["final_obs"]` and `infos["final_info"]` have the end.
-            "Disabled": `reset(options={"reset_mask": mask})` starts it.
+        autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
+            next one. "SameStep": the last step starts the next episode, and `infos["final_obs"]` and
+            `infos["final_info"]` describe the end. "Disabled": `reset(options={"reset_mask": mask})` starts it.
         render_mode: None or "rgb_array"; `render` returns a frame of each robot.
         settings: the other arguments of `NavigateEnv`.
 
-    Infos are arrays with masks, as Gymnasium has them; `pose` is (num_envs, 3). Of a bank's scenarios a reset tells
-    `index` and `reference_cost`; `scenarios` has the scenarios themselves.
-
     Raises:
-        TypeError: there is no such argument.
-        ValueError, ScenarioError, FileNotFoundError, BankError: as for `NavigateEnv`.
+        TypeError: an argument is unknown.
+        ValueError, ScenarioError, FileNotFoundError, BankError: see `NavigateEnv`.
 
     """
 
@@ -78,29 +75,27 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise ValueError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
+        self.num_envs = check_integer("num_envs", num_envs, 1)
         for name in settings:
-            if name not in KNOWN:
+            if name not in SETTING_NAMES:
                 raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
-        self._tasks = Tasks(family, scenario, split, bank)
-        self.settings = Settings(**settings, goal_conditioned=self._goal_conditioned)
+        self._source = ScenarioSource(family, scenario, split, bank)
+        self.settings = EnvironmentSettings(**settings, goal_conditioned=self._goal_conditioned)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
             modes = ", ".join(mode.value for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode: expected one of {modes}, got {autoreset_mode!r}") from None
         check_render_mode(render_mode, self.metadata["render_modes"])
-        self.num_envs = int(num_envs)
         fps = max(1, round(1 / self.settings.control_period))
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": fps}
         self.render_mode = render_mode
-        self._fleet = Fleet(self.num_envs, self.settings)
-        self.single_observation_space = self._fleet.layout.space
+        self._simulator = BatchSimulator(self.num_envs, self.settings)
+        self.single_observation_space = self._simulator.layout.space
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._fleet.check(self._tasks.scenario, self.bank)
+        self._simulator.check(self._source.scenario, self.bank)
         self._choices: list[Scenario | int | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
@@ -111,39 +106,39 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes.
+        """Start episodes.
 
         Args:
-            seed: of the first robot, the next ones following; or one for each.
-            options: "scenario" and "index", each for all robots or a list of one for each; "reset_mask" (num_envs,),
-                bool: the robots that start, all if not given.
+            seed: seed of the first robot, incremented for each following robot; or a list of one per robot.
+            options: "scenario" and "index": one value for all robots, or a list of one per robot; "reset_mask"
+                (num_envs,), bool: the robots that start an episode, by default all.
 
         Raises:
-            ValueError, ScenarioError, IndexError: as `NavigateEnv.reset`.
+            ValueError, ScenarioError, IndexError: see `NavigateEnv.reset`.
 
         """
         options = options or {}
         check_options(options, "scenario", "index", "reset_mask")
-        mask = self._mask(options.get("reset_mask"))
+        mask = self._check_mask(options.get("reset_mask"))
         if not mask.all() and any(
             choice is None for choice, chosen in zip(self._choices, mask, strict=True) if not chosen
         ):
-            raise gym.error.ResetNeeded("reset_mask: reset all robots before some")
-        seeds = self._seeds_of(seed)
+            raise gym.error.ResetNeeded("reset_mask: reset all robots once before resetting some of them")
+        seeds = self._check_seeds(seed)
         robots = np.flatnonzero(mask)
-        scenarios, indices = (self._each(name, options.get(name)) for name in ("scenario", "index"))
-        given = [self._tasks.given(scenarios[i], indices[i]) for i in robots.tolist()]
-        for choice in given:
+        scenarios, indices = (self._broadcast(name, options.get(name)) for name in ("scenario", "index"))
+        selected = [self._source.select(scenarios[i], indices[i]) for i in robots.tolist()]
+        for choice in selected:
             if choice is not None:
-                self._fleet.check(choice, self.bank)
-        for i in robots.tolist():  # nothing can fail from here on
+                self._simulator.check(choice, self.bank)
+        for i in robots.tolist():  # all checks are done: a failed reset changes nothing
             if seeds[i] is not None or self._generators[i] is None:
                 self._generators[i], self._seeds[i] = seeding.np_random(seeds[i])
-                self._noise_generators[i] = disturbance_generator(self._seeds[i]) if self.settings.disturbed else None
-        self._begin(robots, given)
-        return self._fleet.layout.divide(self._flat_observations()), self._infos(mask, mask)
+                self._noise_generators[i] = make_noise_generator(self._seeds[i]) if self.settings.disturbed else None
+        self._start(robots, selected)
+        return self._simulator.layout.divide(self._flat_observations()), self._infos(mask, mask)
 
-    def _mask(self, mask: Any) -> np.ndarray:
+    def _check_mask(self, mask: Any) -> np.ndarray:
         if mask is None:
             return np.ones(self.num_envs, dtype=bool)
         mask = np.asarray(mask)
@@ -154,9 +149,9 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             )
         return mask
 
-    def _seeds_of(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        """A seed for each robot."""
-        if seed is None or (isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)):
+    def _check_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """Return one seed per robot."""
+        if seed is None or is_integer(seed):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         elif isinstance(seed, (list, tuple, np.ndarray)):
             seeds = list(seed)
@@ -164,42 +159,40 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"seed: expected an integer or a list of them, got {seed!r}")
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: expected one for each of {self.num_envs} robots, got {len(seeds)}")
-        for value in seeds:
-            if value is not None and (isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0):
-                raise ValueError(f"seed: expected integers >= 0, got {value!r}")
-        return [None if value is None else int(value) for value in seeds]
+        return [None if value is None else check_integer("seed", value, 0) for value in seeds]
 
-    def _each(self, name: str, value: Any) -> list[Any]:
+    def _broadcast(self, name: str, value: Any) -> list[Any]:
+        """Return one value of an option per robot."""
         if isinstance(value, (list, tuple, np.ndarray)):
             if len(value) != self.num_envs:
                 raise ValueError(f"options: {name}: expected one for each of {self.num_envs} robots, got {len(value)}")
             return list(value)
         return [value] * self.num_envs
 
-    def _begin(self, robots: np.ndarray, given: Sequence[Scenario | int | None] | None = None) -> None:
-        """Starts episodes of robots, given by number, with the scenarios given or drawn."""
-        numbers = robots.tolist()
+    def _start(self, robots: np.ndarray, selected: Sequence[Scenario | int | None] | None = None) -> None:
+        """Start episodes of robots, given by index, with the selected or random scenarios."""
+        indices = robots.tolist()
         choices = []
-        for k, i in enumerate(numbers):
+        for k, i in enumerate(indices):
             generator = self._generators[i]
             assert generator is not None  # seeded at the first reset
-            choice = None if given is None else given[k]
-            choices.append(self._tasks.draw(generator) if choice is None else choice)
-        noise = [self._noise_generators[i] for i in numbers] if self.settings.disturbed else []
-        self._fleet.begin(robots, choices, self.bank, noise)
-        for i, choice in zip(numbers, choices, strict=True):
+            choice = None if selected is None else selected[k]
+            choices.append(self._source.draw(generator) if choice is None else choice)
+        noise = [self._noise_generators[i] for i in indices] if self.settings.disturbed else []
+        self._simulator.reset(robots, choices, self.bank, noise)
+        for i, choice in zip(indices, choices, strict=True):
             self._choices[i] = choice
         self._ended[robots] = False
         if self.render_mode is not None:
-            for i in numbers:
-                self._trails[i] = [tuple(self._fleet.poses[i].tolist())]
+            for i in indices:
+                self._trails[i] = [tuple(self._simulator.poses[i].tolist())]
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Holds each robot's action for one control period.
+        """Hold each robot's action for one control period.
 
         Raises:
-            ResetNeeded: before the first reset, or without autoreset after an episode's end.
-            ValueError: the actions are not finite numbers (num_envs, 2); nothing has changed then.
+            ResetNeeded: before the first reset, or without autoreset after the end of an episode.
+            ValueError: the actions are not finite numbers (num_envs, 2); the state is unchanged then.
 
         """
         if self._choices[0] is None:
@@ -208,16 +201,16 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         restarting = self._ended.copy()
         if self.autoreset_mode is AutoresetMode.DISABLED and restarting.any():
             raise gym.error.ResetNeeded(f"robot {int(np.argmax(restarting))}: its episode has ended; reset it first")
-        fleet, state = self._fleet, self._fleet.state
-        fleet.step(values, ~restarting)
+        simulator, state = self._simulator, self._simulator.state
+        simulator.step(values, ~restarting)
         if self.render_mode is not None:
             for i in np.flatnonzero(~restarting).tolist():
-                self._trails[i].append(tuple(fleet.poses[i].tolist()))
+                self._trails[i].append(tuple(simulator.poses[i].tolist()))
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and restarting.any():
-            self._begin(np.flatnonzero(restarting))
+            self._start(np.flatnonzero(restarting))
         else:
-            restarting = _NOBODY
-        ended = state[:, driving.TERMINATED] > 0
+            restarting = np.zeros(self.num_envs, dtype=bool)
+        ended = state[:, columns.TERMINATED] > 0
         flat = self._flat_observations()
         rewards = self._rewards(flat, ended, restarting)
         infos: dict[str, Any] = {}
@@ -225,19 +218,19 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             robots = np.flatnonzero(ended)
             observations = np.full(self.num_envs, None, dtype=object)
             for i in robots.tolist():
-                observations[i] = fleet.layout.divide(flat[i].copy())
+                observations[i] = simulator.layout.divide(flat[i].copy())
             infos = {"final_obs": observations, "_final_obs": ended.copy()}
             infos["final_info"], infos["_final_info"] = self._infos(ended), ended.copy()
-            self._begin(robots)
-            fleet.observe(flat, robots)
+            self._start(robots)
+            simulator.observe(flat, robots)
             restarting = ended
-        self._ended = ended.copy() if self.autoreset_mode is not AutoresetMode.SAME_STEP else _nobody(self.num_envs)
-        infos.update(self._infos(_everybody(self.num_envs), restarting))
+        self._ended = ended & (self.autoreset_mode is not AutoresetMode.SAME_STEP)
+        infos.update(self._infos(np.ones(self.num_envs, dtype=bool), restarting))
         truncated = np.zeros(self.num_envs, dtype=bool)
-        return fleet.layout.divide(flat), rewards, ended, truncated, infos
+        return simulator.layout.divide(flat), rewards, ended, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A frame of each robot, see `NavigateEnv.render`."""
+        """Return a frame of each robot, see `NavigateEnv.render`."""
         if self.render_mode is None:
             gym.logger.warn('render() needs a render_mode, for example gym.make_vec(..., render_mode="rgb_array")')
             return None
@@ -246,50 +239,50 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return tuple(self._frame(i) for i in range(self.num_envs))
 
     def _frame(self, i: int) -> np.ndarray:
-        from leapnav.envs.rendering import draw_scene, scene_of  # pygame loads only for those who look
+        from leapnav.envs.simulation.rendering import draw_scene, make_scene  # imports pygame
 
         choice = self._choices[i]
-        assert choice is not None  # checked
-        return draw_scene(scene_of(self._fleet, i, choice, self.bank, self._trails[i]))
+        assert choice is not None  # checked by `render`
+        return draw_scene(make_scene(self._simulator, i, choice, self.bank, self._trails[i]))
 
     @property
     def family(self) -> str:
         """The family of the scenarios."""
-        return self._tasks.family
+        return self._source.family
 
     @property
     def bank(self) -> ScenarioBank | None:
-        """The bank of the scenarios, None if they come from elsewhere."""
-        return self._tasks.bank
+        """The bank of the scenarios, or None."""
+        return self._source.bank
 
     @property
     def scenarios(self) -> tuple[Scenario, ...]:
-        """The scenario of each robot's episode."""
-        return tuple(scenario_of(choice, self.bank) for choice in self._choices if choice is not None)
+        """The current scenario of each robot."""
+        return tuple(get_scenario(choice, self.bank) for choice in self._choices if choice is not None)
 
     @property
     def indices(self) -> tuple[int | None, ...]:
-        """The number of each robot's scenario in the bank, None if it is from elsewhere."""
+        """The index of each robot's current scenario in the bank, None if it is not from a bank."""
         return tuple(choice if isinstance(choice, int) else None for choice in self._choices)
 
     @property
     def control_period(self) -> float:
-        """How long an action is held, in s."""
+        """Duration of an action (s)."""
         return self.settings.control_period
 
     @property
     def times(self) -> np.ndarray:
-        """Seconds (num_envs,) since the start of each robot's episode."""
-        return self._fleet.state[:, driving.TIME].copy()
+        """Time since the start of each robot's episode (num_envs,) (s)."""
+        return self._simulator.state[:, columns.TIME].copy()
 
     @property
     def poses(self) -> np.ndarray:
-        """x, y (m) and unwrapped heading (rad) of each robot, (num_envs, 3)."""
-        return self._fleet.poses.copy()
+        """x, y (m) and heading (rad, unwrapped) of each robot, (num_envs, 3)."""
+        return self._simulator.poses.copy()
 
     @property
-    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override] (as Gymnasium's own)
-        """The generator that draws each robot's scenarios."""
+    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override] (the same in Gymnasium)
+        """The random generator of each robot's scenarios."""
         return tuple(self._generators)
 
     @property
@@ -298,48 +291,48 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return tuple(self._seeds)
 
     def _flat_observations(self) -> np.ndarray:
-        flat = np.empty((self.num_envs, self._fleet.layout.size), np.float32)
-        self._fleet.observe(flat)
+        flat = np.empty((self.num_envs, self._simulator.layout.size), np.float32)
+        self._simulator.observe(flat)
         return flat
 
     def _rewards(self, flat: np.ndarray, ended: np.ndarray, restarted: np.ndarray) -> np.ndarray:
-        return self._fleet.state[:, driving.REWARD].copy()
+        return self._simulator.state[:, columns.REWARD].copy()
 
-    def _infos(self, told: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
-        """The infos of the robots in the mask `told`, and of those in `restarted` what a reset says."""
-        state = self._fleet.state
-        values: dict[str, Any] = {name: state[:, column].copy() for name, column in driving.INFOS.items()}
-        for name, column in driving.FLAGS.items():
+    def _infos(self, mask: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
+        """Return the infos of the robots in `mask`, with the infos of a reset for those in `restarted`."""
+        state = self._simulator.state
+        values: dict[str, Any] = {name: state[:, column].copy() for name, column in columns.INFOS.items()}
+        for name, column in columns.FLAGS.items():
             values[name] = state[:, column] != 0.0
-        values["pose"] = self._fleet.poses.copy()
-        parts = {name: -state[:, column] for name, column in driving.PARTS.items()}
+        values["pose"] = self._simulator.poses.copy()
+        parts = {name: -state[:, column] for name, column in columns.PARTS.items()}
         if self.settings.reward == "shaped":
-            parts["shaping"] = state[:, driving.SHAPING].copy()
-        values["reward_parts"] = _masked(parts, told)
-        infos = _masked(values, told)
+            parts["shaping"] = state[:, columns.SHAPING].copy()
+        values["reward_parts"] = _add_masks(parts, mask)
+        infos = _add_masks(values, mask)
         if restarted is not None and restarted.any():
             infos.update(self._reset_infos(restarted))
         return infos
 
     def _reset_infos(self, restarted: np.ndarray) -> dict[str, Any]:
-        """What a reset tells of its robots beside the rest: the scenario, or its number in the bank and its optimum."""
-        numbers = np.zeros(self.num_envs, dtype=np.int64)
+        """Return the infos that only a reset adds: the scenario, or its index in the bank and its reference cost."""
+        indices = np.zeros(self.num_envs, dtype=np.int64)
         costs = np.zeros(self.num_envs)
         scenarios = np.full(self.num_envs, None, dtype=object)
-        known = np.zeros(self.num_envs, dtype=bool)
+        from_bank = np.zeros(self.num_envs, dtype=bool)
         for i in np.flatnonzero(restarted).tolist():
             choice = self._choices[i]
             if isinstance(choice, int):
-                numbers[i], known[i] = choice, True
+                indices[i], from_bank[i] = choice, True
             else:
                 scenarios[i] = choice
         infos: dict[str, Any] = {}
-        if known.any():
-            assert self.bank is not None  # numbers are of a bank
-            costs[known] = self.bank.costs[numbers[known]]
-            infos.update(_masked({"index": numbers, "reference_cost": costs}, known))
-        if (restarted & ~known).any():
-            infos.update(_masked({"scenario": scenarios}, restarted & ~known))
+        if from_bank.any():
+            assert self.bank is not None  # an index always refers to a bank
+            costs[from_bank] = self.bank.costs[indices[from_bank]]
+            infos.update(_add_masks({"index": indices, "reference_cost": costs}, from_bank))
+        if (restarted & ~from_bank).any():
+            infos.update(_add_masks({"scenario": scenarios}, restarted & ~from_bank))
         return infos
 
 
@@ -352,53 +345,44 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
         super().__init__(num_envs, *args, reward=reward, **arguments)
 
     def _rewards(self, flat: np.ndarray, ended: np.ndarray, restarted: np.ndarray) -> np.ndarray:
-        observation = self._fleet.layout.divide(flat)
+        observation = self._simulator.layout.divide(flat)
         infos: Any = None
         if self.settings.reward == "cost":
-            told = self._infos(_everybody(self.num_envs))
-            infos = [row_of(told, i) for i in range(self.num_envs)]
+            batch = self._infos(np.ones(self.num_envs, dtype=bool))
+            infos = [select_robot(batch, i) for i in range(self.num_envs)]
         rewards = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], infos)
         return np.where(restarted, 0.0, rewards)
 
-    def _infos(self, told: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
-        state = self._fleet.state
+    def _infos(self, mask: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
+        state = self._simulator.state
         ends = {
-            "terminated": state[:, driving.TERMINATED] > 0,
-            "at_horizon": state[:, driving.STEPS] >= state[:, driving.LAST_STEP],
+            "terminated": state[:, columns.TERMINATED] > 0,
+            "at_horizon": state[:, columns.STEPS] >= state[:, columns.LAST_STEP],
         }
-        stepped = told if restarted is None else told & ~restarted
-        infos = super()._infos(told, restarted)
-        return {**infos, **_masked(ends, stepped)} if stepped.any() else infos
+        stepped = mask if restarted is None else mask & ~restarted
+        infos = super()._infos(mask, restarted)
+        return {**infos, **_add_masks(ends, stepped)} if stepped.any() else infos
 
 
-# Arguments that go through to the settings.
-KNOWN = frozenset(field.name for field in fields(Settings)) - {"goal_conditioned"}
-_NOBODY = np.zeros(1, dtype=bool)  # broadcasts
+# Arguments that are passed on to the settings.
+SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) - {"goal_conditioned"}
 
 
-def _nobody(count: int) -> np.ndarray:
-    return np.zeros(count, dtype=bool)
-
-
-def _everybody(count: int) -> np.ndarray:
-    return np.ones(count, dtype=bool)
-
-
-def _masked(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Infos as Gymnasium has them: beside each entry, which robots have it."""
+def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Return infos in Gymnasium's vector format: each key with a mask of the robots that have it."""
     masks = {f"_{name}": mask.copy() for name in values}
     return {**values, **masks}
 
 
-def row_of(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """What the infos of all robots tell of one."""
-    row = {}
+def select_robot(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """Return the info of one robot from the infos of all."""
+    info = {}
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
-        if mask is None or not mask[i]:  # a mask itself, or not told
+        if mask is None or not mask[i]:  # a mask itself, or an entry that the robot does not have
             continue
         if isinstance(values, dict):
-            row[name] = row_of(values, i)
+            info[name] = select_robot(values, i)
         else:
-            row[name] = values[i].item() if isinstance(values[i], np.generic) else values[i]
-    return row
+            info[name] = values[i].item() if isinstance(values[i], np.generic) else values[i]
+    return info

@@ -1,6 +1,6 @@
-"""A hard scenario and its alternatives: which ways lead to the goal, what each costs, and why the best is the best.
+"""The local optima of a difficult scenario: path class, driving modes, cost and clearance of each.
 
-python examples/alternatives.py --plot ways.png
+python examples/alternatives.py --plot optima.png
 """
 
 from pathlib import Path
@@ -8,10 +8,9 @@ from pathlib import Path
 import tyro
 
 from leapnav.envs import Scenario
-from leapnav.experts import find_optimum
-from leapnav.experts.plotting import plot_solution
+from leapnav.experts import find_optimum, plot_extremal
 
-# A gate that is hardly wider than the robot, a way round it, and a goal to be reached backwards.
+# The direct path leads through a passage that is hardly wider than the robot; the goal must be reached backwards.
 SCENARIO = Scenario.from_dict(
     {
         "name": "the gate",
@@ -30,23 +29,23 @@ SCENARIO = Scenario.from_dict(
 
 
 def main(plot: Path | None = None) -> None:
-    """Finds all the ways.
+    """Find the optimum and its alternatives.
 
     Args:
-        plot: write a picture of them.
+        plot: Picture of the local optima (.png, .pdf or .svg).
 
     """
     optimum = find_optimum(SCENARIO)
     print(f"{SCENARIO.name}: {optimum.status.value}")
     for extremal in (optimum, *optimum.alternatives):
-        sides = "".join(side[0].upper() for side in extremal.path_class)  # where each obstacle lies, Left or Right
+        sides = "".join(side[0].upper() for side in extremal.path_class)  # Left or Right of the path, by obstacle
         driving = ", ".join(extremal.driving_modes)
         assert extremal.certificate is not None
         print(f"J = {extremal.cost:8.4f}  clearance {extremal.certificate.clearance:.3f} m  {sides}  {driving}")
     for doubt in optimum.doubts:
-        print(f"cheaper, but no solution: J = {doubt.cost:.4f}: {doubt.status.value}")
+        print(f"lower cost, but not certified: J = {doubt.cost:.4f}: {doubt.status.value}")
     if plot is not None:
-        plot_solution(SCENARIO, optimum, plot)
+        plot_extremal(optimum, plot, SCENARIO)
         print(f"wrote {plot}")
 
 

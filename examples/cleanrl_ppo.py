@@ -1,4 +1,4 @@
-"""PPO in one file, after CleanRL's ppo_continuous_action.py, on leapnav's vector environment, scored at the end.
+"""PPO in a single file, after CleanRL's ppo_continuous_action.py, on leapnav's vector environment.
 
 S. Huang et al., CleanRL: High-quality single-file implementations of deep RL algorithms, JMLR 23 (2022).
 
@@ -13,62 +13,66 @@ from torch import nn
 from torch.distributions import Normal
 
 from leapnav.envs.vector import AutoresetMode
-from leapnav.training import evaluate
-from leapnav.training.policies import NavigationFeatures
+from leapnav.training import NavigationFeatures, evaluate
 
-SCALE = 0.1  # of the rewards: a return is some units then
+REWARD_SCALE = 0.1  # brings returns to order 1
 
 
 def layers(inputs: int, outputs: int, gain: float) -> nn.Sequential:
-    """Two hidden layers of 64, with orthogonal weights."""
-    sizes, gains, found = (inputs, 64, 64, outputs), (2**0.5, 2**0.5, gain), []
-    for i, scale in enumerate(gains):
+    """Return a network with two hidden layers of 64 units and orthogonal initial weights."""
+    sizes, gains, modules = (inputs, 64, 64, outputs), (2**0.5, 2**0.5, gain), []
+    for i, layer_gain in enumerate(gains):
         linear = nn.Linear(sizes[i], sizes[i + 1])
-        nn.init.orthogonal_(linear.weight, scale)
+        nn.init.orthogonal_(linear.weight, layer_gain)
         nn.init.zeros_(linear.bias)
-        found += [linear, nn.Tanh()]
-    return nn.Sequential(*found[:-1])
+        modules += [linear, nn.Tanh()]
+    return nn.Sequential(*modules[:-1])
 
 
 class Agent(nn.Module):
-    """Actor and critic; `predict` makes it a policy that leapnav can score."""
+    """Actor and critic, with the method `predict` of a policy that leapnav can evaluate."""
 
     def __init__(self, envs: gym.vector.VectorEnv) -> None:
         super().__init__()
-        self.features = NavigationFeatures(
-            envs.single_observation_space
-        )  # raw metres and seconds are hard to learn from
+        # Scaled and transformed observations; raw metres and seconds are hard to learn from.
+        self.features = NavigationFeatures(envs.single_observation_space)
         inputs, actions = self.features.features_dim, envs.single_action_space.shape[0]
         self.critic, self.actor = layers(inputs, 1, 1.0), layers(inputs, actions, 0.01)
         self.log_std = nn.Parameter(torch.full((actions,), -1.2))
 
     def value(self, observation: torch.Tensor) -> torch.Tensor:
-        """Of the observations."""
+        """Return the values of observations."""
         return self.critic(self.features(observation))[:, 0]
 
     def distribution(self, observation: torch.Tensor) -> Normal:
-        """Of the actions."""
+        """Return the distribution of the actions."""
         return Normal(self.actor(self.features(observation)), self.log_std.exp())
 
     @torch.no_grad()
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        """The means of the actions, for one observation or several."""
-        several = torch.as_tensor(observation).reshape(-1, np.shape(observation)[-1])
-        actions = self.distribution(several).mean.clamp(-1, 1).numpy()
+        """Return the mean action for an observation, or the actions for a batch of observations."""
+        batch = torch.as_tensor(observation).reshape(-1, np.shape(observation)[-1])
+        actions = self.distribution(batch).mean.clamp(-1, 1).numpy()
         return actions.reshape(*np.shape(observation)[:-1], -1), state
 
 
 def main(
-    family: str = "open", total_timesteps: int = 300_000, num_envs: int = 64, num_steps: int = 64, seed: int = 0
+    family: str = "open",
+    total_timesteps: int = 300_000,
+    num_envs: int = 64,
+    num_steps: int = 64,
+    seed: int = 0,
+    test_scenarios: int | None = None,
 ) -> float:
-    """Learns from scratch, and scores what was learned against the optimum.
+    """Train a policy from scratch, and score it against the optimum.
 
     Args:
-        family: of the scenarios.
-        total_timesteps: of all robots.
-        num_envs: robots.
-        num_steps: that each drives between two updates.
-        seed: of everything.
+        family: Family of the scenarios: open, clutter, polygons, rooms or slalom.
+        total_timesteps: Environment steps of all robots together.
+        num_envs: Number of robots.
+        num_steps: Environment steps of each robot between two updates.
+        seed: Random seed.
+        test_scenarios: Number of test scenarios of the score; by default all.
 
     """
     gamma, gae_lambda, clip, epochs, batch = 0.99, 0.95, 0.2, 5, 512
@@ -97,17 +101,19 @@ def main(
                 distribution = agent.distribution(following)
                 action, value = distribution.sample(), agent.value(following)
             observed = following
-            # An episode of leapnav ends by itself, at the horizon: there is no value beyond.
+            # The episode terminates at the horizon, so there is no value after it.
             observation, reward, done, _, info = envs.step(action.clamp(-1, 1).numpy())
             following = torch.as_tensor(observation)
             if done.any():
-                ended, seen = info["final_info"], np.stack(info["final_obs"][done].tolist())
-                successes += ended["is_success"][done].tolist()
-                # A miss costs the more the farther it is from the goal: one penalty for all would not say where it is.
-                away = np.hypot(seen[:, 0], seen[:, 1]) + np.abs(np.arctan2(seen[:, 3], seen[:, 2]))
-                reward[done] -= ended["reward_parts"]["miss"][done] * (1 - np.minimum(1, 0.2 + 0.1 * away))
-            new = (observed, action, distribution.log_prob(action).sum(1), value, SCALE * reward, done)
-            for row, entry in zip(rows.values(), new, strict=True):
+                final_info, final_obs = info["final_info"], np.stack(info["final_obs"][done].tolist())
+                successes += final_info["is_success"][done].tolist()
+                # The penalty of a miss is reduced near the goal; a constant one would not indicate where the goal is.
+                error = np.hypot(final_obs[:, 0], final_obs[:, 1]) + np.abs(
+                    np.arctan2(final_obs[:, 3], final_obs[:, 2])
+                )
+                reward[done] -= final_info["reward_parts"]["miss"][done] * (1 - np.minimum(1, 0.2 + 0.1 * error))
+            step = (observed, action, distribution.log_prob(action).sum(1), value, REWARD_SCALE * reward, done)
+            for row, entry in zip(rows.values(), step, strict=True):
                 row.append(torch.as_tensor(entry, dtype=torch.float32))
         x, a, logp, value, reward, done = (torch.stack(row) for row in rows.values())
         with torch.no_grad():
@@ -132,10 +138,10 @@ def main(
                 optimizer.step()
         if successes and update % 10 == 0:
             steps = (update + 1) * num_envs * num_steps
-            print(f"{steps:9,} steps: success {100 * np.mean(successes):.0f} % while it learns", flush=True)
-    found = evaluate(agent, family, environment=environment)
-    print(f"success {100 * found.success:.1f} %, collision {100 * found.collision:.1f} %, SOC {found.soc:.3f}")
-    return found.soc
+            print(f"{steps:9,} steps: training success {100 * np.mean(successes):.0f} %", flush=True)
+    score = evaluate(agent, family, count=test_scenarios, environment=environment)
+    print(f"success {100 * score.success:.1f} %, collision {100 * score.collision:.1f} %, SOC {score.soc:.3f}")
+    return score.soc
 
 
 if __name__ == "__main__":

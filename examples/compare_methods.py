@@ -1,4 +1,4 @@
-"""The four methods on one scenario, from the same path: what each finds, how fast, and Leapfrog's way there.
+"""The four methods on one scenario, from the same initial guess: cost, residual, iterations and time of each.
 
 python examples/compare_methods.py --family polygons --index 3 --plot leapfrog.png
 """
@@ -12,17 +12,17 @@ from rich.console import Console
 from rich.table import Table
 
 from leapnav.envs import ScenarioBank
-from leapnav.experts import find_optimum, solve
-from leapnav.experts.methods import Method
+from leapnav.experts import find_optimum, plot_extremal, solve
+from leapnav.experts.solve import Method
 
 
 def main(family: str = "clutter", index: int = 0, plot: Path | None = None) -> None:
-    """Solves a scenario of the test bank with every method.
+    """Solve a scenario of the test bank by every method.
 
     Args:
-        family: open, clutter, polygons, rooms or slalom.
-        index: of the scenario.
-        plot: write a picture of Leapfrog's sweeps, without Newton's method to end them.
+        family: Family of the scenario: open, clutter, polygons, rooms or slalom.
+        index: Index of the scenario in the bank.
+        plot: Picture of Leapfrog's sweeps (.png, .pdf or .svg), without the final Newton steps.
 
     """
     scenario = ScenarioBank.shipped(family, "test")[index]
@@ -30,7 +30,7 @@ def main(family: str = "clutter", index: int = 0, plot: Path | None = None) -> N
     for column in ("method", "status", "J", "residual", "iterations", "ms"):
         table.add_column(column, no_wrap=True)
     for method in get_args(Method):
-        solve(scenario, method=method)  # what is compiled now need not be timed
+        solve(scenario, method=method)  # loads or compiles the kernels, so that the next solve is timed without that
         start = perf_counter()
         extremal = solve(scenario, method=method)
         milliseconds = 1000 * (perf_counter() - start)
@@ -38,9 +38,9 @@ def main(family: str = "clutter", index: int = 0, plot: Path | None = None) -> N
         iterations = str(len(extremal.history))
         table.add_row(method, extremal.status.name, f"{extremal.cost:.9f}", residual, iterations, f"{milliseconds:.1f}")
     Console().print(table)
-    print(f"the best of all paths: J = {find_optimum(scenario).cost:.9f}")
+    print(f"optimum of the global search: J = {find_optimum(scenario).cost:.9f}")
     if plot is not None:
-        solve(scenario, method="leapfrog", polish=False).plot(plot)
+        plot_extremal(solve(scenario, method="leapfrog", polish=False), plot)
         print(f"wrote {plot}")
 
 

@@ -1,4 +1,4 @@
-"""Pictures of scenarios, paths and extremals, on Matplotlib axes."""
+"""Plots of scenarios, paths and extremals with Matplotlib."""
 
 from __future__ import annotations
 
@@ -16,32 +16,33 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from leapnav.envs.bank import ScenarioBank
-from leapnav.envs.obstacles import clearance
-from leapnav.envs.scenario import Scenario
-from leapnav.experts.extremal import Extremal, Iteration
-from leapnav.experts.feasible_path import dense_path, telling_sweeps
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import Optimum
-from leapnav.experts.problem import OptimalControlProblem
+from leapnav.experts.problem.extremal import Extremal, Iteration
+from leapnav.experts.problem.problem import OptimalControlProblem
+from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
 
 OBSTACLE, EDGE, WALL, START, GOAL, OPTIMUM = "#c3c8d1", "#7a8190", "#3c4048", "#2662ab", "#22804f", "#1a1a1a"
-# Told apart by their lightness too, so also by the colour-blind.
+# The curves also differ in lightness, for readers with a colour vision deficiency.
 CURVES = (START, "#e08a00", GOAL, "#cc79a7", "#56b4e9", OPTIMUM)
 ALTERNATIVE_COLORS = ("#e08a00", "#56b4e9", "#cc79a7", "#22804f")
-ALTERNATIVES_DRAWN = len(ALTERNATIVE_COLORS)
-ROBOTS_DRAWN = 9  # along a path, evenly spaced in time
-POINTS = 400  # of a dense path
-FIELD_POINTS = 200  # per side, of an obstacle field
-BOUND_SHOWN = 3.0  # times the largest control
-SMALLEST_DRIFT = 1e-9  # below it the Hamiltonian's deviations are drawn small, as what they are
-SWEEPS = ("sweep", "reduce")  # Leapfrog's phases, whose rows carry a feasible path
-SWEEPS_DRAWN, FIRST_SWEEPS = 12, 4
-SMALLEST_DISTANCE = 1e-10  # of costs, relative: the end error that Leapfrog allows an arc
-SPREAD = 100.0  # costs further apart, in smallest distances, are drawn as distances on a logarithmic axis
+MAX_ALTERNATIVES = len(ALTERNATIVE_COLORS)
+N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
+N_POINTS = 400  # points of a dense path
+N_FIELD_POINTS = 200  # sample points per side of an obstacle field
+MAX_BOUND = 3.0  # control bounds up to this multiple of the largest control are within the axes
+MIN_DRIFT = 1e-9  # smallest half-height of the Hamiltonian's axes, so that rounding errors do not fill them
+SWEEPS = ("sweep", "reduce")  # Leapfrog's phases, whose iterates have a feasible path
+MAX_SWEEPS, N_FIRST_SWEEPS = 12, 4
+MIN_DISTANCE = 1e-10  # relative distance of costs: the end error that Leapfrog allows an arc
+MAX_LINEAR_SPREAD = 100.0  # in units of the smallest distance; a larger spread of costs is drawn on a logarithmic axis
 
 
 def draw_scenario(axes: Axes, scenario: Scenario) -> None:
-    """Arena, obstacles, start and goal, in metres and to scale."""
+    """Draw arena, obstacles, start and goal to scale, in metres."""
     x_min, y_min, x_max, y_max = scenario.arena
     for obstacle in scenario.obstacles:
         if obstacle.circle is not None:
@@ -60,7 +61,7 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
 
 
 def draw_robot(axes: Axes, pose: Any, radius: float, color: str, **style: Any) -> None:
-    """The robot's rim, and a line from its centre along its heading unless that is None."""
+    """Draw the outline of a robot, and a line from its centre along its heading unless that is None."""
     x, y, heading = pose
     axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=color, **{"linewidth": 1.4, **style}))
     if heading is not None:
@@ -69,10 +70,10 @@ def draw_robot(axes: Axes, pose: Any, radius: float, color: str, **style: Any) -
 
 
 def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLike[str]) -> None:
-    """Writes the picture of a scenario's extremal, see `plot_extremal`.
+    """Write a plot of a scenario's extremal to a file, see `plot_extremal`.
 
     Raises:
-        ValueError: the extremal has no path, or the file's ending is no picture format.
+        ValueError: the extremal has no path, or the extension of the file is not an image format.
 
     """
     plot_extremal(extremal, path, scenario)
@@ -84,21 +85,21 @@ def plot_extremal(
     scenario: Scenario | None = None,
     title: str | None = None,
 ) -> Figure:
-    """An extremal of any problem: states, controls, costates and Hamiltonian over time.
+    """Plot states, controls, costates and Hamiltonian of an extremal over time.
 
-    A system with a position also has its path in the plane. A Leapfrog solve shows how it came about: the feasible
-    paths of its sweeps, from light to dark, in the plane (of the first two states, for a system without a position),
-    and the cost against the sweep, in the same colours. The optimum of a scenario is drawn with its alternatives.
+    For a system with a position, the path in the plane is added. For a Leapfrog solution, the feasible paths of its
+    sweeps are added from light to dark, in the plane of the position or of the first two states, and the cost of each
+    sweep in the same colours. The optimum of a scenario is drawn with its alternatives.
 
     Args:
-        extremal: of any problem; it need not be certified.
-        path: where to write the picture; None writes none.
-        scenario: the problem's scenario, whose arena and obstacles are drawn. Without it the plane shows where the
-            problem's obstacle field lets no robot's centre be.
-        title: None: cost and status, after the scenario's name.
+        extremal: extremal of any problem, certified or not.
+        path: file to write; None writes no file.
+        scenario: the scenario of the problem, for its arena and obstacles. Without it, the region in which the robot's
+            centre cannot be is drawn.
+        title: None uses the name of the scenario, the cost and the status.
 
     Raises:
-        ValueError: the extremal has no path, or the file's ending is no picture format.
+        ValueError: the extremal has no path, or the extension of the file is not an image format.
 
     """
     if len(extremal.times) == 0:
@@ -132,12 +133,12 @@ def plot_extremal(
 
 
 def _dense_times(extremal: Extremal) -> np.ndarray:
-    """Evenly spaced times and the integrator's own, which lie close where the path turns sharply; shape (K,)."""
-    return np.union1d(extremal.times, np.linspace(0.0, extremal.problem.horizon, POINTS))
+    """Evenly spaced times and the steps of the integrator, which are dense in sharp turns; shape (K,)."""
+    return np.union1d(extremal.times, np.linspace(0.0, extremal.problem.horizon, N_POINTS))
 
 
 def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> None:
-    """States, controls, costates and Hamiltonian on four axes."""
+    """Draw states, controls, costates and Hamiltonian on four axes."""
     problem, horizon = extremal.problem, extremal.problem.horizon
     names = [sp.latex(symbol) for symbol in problem.system.state]
     times = _dense_times(extremal)
@@ -157,7 +158,7 @@ def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> N
     for axes in panels:
         axes.set_xlim(0.0, horizon)
         axes.grid(alpha=0.3)
-        # Beside the axes, where no curve can run through it.
+        # Beside the axes, so that it covers no curve.
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.05), frameon=False, fontsize=9, handlelength=1.2)
         spec = axes.get_subplotspec()
         if spec is not None and last is not None and spec.rowspan.stop == last.rowspan.stop:
@@ -167,20 +168,20 @@ def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> N
 
 
 def _draw_bounds(axes: Axes, controls: np.ndarray, bounds: Sequence[tuple[float, float]]) -> None:
-    """Control bounds as faint lines; those far from the controls lie beyond the axes, else the curves were flat."""
+    """Draw control bounds as faint lines; those far from the controls are outside the axes, to keep the scale."""
     low, high = axes.get_ylim()
-    near = BOUND_SHOWN * float(np.abs(controls).max())
+    limit = MAX_BOUND * float(np.abs(controls).max())
     for color, pair in zip(cycle(CURVES), bounds, strict=False):
         for bound in pair:
             if np.isfinite(bound):
                 axes.axhline(bound, color=color, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.5, zorder=1)
-            if abs(bound) <= near:
+            if abs(bound) <= limit:
                 low, high = min(low, 1.06 * bound), max(high, 1.06 * bound)
     axes.set_ylim(low, high)
 
 
 def _draw_hamiltonian(axes: Axes, extremal: Extremal) -> None:
-    """H less its mean at the integrator's own steps: between them the interpolant's error would show, not H's."""
+    """Draw H minus its mean at the steps of the integrator, where the interpolation error is zero."""
     mean = float(extremal.hamiltonian.mean())
     deviation = extremal.hamiltonian - mean
     axes.plot(
@@ -192,12 +193,12 @@ def _draw_hamiltonian(axes: Axes, extremal: Extremal) -> None:
         markersize=3,
         label=r"$H - \bar{H}$" + "\n" + rf"$\bar{{H}} = {mean:.5g}$",
     )
-    reach = 1.25 * max(SMALLEST_DRIFT, float(np.abs(deviation).max()))
-    axes.set(ylabel="Hamiltonian", ylim=(-reach, reach))
+    limit = 1.25 * max(MIN_DRIFT, float(np.abs(deviation).max()))
+    axes.set(ylabel="Hamiltonian", ylim=(-limit, limit))
 
 
 def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweeps: Sequence[Iteration]) -> None:
-    """The path of a system with a position, over the obstacles, with headings if it has a state theta."""
+    """Draw the path of a system with a position over the obstacles, with headings if it has a state theta."""
     system = extremal.problem.system
     assert system.position is not None
     ix, iy = (system.state.index(symbol) for symbol in system.position)
@@ -206,7 +207,7 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
     states = extremal.evaluate(_dense_times(extremal))[0]
     _draw_sweeps(axes, extremal.problem, sweeps, lambda _, states: (states[:, ix], states[:, iy]))
     axes.plot(states[:, ix], states[:, iy], color=OPTIMUM, linewidth=1.8, zorder=3)
-    drawn = extremal.evaluate(np.linspace(0.0, extremal.problem.horizon, ROBOTS_DRAWN + 2))[0]
+    drawn = extremal.evaluate(np.linspace(0.0, extremal.problem.horizon, N_ROBOTS + 2))[0]
     poses = [(q[ix], q[iy], None if heading is None else q[heading]) for q in drawn]
     if scenario is not None:
         draw_scenario(axes, scenario)
@@ -234,8 +235,8 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
 
 
 def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
-    """The cheapest of the other local optima, with a legend that says what tells them apart."""
-    shown = optimum.alternatives[:ALTERNATIVES_DRAWN]
+    """Draw the best other local optima, with costs and path classes in the legend."""
+    shown = optimum.alternatives[:MAX_ALTERNATIVES]
     if not shown:
         return
     entries = [(optimum, OPTIMUM, 1.8), *((other, ALTERNATIVE_COLORS[k], 1.3) for k, other in enumerate(shown))]
@@ -244,7 +245,7 @@ def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
         label = f"J = {other.cost:.4g}"
         if other is not optimum and optimum.cost > 0:
             label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
-        label += f", {', '.join(other.driving_modes) or 'turn on the spot'}"
+        label += f", {', '.join(other.driving_modes) or 'rotation in project'}"
         if other.heading_winding:
             label += f", winding {other.heading_winding:+d}"
         axes.plot(*positions.T, color=color, linewidth=width, zorder=2.5, label=label)
@@ -260,14 +261,19 @@ def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
 
 
 def plot_bank(bank: ScenarioBank, path: str | os.PathLike[str], count: int = 24, columns: int = 6) -> None:
-    """A contact sheet: scenarios of a bank, evenly spaced in it, with their optima.
+    """Plot scenarios of a bank with their optima, side by side.
+
+    Args:
+        bank: the bank.
+        path: file to write.
+        count: maximum number of scenarios, evenly spaced in the bank.
+        columns: maximum number of columns.
 
     Raises:
-        ValueError: count < 1, or the file's ending is no picture format.
+        ValueError: count < 1, or the extension of the file is not an image format.
 
     """
-    if count < 1:
-        raise ValueError(f"count: expected at least 1, got {count!r}")
+    check_at_least("count", count, 1)
     chosen = np.unique(np.linspace(0, len(bank) - 1, min(count, len(bank))).round().astype(int))
     columns = min(columns, len(chosen))
     rows = math.ceil(len(chosen) / columns)
@@ -284,24 +290,24 @@ def plot_bank(bank: ScenarioBank, path: str | os.PathLike[str], count: int = 24,
 
 
 def _draw_field(axes: Axes, field: np.ndarray, center: np.ndarray, reach: float) -> None:
-    """Where an obstacle field lets no robot's centre be, in a square of half-side `reach` (m)."""
-    x, y = (np.linspace(c - reach, c + reach, FIELD_POINTS) for c in center)
+    """Draw the region in which the robot's centre cannot be, in a square of half-side `reach` (m)."""
+    x, y = (np.linspace(c - reach, c + reach, N_FIELD_POINTS) for c in center)
     distance = np.array([[clearance(a, b, field)[0] for a in x] for b in y])
     if distance.min() < 0:
         axes.contourf(x, y, distance, levels=[distance.min(), 0.0], colors=[OBSTACLE], zorder=0)
 
 
 def _draw_state_space(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration]) -> None:
-    """The first two states against each other, or the only one over time."""
+    """Draw the first two states against each other, or a single state over time."""
     times = _dense_times(extremal)
     states = extremal.evaluate(times)[0]
     names = [f"${sp.latex(symbol)}$" for symbol in extremal.problem.system.state]
 
-    def place(times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return (times, states[:, 0]) if states.shape[1] == 1 else (states[:, 0], states[:, 1])
 
-    _draw_sweeps(axes, extremal.problem, sweeps, place)
-    x, y = place(times, states)
+    _draw_sweeps(axes, extremal.problem, sweeps, project)
+    x, y = project(times, states)
     axes.plot(x, y, color=OPTIMUM, linewidth=1.8, zorder=3)
     for k, color in ((0, START), (-1, GOAL)):
         axes.plot(x[k], y[k], "o", color=color, markersize=7, zorder=4)
@@ -313,37 +319,40 @@ def _draw_sweeps(
     axes: Axes,
     problem: OptimalControlProblem,
     sweeps: Sequence[Iteration],
-    place: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    project: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
 ) -> None:
-    """Feasible paths and nodes of some sweeps, where `place` puts times (K,) and states (K, n)."""
-    for k, color in _chosen(sweeps).items():
+    """Draw feasible paths and nodes of selected sweeps; `project` maps times (K,) and states (K, n) to the axes."""
+    for k, color in _sweep_colors(sweeps).items():
         times, nodes = sweeps[k].times, sweeps[k].nodes
         assert times is not None and nodes is not None
-        axes.plot(*place(*dense_path(problem, times, nodes, POINTS)), color=color, linewidth=1.0, label=f"sweep {k}")
-        axes.plot(*place(times, nodes[:, : problem.system.n]), ".", color=color, markersize=3.5)
+        axes.plot(
+            *project(*dense_path(problem, times, nodes, N_POINTS)), color=color, linewidth=1.0, label=f"sweep {k}"
+        )
+        axes.plot(*project(times, nodes[:, : problem.system.n]), ".", color=color, markersize=3.5)
 
 
-def _chosen(sweeps: Sequence[Iteration]) -> dict[int, Any]:
-    """Which sweeps to draw, and their colours from light to dark."""
-    numbers = telling_sweeps(len(sweeps), FIRST_SWEEPS, SWEEPS_DRAWN)
+def _sweep_colors(sweeps: Sequence[Iteration]) -> dict[int, Any]:
+    """Indices of the sweeps to draw, and their colours from light to dark."""
+    numbers = select_sweeps(len(sweeps), N_FIRST_SWEEPS, MAX_SWEEPS)
     return dict(zip(numbers, colormaps["viridis_r"](np.linspace(0.12, 0.92, len(numbers))), strict=True))
 
 
 def _draw_costs(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration]) -> None:
-    """Cost of each iterate, the sweeps in the colours of their paths, over the number of segments if that changes."""
+    """Draw the cost of each iterate, sweeps in the colours of their paths, and the number of segments if it changes."""
     rows = [row for row in extremal.history if np.isfinite(row.cost)]
     costs, phases = np.array([row.cost for row in rows]), np.array([row.phase for row in rows])
     swept = np.flatnonzero(np.isin(phases, SWEEPS))
-    # A sweep's path is feasible, so only the end errors of its arcs take it below the extremal; a Newton step's is not.
+    # The path of a sweep is feasible: its cost is below the extremal's only by the end errors of its arcs. The path of
+    # a Newton step is not feasible.
     distance = np.abs(costs - extremal.cost)
     distance[swept] = costs[swept] - extremal.cost
-    smallest = SMALLEST_DISTANCE * (1 + abs(extremal.cost))
-    # A failure may have ended above its sweeps.
-    logarithmic = distance.max() > SPREAD * smallest and distance.min() > -SPREAD * smallest
+    smallest = MIN_DISTANCE * (1 + abs(extremal.cost))
+    # A failure may cost more than its sweeps.
+    logarithmic = distance.max() > MAX_LINEAR_SPREAD * smallest and distance.min() > -MAX_LINEAR_SPREAD * smallest
     values = np.maximum(distance, smallest) if logarithmic else costs
-    label = "sweep, in its path's colour"
+    label = "sweep (colour of its path)"
     axes.plot(swept, values[swept], color=EDGE, linewidth=0.8, marker=".", markersize=3, zorder=1, label=label)
-    for k, color in _chosen(sweeps).items():
+    for k, color in _sweep_colors(sweeps).items():
         axes.plot(swept[k], values[swept[k]], "o", color=color, markersize=5)
     for phase, marker, label in (("reduce", "s", "nodes removed"), ("newton", "x", "Newton step")):
         numbers = np.flatnonzero(phases == phase)
@@ -367,7 +376,7 @@ def _draw_costs(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration]) -> 
         side.yaxis.set_major_locator(MaxNLocator(4, integer=True))
         side.yaxis.label.set_color(EDGE)
         side.tick_params(colors=EDGE)
-        # The steps are a backdrop.
+        # Draw the steps behind the costs.
         axes.set_zorder(side.get_zorder() + 1)
         axes.patch.set_visible(False)
     axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=3, frameon=False, fontsize=8)

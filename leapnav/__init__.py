@@ -1,7 +1,7 @@
 """A wheeled-robot navigation benchmark in which the optimum is known.
 
-`import leapnav` registers the environments and loads nothing heavy; the parts are `leapnav.envs`, `leapnav.experts` and
-`leapnav.training`.
+`import leapnav` registers the environments and imports nothing heavy. The packages are `leapnav.envs`,
+`leapnav.experts` and `leapnav.training`.
 """
 
 from importlib.metadata import version
@@ -9,21 +9,25 @@ from pkgutil import extend_path
 
 import gymnasium
 
+from leapnav import deprecated
+
 __all__ = ["__version__"]
 
-# The parts stand beside this folder in the repository. From there, with a strict editable install or a plain one, this
-# folder is found first; the installed package's other folders join it.
+# In the repository the packages are beside this directory. With an editable install, or when Python is started in the
+# repository, this directory is found first, and the directories of the installed package are added here.
 __path__ = extend_path(__path__, __name__)
 __version__ = version("leapnav")
 
+deprecated.install()
+
 for _name in ("Navigate", "NavigateGoal"):
-    if f"leapnav/{_name}-v0" not in gymnasium.registry:  # subprocess workers import again
-        # Gymnasium's wrappers hide `compute_reward`; what they check, the environment checks itself.
-        _wrapped = _name == "Navigate"
+    if f"leapnav/{_name}-v0" not in gymnasium.registry:  # a subprocess worker imports the package again
+        # Gymnasium's wrappers hide `compute_reward` of the goal environment, which does their checks itself.
+        _is_wrapped = _name == "Navigate"
         gymnasium.register(
             f"leapnav/{_name}-v0",
             entry_point=f"leapnav.envs.navigation:{_name}Env",
             vector_entry_point=f"leapnav.envs.vector:{_name}VectorEnv",
-            order_enforce=_wrapped,
-            disable_env_checker=not _wrapped,
+            order_enforce=_is_wrapped,
+            disable_env_checker=not _is_wrapped,
         )

@@ -1,4 +1,4 @@
-"""`python -m leapnav` is the command `leapnav`."""
+"""The command line as `python -m leapnav`."""
 
 import sys
 

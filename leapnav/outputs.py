@@ -1,8 +1,7 @@
-"""Where commands write."""
+"""Output files, JSON and the exit code of failure, shared by the commands."""
 
 from __future__ import annotations
 
-import json as encoder
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -10,57 +9,72 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TextIO
 
+FAILED = 1  # exit code of a command that ran to its end with a negative result
 PICTURES, VIDEOS, PAGES = (".png", ".pdf", ".svg"), (".mp4",), (".html",)
 STDOUT = Path("-")
-_reserved: ContextVar[TextIO | None] = ContextVar("reserved", default=None)
+_json_stream: ContextVar[TextIO | None] = ContextVar("json_stream", default=None)
 
 
 def check_outputs(
     json: Path | None = None, plot: Path | None = None, video: Path | None = None, page: Path | None = None
 ) -> None:
-    """Checks the files that a command is to write: what cannot be written is told before the work, not after.
+    """Check that the output files of a command can be written, before its work begins.
+
+    Args:
+        json: JSON file, "-" for standard output.
+        plot: picture.
+        video: video.
+        page: HTML page.
 
     Raises:
-        FileNotFoundError, IsADirectoryError: there is no such folder, or it is one.
-        ValueError: the name ends in no format that can be written.
+        FileNotFoundError: the directory of a file does not exist.
+        IsADirectoryError: a file is a directory.
+        ValueError: the suffix of a file is not one of the supported formats.
 
     """
     for path in (None if json == STDOUT else json, plot, video, page):
         if path is not None and not path.parent.is_dir():
-            raise FileNotFoundError(f"{path}: its folder does not exist")
+            raise FileNotFoundError(f"{path}: the directory does not exist")
         if path is not None and path.is_dir():
-            raise IsADirectoryError(f"{path}: is a folder")
+            raise IsADirectoryError(f"{path}: is a directory")
     for path, formats in ((plot, PICTURES), (video, VIDEOS), (page, PAGES)):
         if path is not None and path.suffix not in formats:
             raise ValueError(f"{path}: expected a name that ends in {', '.join(formats)}")
 
 
 @contextmanager
-def reserved_for_json(json: Path | None) -> Iterator[None]:
-    """Where JSON goes to standard output, all else that a command prints goes to standard error."""
+def json_on_stdout(json: Path | None) -> Iterator[None]:
+    """Redirect everything but JSON to standard error while JSON goes to standard output.
+
+    Args:
+        json: the command's JSON file; nothing is redirected unless it is "-".
+
+    """
     if json != STDOUT:
         yield
         return
-    token = _reserved.set(sys.stdout)
+    token = _json_stream.set(sys.stdout)
     try:
         with redirect_stdout(sys.stderr):
             yield
     finally:
-        _reserved.reset(token)
+        _json_stream.reset(token)
 
 
 def write_json(content: Any, path: Path | None) -> None:
-    """Writes what a command found, and says where; with the path "-" to standard output, and with None nowhere.
+    """Write the result of a command as JSON. NaN and infinity become null.
 
-    Numbers that are not finite become null.
+    Args:
+        content: dictionaries, lists, numbers, strings, dataclasses, paths.
+        path: the file; "-" writes to standard output, None writes nothing.
+
     """
     if path is None:
         return
-    from leapnav.experts.plain import finite  # whoever asks for help need not load the solvers
+    from leapnav.envs.utils.json_utils import encode
 
-    text = encoder.dumps(finite(content), allow_nan=False)
     if path == STDOUT:
-        print(text, file=_reserved.get() or sys.stdout)
+        print(encode(content), file=_json_stream.get() or sys.stdout)
         return
-    path.write_text(text + "\n")
+    path.write_text(encode(content) + "\n")  # not atomic: it may be a pipe or a device
     print(f"wrote {path}")

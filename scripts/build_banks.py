@@ -1,7 +1,7 @@
-"""Builds the banks that ship with leapnav, in envs/banks, or checks that they come out the same to the bit.
+"""Build the scenario banks that are shipped with leapnav, or check that a new build is bitwise identical.
 
-python scripts/build_banks.py            # builds those that are missing; remove a bank to build it anew
-python scripts/build_banks.py --check    # builds all of them elsewhere and compares
+python scripts/build_banks.py            # builds missing banks; remove a bank to build it again
+python scripts/build_banks.py --check    # builds all banks in a temporary directory and compares
 """
 
 import argparse
@@ -14,15 +14,15 @@ from pathlib import Path
 from leapnav.envs import FAMILIES
 from leapnav.experts import build_bank
 
-BANKS = Path(__file__).resolve().parent.parent / "envs" / "banks"
-# Number of scenarios and seed. Draws of different seeds are independent, so no test scenario is in a training bank.
+BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
+# Number of scenarios, and seed. Different seeds give independent scenarios, so the splits share none.
 SPLITS = {"train": (400, 0), "test": (200, 1)}
 
 
-def build(folder: Path, workers: int) -> None:
+def build(directory: Path, workers: int) -> None:
     for family in FAMILIES:
         for split, (count, seed) in SPLITS.items():
-            build_bank(family, count, folder / f"{family}-{split}.bank", seed=seed, workers=workers)
+            build_bank(family, count, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
 
 
 def check(workers: int) -> int:
@@ -32,14 +32,14 @@ def check(workers: int) -> int:
         _, different, missing = filecmp.cmpfiles(scratch, BANKS, names, shallow=False)
     for name in (*different, *missing):
         print(f"{name}: {'missing' if name in missing else 'different'}")
-    print(f"{len(names) - len(different) - len(missing)} of {len(names)} banks are the same to the bit")
+    print(f"{len(names) - len(different) - len(missing)} of {len(names)} banks are bitwise identical")
     return 1 if different or missing else 0
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="build elsewhere and compare")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--check", action="store_true", help="build in a temporary directory and compare")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="number of processes")
     arguments = parser.parse_args()
     if arguments.check:
         return check(arguments.workers)

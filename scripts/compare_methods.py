@@ -1,11 +1,11 @@
-"""All methods on all families: clones of several seeds, PPO and SAC from scratch and from a clone, what ships.
+"""Compare all methods on all families: clones, PPO and SAC from scratch and from a clone, and the shipped policies.
 
-python scripts/compare_methods.py --runs DIR                      # what is finished there is not done again
-python scripts/compare_methods.py --only bc --families open       # some
-python scripts/compare_methods.py --table                         # nothing is trained: the table of what is there
+python scripts/compare_methods.py --runs DIR                      # skips finished runs in DIR, resumes the others
+python scripts/compare_methods.py --only bc --families open       # trains only these
+python scripts/compare_methods.py --table                         # trains nothing, prints the table of finished runs
 
-What takes less than ten minutes is run with five seeds; clones share their demonstrations, so that their spread is the
-fit's. PPO from a clone starts with the first one; SAC, which squashes its actions, makes its own.
+Runs of less than ten minutes are repeated with five seeds. The clones of a family share their demonstrations, so their
+variation is that of the fit. PPO starts from the first clone; SAC squashes its actions, so it fits a clone of its own.
 """
 
 import argparse
@@ -14,25 +14,26 @@ from dataclasses import replace
 from pathlib import Path
 
 from leapnav.envs import FAMILIES, ScenarioBank
-from leapnav.experts.rollouts import rollout
+from leapnav.experts import rollout
 from leapnav.training import BCConfig, PPOConfig, SACConfig, train_bc, train_ppo, train_sac
-from leapnav.training.contest import contest
-from leapnav.training.entrants import load_entrant
-from leapnav.training.reports import COLUMNS, cell
+from leapnav.training.scoring.comparison import compare_policies
+from leapnav.training.scoring.policy_specs import load_policy_spec
+from leapnav.training.scoring.reports import COLUMNS, cell
 
-SHOWN = ("success", "collision", "soc", "regret")
+SHOWN_COLUMNS = ("success", "collision", "soc", "regret")
 METHODS = ("bc", "scratch", "warm", "sac", "sacwarm")
 DEMONSTRATIONS = {"open": 2000, "clutter": 10_000, "polygons": 4000, "rooms": 4000, "slalom": 4000}
 DEMONSTRATION_SEED = 60_000
 STEPS = {"open": 1_000_000, "clutter": 5_000_000, "polygons": 2_000_000, "rooms": 2_000_000, "slalom": 2_000_000}
 SAC_STEPS = {"sac": 100_000, "sacwarm": 20_000}
-ONE_SEED = {
+# Families on which a run of the method takes more than ten minutes.
+SINGLE_SEED = {
     "bc": ("slalom",),
     "scratch": ("clutter", "polygons", "rooms", "slalom"),
     "warm": ("clutter", "polygons", "rooms", "slalom"),
     **dict.fromkeys(("sac", "sacwarm"), tuple(FAMILIES)),
 }
-EVALUATIONS = 8  # on the way of a run of PPO or SAC
+N_EVALUATIONS = 8  # during a run of PPO or SAC
 ROWS = {
     "bc": "clone of {demos:,}",
     "scratch": "PPO from scratch, {steps:.1f} M steps",
@@ -43,11 +44,11 @@ ROWS = {
 
 
 def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> None:
-    """The runs of a method on a family that are not finished."""
+    """Run or resume a method on a family, with every seed."""
     demos = runs / family / "demonstrations"
     if method in ("bc", "warm", "sacwarm"):
         rollout(family, DEMONSTRATIONS[family], demos, seed=DEMONSTRATION_SEED, workers=workers)
-    for seed in range(1 if family in ONE_SEED[method] else seeds):
+    for seed in range(1 if family in SINGLE_SEED[method] else seeds):
         out = runs / family / f"{method}-{seed}"
         run = {"out": out, "seed": seed, "resume": (out / "config.json").exists()}
         if method == "bc":
@@ -56,44 +57,44 @@ def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> Non
         if method in SAC_STEPS:
             steps = SAC_STEPS[method]
             start = (demos,) if method == "sacwarm" else ()
-            every = steps // EVALUATIONS
-            train_sac(SACConfig.tuned(family, total_timesteps=steps, warm_start=start, evaluate_every=every, **run))
+            run["evaluate_every"] = steps // N_EVALUATIONS
+            train_sac(SACConfig.tuned(family, total_timesteps=steps, warm_start=start, **run))
             continue
         if method == "warm":
             run["warm_start"] = (runs / family / "bc-0", demos)
         if method == "scratch":
             run["total_timesteps"] = STEPS[family]
         config = PPOConfig.tuned(family, **run)
-        train_ppo(replace(config, evaluate_every=config.total_timesteps // EVALUATIONS))
+        train_ppo(replace(config, evaluate_every=config.total_timesteps // N_EVALUATIONS))
 
 
 def is_finished(run: Path) -> bool:
-    """Whether a run came to its end: during it, its folder holds the policy of the last evaluation."""
+    """Whether a run is finished; the directory of an unfinished one contains the policy of the latest evaluation."""
     evaluations = run / "evaluations.jsonl"
     return evaluations.exists() and json.loads(evaluations.read_text().splitlines()[-1])["final"]
 
 
-def entrants(family: str, runs: Path) -> list[str]:
-    """What the table of a family compares, each with its row's name."""
+def specs(family: str, runs: Path) -> list[str]:
+    """Return the policies in the table of a family, as LABEL=DIRECTORY or NAME."""
     values = {"demos": DEMONSTRATIONS[family], "steps": STEPS[family] / 1e6, **SAC_STEPS}
-    found = [
-        f"{ROWS[method].format(**values)}={folder}"
+    finished = [
+        f"{ROWS[method].format(**values)}={run}"
         for method in METHODS
-        for folder in sorted((runs / family).glob(f"{method}-*"))
-        if is_finished(folder)
+        for run in sorted((runs / family).glob(f"{method}-*"))
+        if is_finished(run)
     ]
-    return [*found, f"DAgger (ships)={family}", "go-to-goal"]
+    return [*finished, f"DAgger (shipped)={family}", "go-to-goal"]
 
 
 def main() -> None:
-    """Trains what is asked for and prints the table."""
+    """Train the methods and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, default=Path("runs/methods"))
     parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
-    parser.add_argument("--only", nargs="+", default=METHODS, choices=METHODS, help="train these methods")
-    parser.add_argument("--seeds", type=int, default=5, help="of what takes less than ten minutes")
-    parser.add_argument("--table", action="store_true", help="train nothing")
-    parser.add_argument("--workers", type=int, default=1, help="processes that make demonstrations")
+    parser.add_argument("--only", nargs="+", default=METHODS, choices=METHODS, help="methods to train")
+    parser.add_argument("--seeds", type=int, default=5, help="number of seeds of runs that take less than ten minutes")
+    parser.add_argument("--table", action="store_true", help="print the table without training")
+    parser.add_argument("--workers", type=int, default=1, help="number of processes that record demonstrations")
     arguments = parser.parse_args()
     if not arguments.table:
         for method in arguments.only:
@@ -102,10 +103,14 @@ def main() -> None:
     print("| family | policy | runs | success (%) | collision (%) | SOC | median regret (%) |")
     print("|---|---|---|---|---|---|---|")
     for family in arguments.families:
-        names = [load_entrant(name) for name in entrants(family, arguments.runs)]
-        found = contest(names, [ScenarioBank.shipped(family, "test")])
-        for row in found.scores():
-            cells = [cell(getattr(row, name), *form).replace("\n", " ") for _, name, *form in COLUMNS if name in SHOWN]
+        policies = [load_policy_spec(name) for name in specs(family, arguments.runs)]
+        comparison = compare_policies(policies, [ScenarioBank.shipped(family, "test")])
+        for row in comparison.scores():
+            cells = [
+                cell(getattr(row, name), *form).replace("\n", " ")
+                for _, name, *form in COLUMNS
+                if name in SHOWN_COLUMNS
+            ]
             print(f"| {family} | {row.policy} | {row.runs} | {' | '.join(cells)} |", flush=True)
 
 

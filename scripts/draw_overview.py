@@ -1,4 +1,4 @@
-"""Draws the README's picture: a scenario, Leapfrog's sweeps, the optimum, a learned policy, and what policies score.
+"""Draw the overview figure of the README: Leapfrog's sweeps, the optimum and a learned policy; scores of policies.
 
 python scripts/draw_overview.py            # writes docs/images/overview.png
 """
@@ -11,15 +11,15 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from leapnav.envs import NavigateEnv, Scenario, ScenarioBank
-from leapnav.experts import Path as Guess
-from leapnav.experts import find_optimum, solve
-from leapnav.experts.feasible_path import dense_path
+from leapnav.envs.episodes import act_with, play_episode
+from leapnav.experts import Trajectory, find_optimum, solve
 from leapnav.experts.plotting import draw_robot, draw_scenario
+from leapnav.experts.solvers.feasible_path import dense_path
 from leapnav.training import load_policy, policy_environment
 
 PICTURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "overview.png"
 SWEEPS = (0, 16, 48, 96, 160)
-# Clutter's test split, from docs/results.md; the clone's is the mean of five.
+# SOC on the test split of clutter, from docs/results.md; for the clone the mean of five runs.
 SCORES = {
     "random": 0.0,
     "go-to-goal": 0.079,
@@ -28,56 +28,56 @@ SCORES = {
     "DAgger": 0.945,
     "optimum": 1.0,
 }
-INDEX = 150  # in clutter's test bank
-VIA = [(0.9, 6.3), (3.6, 5.7), (6.6, 6.6)]  # a first path round the obstacles that is far from the best
+INDEX = 150  # in the test bank of clutter
+VIA_POINTS = [(0.9, 6.3), (3.6, 5.7), (6.6, 6.6)]  # m, of an initial guess that is far from the optimum
 
 
-def first_path(scenario: Scenario) -> Guess:
-    """Straight from point to point, looking ahead."""
-    corners = np.array([scenario.start[:2], *VIA, scenario.goal[:2]])
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
-    at = np.linspace(0.0, way[-1], 65)
-    points = np.stack([np.interp(at, way, column) for column in corners.T], axis=1)
+def initial_guess(scenario: Scenario) -> Trajectory:
+    """Return straight lines through the via-points at constant speed, with headings along the path."""
+    corners = np.array([scenario.start[:2], *VIA_POINTS, scenario.goal[:2]])
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
+    distances = np.linspace(0.0, lengths[-1], 65)
+    points = np.stack([np.interp(distances, lengths, column) for column in corners.T], axis=1)
     headings = np.unwrap(np.arctan2(*np.gradient(points, axis=0).T[::-1]))
     headings[[0, -1]] = scenario.start[2], scenario.goal[2]
-    return Guess(np.linspace(0.0, scenario.horizon, 65), np.column_stack([points, np.unwrap(headings)]))
+    return Trajectory(np.linspace(0.0, scenario.horizon, 65), np.column_stack([points, np.unwrap(headings)]))
 
 
 def main() -> None:
-    """Draws it."""
+    """Draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=PICTURE)
+    parser.add_argument("--out", type=Path, default=PICTURE, help="output file")
     arguments = parser.parse_args()
     scenario = ScenarioBank.shipped("clutter", "test")[INDEX]
     optimum = find_optimum(scenario)
     figure = Figure(figsize=(11, 4.9), layout="constrained")
     plane, bars = figure.subplots(1, 2, width_ratios=(1.5, 1))
     draw_scenario(plane, scenario)
-    leap = solve(scenario, guess=first_path(scenario), polish=False)
-    rows = [row for row in leap.history if row.times is not None]
+    leapfrog = solve(scenario, guess=initial_guess(scenario), polish=False)
+    rows = [row for row in leapfrog.history if row.times is not None]
     shown = [k for k in SWEEPS if k < len(rows)]
     for k, color in zip(shown, colormaps["viridis_r"](np.linspace(0.1, 0.8, len(shown))), strict=True):
         times, nodes = rows[k].times, rows[k].nodes
         assert times is not None and nodes is not None
-        _, states = dense_path(leap.problem, times, nodes, 400)
+        _, states = dense_path(leapfrog.problem, times, nodes, 400)
         plane.plot(states[:, 0], states[:, 1], color=color, linewidth=1.2, label=f"Leapfrog, sweep {k}")
         plane.plot(nodes[:, 0], nodes[:, 1], ".", color=color, markersize=3)
     path = optimum.interpolate(np.linspace(0.0, scenario.horizon, 400))
     plane.plot(path[:, 0], path[:, 1], color="#d9730d", linewidth=2.5, label=f"optimum, J* = {optimum.cost:.3f}")
     env = NavigateEnv(scenario=scenario, **policy_environment("clutter"))
-    policy, poses, done = load_policy("clutter"), [scenario.start], False
-    observation, info = env.reset(seed=0)
-    while not done:
-        observation, _, done, _, info = env.step(policy.predict(observation, deterministic=True)[0])
+    _, info, steps = play_episode(env, act_with(load_policy("clutter")), seed=0)
+    poses = [scenario.start]
+    for step in steps:
+        info = step.info
         poses.append(info["pose"])
     driven = np.array(poses)
     label = f"learned policy, J = {info['cost']:.3f}"
     plane.plot(driven[:, 0], driven[:, 1], "--", color="#2662ab", linewidth=1.8, label=label)
-    for share in np.linspace(0.0, 1.0, 9):
-        pose = path[round(share * 399), :3]
+    for fraction in np.linspace(0.0, 1.0, 9):
+        pose = path[round(fraction * 399), :3]
         draw_robot(plane, pose, scenario.robot.radius, "#d9730d", alpha=0.5)
     plane.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)
-    plane.set_title("Feasible paths come down to the certified optimum", fontsize=10)
+    plane.set_title("Feasible paths converge to the certified optimum", fontsize=10)
     names = list(SCORES)
     colors = ["#b9bec6"] * (len(names) - 1) + ["#d9730d"]
     drawn = bars.barh(names, list(SCORES.values()), color=colors)

@@ -1,7 +1,7 @@
-"""Trains the policies that ship with leapnav, in training/pretrained, and scores them.
+"""Train and score the policies that are shipped with leapnav.
 
-python scripts/ship_policies.py                    # all of them, in runs/ship; what is finished there is not done again
-python scripts/ship_policies.py clutter all        # some
+python scripts/ship_policies.py                    # all policies, trained in runs/ship; skips finished runs
+python scripts/ship_policies.py clutter all        # only these
 """
 
 import argparse
@@ -10,38 +10,39 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from leapnav.envs.families import ALL, FAMILIES
+from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.training import DAggerRunConfig, evaluate, load_policy, policy_environment, save_policy, train_dagger
-from leapnav.training.policies import read_description
+from leapnav.training.policies.files import SHIPPED, read_description
 
-PRETRAINED = Path(__file__).resolve().parent.parent / "training" / "pretrained"
 NAMES = (*FAMILIES, ALL)
 
 
 def ship(name: str, runs: Path) -> None:
-    """Trains a family's policy, or goes on with it, and writes its actor in half precision."""
+    """Train the policy of a family, or resume its run; write the actor in half precision, and score it."""
     run = runs / name
     config = replace(DAggerRunConfig.tuned(name), out=run)
     train_dagger(replace(config, resume=(run / "config.json").exists()), workers=os.cpu_count() or 1)
-    folder = PRETRAINED / name
-    shutil.rmtree(folder, ignore_errors=True)
+    shipped = SHIPPED / name
+    shutil.rmtree(shipped, ignore_errors=True)
     training = read_description(run)["training"]
-    save_policy(load_policy(run), folder, policy_environment(run), training=training, half=True)
-    policy = load_policy(folder)
+    save_policy(load_policy(run), shipped, policy_environment(run), training=training, half=True)
+    policy = load_policy(shipped)
     for family in FAMILIES if name == ALL else (name,):
-        found = evaluate(policy, family, environment=policy_environment(folder))
-        print(f"{name} on {family}: success {found.success:.3f}, SOC {found.soc:.3f}, median regret {found.regret:.4f}")
+        score = evaluate(policy, family, environment=policy_environment(shipped))
+        print(f"{name} on {family}: success {score.success:.3f}, SOC {score.soc:.3f}, median regret {score.regret:.4f}")
 
 
 def main() -> None:
-    """Ships what is asked for."""
+    """Train the named policies."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(NAMES)}")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"policies to train ({', '.join(NAMES)}); by default all"
+    )
     parser.add_argument("--runs", type=Path, default=Path("runs/ship"))
     arguments = parser.parse_args()
     unknown = [name for name in arguments.names if name not in NAMES]
     if unknown:
-        parser.error(f"expected some of {', '.join(NAMES)}, got {unknown[0]!r}")
+        parser.error(f"NAME: expected one of {', '.join(NAMES)}, got {unknown[0]!r}")
     for name in arguments.names or NAMES:
         ship(name, arguments.runs)
 

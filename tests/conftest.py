@@ -4,24 +4,40 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
 
-# The same cases each time; HYPOTHESIS_PROFILE=long makes many new ones.
+# The default profile repeats the same examples; HYPOTHESIS_PROFILE=long generates many new ones.
 settings.register_profile("default", max_examples=40, deadline=None, derandomize=True)
 settings.register_profile("long", max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
+def shared_directory(tmp_path_factory, name, make):
+    """A directory that one test process makes and all use."""
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent  # common to all workers of a run
+    out = base / name
+    with FileLock(base / f"{name}.lock"):
+        if not out.exists():
+            partial = base / f"{name}.partial"
+            make(partial)
+            partial.rename(out)
+    return out
+
+
 @pytest.fixture(scope="session")
 def demonstrated(tmp_path_factory):
-    """A folder of demonstrations of the open family."""
-    from leapnav.experts.rollouts import rollout
+    """Directory with demonstrations of the open family."""
+    from leapnav.experts.data.rollouts import rollout
 
-    out = tmp_path_factory.mktemp("demonstrated") / "open"
-    rollout("open", 40, out, seed=300, recoveries=1, workers=2, progress=False)
-    return out
+    def make(out):
+        rollout("open", 40, out, seed=300, recoveries=1, workers=2, progress=False)
+
+    return shared_directory(tmp_path_factory, "demonstrated", make)
 
 
 @pytest.fixture(scope="session")
@@ -32,15 +48,26 @@ def dataset(demonstrated):
 
 
 @pytest.fixture(scope="session")
-def clone(dataset):
-    """A policy cloned from them, and the losses of its epochs."""
+def clone(dataset, tmp_path_factory):
+    """Policy cloned from the demonstrations, and the losses of its epochs."""
+    import torch as th
+
     from leapnav.envs import NavigateEnv
-    from leapnav.training import CloningConfig, behaviour_clone, make_policy
+    from leapnav.training import CloningConfig, EpochLoss, behaviour_clone, make_policy
 
     env = NavigateEnv("open")
     policy = make_policy(env.observation_space, env.action_space, seed=0)
-    config = CloningConfig(epochs=60, batch_size=256, patience=0)
-    return policy, behaviour_clone(policy, dataset, config, progress=False)
+
+    def make(out):
+        config = CloningConfig(epochs=60, batch_size=256, patience=0)
+        losses = behaviour_clone(policy, dataset, config, progress=False)
+        out.mkdir()
+        th.save({"policy": policy.state_dict(), "losses": [vars(loss) for loss in losses]}, out / "clone.pt")
+
+    state = th.load(shared_directory(tmp_path_factory, "clone", make) / "clone.pt", weights_only=True)
+    policy.load_state_dict(state["policy"])
+    policy.set_training_mode(False)
+    return policy, [EpochLoss(**loss) for loss in state["losses"]]
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What several tests share: the lists that general tests run over, and the stored reference data."""
+"""Helpers of several tests: problems and scenarios with known costs, and the stored reference data."""
 
 import json
 from pathlib import Path
@@ -7,24 +7,24 @@ import numpy as np
 import sympy as sp
 from scipy.integrate import solve_ivp
 
+from leapnav.cli import main
 from leapnav.envs import Scenario
-from leapnav.experts import ControlAffineSystem, OptimalControlProblem
-from leapnav.experts import Path as Guess
+from leapnav.experts import ControlAffineSystem, OptimalControlProblem, Trajectory
 from leapnav.training import CloningConfig, make_policy
 
 DATA = Path(__file__).parent / "data"
-QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)  # a fit that is not to be good
-SMALL = (32, 32)  # a network, too
+QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)  # a quick fit of low quality
+SMALL = (32, 32)  # hidden layers of a small network
 
 
 def best_known() -> list[tuple[Scenario, float]]:
-    """Scenarios with the best cost known for each."""
+    """Return scenarios with the best known cost of each."""
     entries = json.loads((DATA / "best_known.json").read_text())
     return [(Scenario.from_dict(entry["scenario"]), entry["best_known_cost"]) for entry in entries]
 
 
 def published_problems() -> dict[str, tuple[OptimalControlProblem, float, str]]:
-    """Published problems by name, with the known cost and the source (file: data/published_problems.json)."""
+    """Return published problems by name, with the known cost and the source (data/published_problems.json)."""
     problems = {}
     for entry in json.loads((DATA / "published_problems.json").read_text()):
         symbols = tuple(sp.Symbol(name) for name in entry["state"])
@@ -47,7 +47,7 @@ def published_problems() -> dict[str, tuple[OptimalControlProblem, float, str]]:
 
 
 def scenario_fields(**changes: object) -> dict:
-    """A valid scenario as its file has it, with some fields changed."""
+    """Return the fields of a valid scenario file, with some of them changed."""
     fields = {
         "name": "small",
         "arena": [0, 0, 10, 10],
@@ -65,20 +65,35 @@ def scenario_fields(**changes: object) -> dict:
 
 
 def shooting_guess(problem, costate):
-    """The path that the flow draws from an initial costate."""
+    """Return the path of the extremal flow from an initial costate."""
     n = problem.system.n
 
     def flow(_, z):
-        dz, empty = np.empty(2 * n), np.empty((2 * n, 0))
-        problem.arrays.flow(z, problem.arrays.data, problem.arrays.field, empty, dz, empty)
-        return dz
+        return problem.arrays.rates(z)
 
     times = np.linspace(0.0, problem.horizon, 65)
     start = np.concatenate([np.asarray(problem.start, dtype=float), costate])
     z = solve_ivp(flow, (0.0, problem.horizon), start, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12).y.T
-    return Guess(times, z[:, :n], z[:, n:])
+    return Trajectory(times, z[:, :n], z[:, n:])
 
 
 def fresh(env, seed=0, hidden=SMALL):
-    """A small policy that has learned nothing."""
+    """Return a small untrained policy."""
     return make_policy(env.observation_space, env.action_space, seed, hidden)
+
+
+def failing(arguments, capsys):
+    """Runs a command that must fail: its exit code and its one line on standard error."""
+    capsys.readouterr()
+    code = main([str(a) for a in arguments])
+    error = capsys.readouterr().err
+    (line,) = [line for line in error.splitlines(keepends=True) if not line.startswith("leapnav: compiling")]
+    assert "Traceback" not in line
+    return code, line
+
+
+class FastClock:
+    """A clock of pygame that does not wait."""
+
+    def tick(self, fps):
+        assert fps == 20

@@ -14,16 +14,27 @@ import pytest
 
 import leapnav
 from leapnav.envs import FAMILIES, BankError, ScenarioBank, sample_scenario
-from leapnav.envs.bank import SPLITS, VERSION, BankEntry, write_bank
-from leapnav.envs.obstacles import clearances
-from leapnav.experts import ExpertPolicy, Path, build_bank, find_optimum, solve
-from leapnav.experts.banks import Rejection, judge
+from leapnav.envs.scenarios.bank import SPLITS, VERSION, BankEntry, write_bank
+from leapnav.envs.shapes.clearance import clearances
+from leapnav.experts import ExpertPolicy, Trajectory, build_bank, find_optimum, solve
+from leapnav.experts.data.banks import Rejection, draw, judge
+from leapnav.experts.data.store import ResumableStore
 
 ID = "leapnav/Navigate-v0"
 
 
 def build(out, count=6, **changes):
     return build_bank("clutter", count, out, **{"seed": 3, "progress": False, **changes})
+
+
+def partial_build(out):
+    """The build directory of a bank that is not finished."""
+    settings = {"version": VERSION, "software": leapnav.__version__, "family": "clutter", "seed": 3}
+    return ResumableStore(out.with_name(f"{out.name}.build"), "bank", settings, BankError)
+
+
+def shards(directory):
+    return {path.name for path in directory.glob("shard-*.npz")}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +65,7 @@ def test_a_bank_holds_scenarios_with_their_optima(bank):
 def test_a_stored_optimum_is_a_guess_from_which_it_is_certified_again(bank):
     for index, scenario in enumerate(bank):
         reference = bank.reference(index)
-        guess = Path(reference.times, *(a.astype(float) for a in (reference.states, reference.costates)))
+        guess = Trajectory(reference.times, *(a.astype(float) for a in (reference.states, reference.costates)))
         extremal = solve(scenario, "multiple_shooting", guess=guess)
         assert extremal.success
         assert extremal.cost == pytest.approx(reference.cost, rel=1e-9)
@@ -72,7 +83,7 @@ def test_a_bank_is_a_sequence(bank):
 
 
 def test_other_programs_can_read_it(bank):
-    """By the module's own description, with nothing but an HDF5 reader."""
+    """Any HDF5 reader can read the format that the module describes."""
     with h5py.File(bank.path) as file:
         assert file.attrs["format"] == "leapnav-bank"
         assert file.attrs["version"] == 3
@@ -99,55 +110,48 @@ def test_a_bank_is_mapped_and_aligned_and_crosses_processes(bank):
 def test_neither_workers_nor_a_half_done_build_change_a_bit(bank, tmp_path):
     content = bank.path.read_bytes()
     assert build(tmp_path / "two.bank", workers=2).path.read_bytes() == content
-    # What a build leaves that is killed while it writes a line: whole lines, and half of one.
-    header = {"format": VERSION, "software": bank.software, "family": "clutter", "seed": 3}
-    from leapnav.experts.banks import draw
-
-    lines = [json.dumps(header), *(json.dumps(draw("clutter", 3, number)) for number in (4, 0, 2))]
-    half = json.dumps(draw("clutter", 3, 1))[:500]
-    (tmp_path / "half.bank.journal").write_text("\n".join([*lines, half]))
+    with partial_build(tmp_path / "half.bank") as store:
+        for number in (4, 0, 2):
+            store.write(number, draw(number, "clutter", 3))
+        # A process that is killed while it writes a file leaves a part of it.
+        (store.directory / ".shard-000001.npz.1.partial").write_bytes(store.path(0).read_bytes()[:500])
     assert build(tmp_path / "half.bank").path.read_bytes() == content
-    assert not (tmp_path / "half.bank.journal").exists()
+    assert not store.directory.exists()
 
 
 def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
-    whole = build(tmp_path / "whole.bank", count=40)
+    whole = build(tmp_path / "whole.bank", count=24)
     code = (
         "from leapnav.experts import build_bank\n"
         "if __name__ == '__main__':\n"
-        f"    build_bank('clutter', 40, {str(tmp_path / 'killed.bank')!r}, seed=3, workers=2, progress=False)\n"
+        f"    build_bank('clutter', 24, {str(tmp_path / 'killed.bank')!r}, seed=3, workers=2, progress=False)\n"
     )
-    script, journal = tmp_path / "build.py", tmp_path / "killed.bank.journal"
+    script, directory = tmp_path / "build.py", tmp_path / "killed.bank.build"
     script.write_text(code)
-    lines = 0
-    for more in (4, 13, 9):
+    finished: set[str] = set()
+    for more in (4, 7):
         process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
-        while (
-            process.poll() is None and len(journal.read_bytes().splitlines() if journal.exists() else []) < lines + more
-        ):
+        while process.poll() is None and len(shards(directory)) < len(finished) + more:
             time.sleep(0.01)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         assert not (tmp_path / "killed.bank").exists()
-        before, lines = lines, len(journal.read_bytes().splitlines())
-        assert lines >= before + more  # nothing noted was lost
-    assert build(tmp_path / "killed.bank", count=40).path.read_bytes() == whole.path.read_bytes()
+        before, finished = finished, shards(directory)
+        assert finished > before  # nothing finished was lost
+    assert build(tmp_path / "killed.bank", count=24).path.read_bytes() == whole.path.read_bytes()
 
 
 def test_two_builds_of_one_bank_do_not_get_in_each_other_s_way(tmp_path):
-    from leapnav.experts.banks import _Journal
-
-    header = {"format": VERSION, "software": leapnav.__version__, "family": "clutter", "seed": 3}
-    with _Journal(tmp_path / "x.bank.journal", header), pytest.raises(BankError, match="another process is building"):
+    with partial_build(tmp_path / "x.bank"), pytest.raises(BankError, match="another process"):
         build(tmp_path / "x.bank")
     assert len(build(tmp_path / "x.bank")) == 6
 
 
 def test_a_build_killed_between_its_last_two_steps_is_tidied_up(bank):
-    journal = bank.path.with_name("small.bank.journal")
-    journal.write_text("left")
+    with partial_build(bank.path) as store:
+        pass
     assert len(build(bank.path)) == 6
-    assert not journal.exists()
+    assert not store.directory.exists()
 
 
 def test_a_damaged_scenario_is_told_by_file_and_number(bank, tmp_path):
@@ -168,24 +172,19 @@ def test_what_is_complete_is_not_built_again_and_nothing_else_is_overwritten(ban
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("file", "content", "message"),
     [
-        ('{"format": 3, "software": "0", "family": "clutter", "seed": 3}\n', "of a build with software '0' instead"),
-        ("not a journal\n", "line 1 is no record of a build"),
-        ('{"draw": 1}\n', "line 1 is no record of a build"),
-        ("notes without an end of line", "line 1 is no record of a build"),
-        ("HEADER" + '{"draw": 0, "rejected": null}\n', "line 2 is no record of a build"),
-        ("HEADER" + '{"draw": 0}\n', "line 2 is no record of a build"),
+        ("bank.json", b'{"format": "leapnav-bank", "software": "0"}', "other settings: family is None, got 'clutter'"),
+        ("bank.json", b"not a manifest", "bank.json: damaged"),
+        ("shard-000000.npz", b"not a shard", "shard-000000.npz: damaged"),
     ],
 )
-def test_a_foreign_journal_is_refused_and_kept(content, message, tmp_path):
-    journal = tmp_path / "new.bank.journal"
-    header = {"format": VERSION, "software": leapnav.__version__, "family": "clutter", "seed": 3}
-    content = content.replace("HEADER", json.dumps(header) + "\n")
-    journal.write_text(content)
+def test_a_foreign_build_directory_is_refused_and_kept(file, content, message, tmp_path):
+    with partial_build(tmp_path / "new.bank") as store:
+        (store.directory / file).write_bytes(content)
     with pytest.raises(BankError, match=message):
         build(tmp_path / "new.bank")
-    assert journal.read_text() == content
+    assert (store.directory / file).read_bytes() == content
 
 
 @pytest.mark.parametrize(
@@ -226,12 +225,12 @@ def without_costs(path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda path: path.write_text("text"), "no scenario bank, or damaged"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-5000]), "no scenario bank, or damaged"),
-        (lambda path: path.write_bytes(b""), "no scenario bank, or damaged"),
+        (lambda path: path.write_text("text"), "not a scenario bank, or damaged"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-5000]), "not a scenario bank, or damaged"),
+        (lambda path: path.write_bytes(b""), "not a scenario bank, or damaged"),
         (with_attribute("version", 1), "version 1 of the format; this leapnav reads 3"),
-        (with_attribute("format", "other"), "an HDF5 file, but no scenario bank"),
-        (without_costs, "no scenario bank, or damaged: .*costs"),
+        (with_attribute("format", "other"), "an HDF5 file, but not a scenario bank"),
+        (without_costs, "not a scenario bank, or damaged: .*costs"),
     ],
 )
 def test_what_is_no_bank_is_told_by_name(bank, change, message, tmp_path):
@@ -275,7 +274,7 @@ def test_only_certified_optima_beyond_doubt_are_admitted():
 
     failed = replace(optimum, status=Status.STALLED)
     assert judge(failed) is Rejection.NO_OPTIMUM
-    assert judge(replace(optimum, doubts=(replace(optimum, status=Status.COLLISION),))) is Rejection.TOUCHING
+    assert judge(replace(optimum, doubts=(replace(optimum, status=Status.COLLISION),))) is Rejection.COLLISION
     assert judge(replace(optimum, doubts=(failed,))) is Rejection.UNRESOLVED
 
 
@@ -286,7 +285,7 @@ def test_a_cheaper_path_through_an_obstacle_s_edge_is_a_doubt():
     assert len(missing) == sum(bank.rejected.values())
     scenario = sample_scenario("polygons", np.random.default_rng([bank.seed, missing[0]]))
     optimum = find_optimum(scenario)
-    assert judge(optimum) is Rejection.TOUCHING
+    assert judge(optimum) is Rejection.COLLISION
     doubt = optimum.doubts[0]
     assert doubt.cost < optimum.cost
     assert -0.1 <= doubt.certificate.clearance <= 0

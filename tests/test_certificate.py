@@ -8,7 +8,7 @@ from helpers import best_known, published_problems, shooting_guess
 from scipy.integrate import cumulative_simpson
 
 from leapnav.envs import Scenario
-from leapnav.envs.obstacles import clearances
+from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import (
     ControlAffineSystem,
     OptimalControlProblem,
@@ -18,7 +18,7 @@ from leapnav.experts import (
     solve,
     verify,
 )
-from leapnav.experts.methods import METHODS
+from leapnav.experts.solve import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
@@ -75,7 +75,7 @@ def test_a_focal_point_of_free_end_components_is_no_success():
 
 
 def test_an_obstacle_between_two_integrator_steps_is_seen():
-    # The flow does not feel this disc, so the integrator's steps are decimetres long.
+    # Without a proximity cost the flow does not depend on this disc, so the integrator's steps are decimetres long.
     fields = {
         **SCENARIOS["clutter-0"][0].to_dict(),
         "robot": {"model": "unicycle", "radius": 0.01, "max_speed": 2.0, "max_turn_rate": 3.0},
@@ -92,7 +92,7 @@ def test_an_obstacle_between_two_integrator_steps_is_seen():
 
 
 def test_a_clearance_between_the_nodes_is_seen():
-    """The certificate looks at the dense path: its clearance is that of a thousand points, not of the nodes."""
+    """The clearance of the certificate is that of the interpolated path, not of the nodes."""
     extremal = find_optimum(SCENARIOS["slalom-4"][0])
     states = extremal.evaluate(np.linspace(0, extremal.problem.horizon, 20_000))[0]
     dense = clearances(np.ascontiguousarray(states), extremal.problem.field).min()
@@ -103,7 +103,7 @@ def test_a_clearance_between_the_nodes_is_seen():
 def test_the_costate_is_the_gradient_of_the_optimal_cost(name):
     scenario, _ = SCENARIOS[name]
     reference = find_optimum(scenario)
-    h = 2e-5  # third derivatives are large near an obstacle
+    h = 2e-5  # third derivatives are large close to an obstacle
 
     def cost(**changes):
         fields = scenario.to_dict()
@@ -149,7 +149,7 @@ def test_a_wrong_solution_is_not_certified():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_conjugate_point_of_even_multiplicity_is_seen(method):
-    # Two oscillators alike: det dq(t)/dlambda(0) is a square, and touches zero without a change of sign.
+    # Two identical oscillators: det dq(t)/dlambda(0) is a square, and vanishes without a change of sign.
     x, y = sp.symbols("x y")
     system = ControlAffineSystem(state=(x, y), drift=(0, 0), fields=((1, 0), (0, 1)))
     for goal, horizon, first in (
@@ -170,7 +170,7 @@ def test_a_conjugate_point_of_even_multiplicity_is_seen(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("horizon", [4.0, 7.0, 13.0])
 def test_an_extremal_at_rest_hides_no_conjugate_point(horizon, method):
-    # The integrator could take the whole horizon in one step if it looked at the extremal alone.
+    # The integrator would take the whole horizon in one step if it controlled the error of the extremal alone.
     x = sp.Symbol("x")
     system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
     problem = OptimalControlProblem(system, (0,), (0,), horizon, (1.0,), state_cost=-(x**2) / 2)

@@ -9,14 +9,14 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.envs import sample_scenario
 from leapnav.training import CloningConfig, Dataset, behaviour_clone, evaluate, network
-from leapnav.training.actors import copy_actor, mean_action
-from leapnav.training.cloning import Cloning
+from leapnav.training.learning.cloning import Cloning
+from leapnav.training.policies.actors import copy_actor, mean_action
 
 
 def test_cloning_learns(clone, env):
     policy, losses = clone
     assert losses[-1].training < 0.1 * losses[0].training
-    assert losses[-1].validation < 0.3  # of what the mean action loses
+    assert losses[-1].validation < 0.3  # relative to the loss of the mean action
     learned = evaluate(policy, "open", count=20, timed=False, progress=False)
     before = evaluate(fresh(env), "open", count=20, timed=False, progress=False)
     assert np.mean([e.episode_return for e in learned]) > np.mean([e.episode_return for e in before]) + 10
@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_weights(dataset, env):
         policy = fresh(env, seed=3)
         behaviour_clone(policy, dataset[:2000], QUICK, progress=False)
         weights.append(policy.parameters_to_vector())
-        th.rand(5)  # the global generator plays no part
+        th.rand(5)  # the global generator has no effect
     assert weights[0].tobytes() == weights[1].tobytes()
 
 
@@ -63,14 +63,14 @@ def test_making_and_cloning_leave_the_global_generators_alone(dataset, env):
 
 
 def test_no_course_is_in_both_training_and_validation(dataset):
-    from leapnav.training.cloning import _split
+    from leapnav.training.learning.cloning import _split
 
     train, held_out = _split(dataset, 0.25, 0)
     assert train.sum() + held_out.sum() == len(dataset)
     assert held_out.any()
     courses = np.array(dataset.course_texts)[dataset.episodes]
     assert not set(courses[train]) & set(courses[held_out])
-    # Of fewer courses those are held out that were before, but for the share's rounding.
+    # With fewer courses the same ones are held out, except for the rounding of the fraction.
     fewer = dataset.episodes < 60
     again = _split(dataset[fewer], 0.25, 0)[1]
     assert len(set(courses[fewer][again]) - set(courses[held_out])) <= 3
@@ -78,7 +78,7 @@ def test_no_course_is_in_both_training_and_validation(dataset):
 
 def test_cloning_stops_early_and_keeps_the_best_epoch(dataset, env):
     policy = fresh(env)
-    # A learning rate at which the loss soon rises.
+    # With this learning rate the loss soon increases.
     config = CloningConfig(epochs=50, patience=2, batch_size=64, learning_rate=0.05, validation_share=0.3)
     fit = Cloning(policy, dataset[:1500], config)
     while not fit.finished:
@@ -87,17 +87,18 @@ def test_cloning_stops_early_and_keeps_the_best_epoch(dataset, env):
     assert len(validation) < 50
     assert min(validation[:-2]) <= min(validation[-2:])
     fit.finish()
-    assert fit._validation() == pytest.approx(min(validation), rel=1e-5)
+    assert fit._validation_loss() == pytest.approx(min(validation), rel=1e-5)
 
 
-def test_a_fit_that_was_put_aside_goes_on_to_the_same_bits(dataset, env):
+def test_a_resumed_fit_has_the_same_bits_as_an_uninterrupted_one(dataset, env, tmp_path):
     config = CloningConfig(epochs=4, batch_size=256)
     straight, first, second = fresh(env), fresh(env), fresh(env, seed=9)
     behaviour_clone(straight, dataset, config, progress=False)
     begun = Cloning(first, dataset, config)
     begun.run_epoch()
     begun.run_epoch()
-    state, weights = begun.state_dict(), first.state_dict()
+    th.save((begun.state_dict(), first.state_dict()), tmp_path / "fit.pt")
+    state, weights = th.load(tmp_path / "fit.pt", weights_only=True)
     resumed = Cloning(second, dataset, config)
     second.load_state_dict(weights)
     resumed.load_state_dict(state)
@@ -108,8 +109,8 @@ def test_a_fit_that_was_put_aside_goes_on_to_the_same_bits(dataset, env):
 
 
 def test_the_hamiltonian_loss_is_what_an_error_costs():
-    """H(q, lambda, u) - H(q, lambda, u*), written out, for optima inside the robot's limits and on them."""
-    from leapnav.training.cloning import _hamiltonian_loss, action_slopes
+    """The loss equals H(q, lambda, u) - H(q, lambda, u*) for optima inside the robot's limits and at them."""
+    from leapnav.training.learning.cloning import _hamiltonian_loss, action_slopes
 
     rng = np.random.default_rng(0)
     count, limits, weights = 200, np.array([2.0, 3.0]), np.array([1.0, 0.5])
@@ -154,7 +155,7 @@ def test_ppo_can_go_on_from_a_clone(clone, env):
     with pytest.raises(ValueError, match="its network has the shapes"):
         copy_actor(clone[0], fresh(env))
     squashing = SAC("MlpPolicy", env, policy_kwargs=network(), device="cpu")
-    with pytest.raises(ValueError, match="which squashes its actions or does not"):
+    with pytest.raises(ValueError, match="expected the same squashing of the actions"):
         copy_actor(clone[0], squashing.policy)
 
 
@@ -163,6 +164,17 @@ def test_the_target_actor_of_td3_is_cloned_too(dataset, env):
     behaviour_clone(model, dataset, QUICK, progress=False)
     target = model.actor_target.state_dict()
     assert all(th.equal(value, target[name]) for name, value in model.actor.state_dict().items())
+
+
+def test_the_learning_rate_rises_linearly_and_falls_along_a_cosine():
+    from leapnav.training.learning.cloning import WARM_UP_STEPS, warm_up_and_cosine
+
+    total = 10 * WARM_UP_STEPS
+    factor = warm_up_and_cosine(total)
+    assert factor(0) == 1 / WARM_UP_STEPS
+    assert factor(WARM_UP_STEPS - 1) == pytest.approx(1.0, abs=0.03)
+    assert factor(total // 2) == pytest.approx(0.5)
+    assert factor(total) == 0.0
 
 
 def test_a_fit_that_diverges_says_so(dataset, env):
@@ -182,7 +194,7 @@ def test_a_fit_that_diverges_says_so(dataset, env):
         ({"learning_rate": math.inf}, "learning_rate: .*inf"),
         ({"seed": 10**20}, "seed: "),
         ({"patience": -1}, "patience: .*-1"),
-        ({"loss": "l3"}, "loss: expected action or hamiltonian, got 'l3'"),
+        ({"loss": "l3"}, "loss: expected one of action, hamiltonian, got 'l3'"),
     ],
 )
 def test_bad_settings_are_named(settings, message, dataset, env):

@@ -14,8 +14,8 @@ from leapnav.experts import (
     find_optimum,
     solve,
 )
-from leapnav.experts.homotopy import blend
-from leapnav.experts.methods import METHODS
+from leapnav.experts.continuation import blend
+from leapnav.experts.solve import METHODS
 
 SCENARIO = {s.name: s for s, _ in best_known()}["clutter-5"]
 
@@ -89,7 +89,7 @@ def test_problems_that_cannot_be_blended_are_named():
     problem = pendulum(2.0)
     with pytest.raises(ValueError, match="differ in their system"):
         continuation([problem, published_problems()["grushin"][0]])
-    with pytest.raises(ValueError, match="only one has control bounds"):
+    with pytest.raises(ValueError, match="only one of two successive problems has control bounds"):
         continuation([problem, pendulum(2.0, bound=1.0)])
     fewer = SCENARIO.model_copy(update={"obstacles": SCENARIO.obstacles[1:]})
     with pytest.raises(ValueError, match="the same kinds of obstacles"):

@@ -3,19 +3,19 @@ import pytest
 from helpers import QUICK, fresh
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
-from leapnav.envs.settings import Settings
+from leapnav.envs.settings import EnvironmentSettings
 from leapnav.experts import ExpertPolicy
 from leapnav.training import DAgger, DAggerConfig, Dataset, behaviour_clone, make_vec_env
-from leapnav.training.dagger import _Episode, _label, _takeovers
-from leapnav.training.rewards import ScaledReward
+from leapnav.training.learning.dagger import _Episode, _label, _takeovers
+from leapnav.training.robots.rewards import ScaledReward
 
 
 def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tmp_path):
-    """The samples are the optimum's from states of the learner, with value and costate; rounds are kept on disk."""
+    """The samples are those of the optimum from states of the learner; rounds are stored on disk."""
     policy = fresh(env)
     behaviour_clone(policy, dataset, QUICK, progress=False)
     venv = make_vec_env(n_envs=4, family="open", split="fresh")
-    config = DAggerConfig(rounds=2, failures=4, lead=1.0)
+    config = DAggerConfig(rounds=2, max_failures=4, lead=1.0)
     dagger = DAgger(
         policy,
         ExpertPolicy(venv, quick=True),
@@ -66,22 +66,22 @@ def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
 
 
 def test_where_the_expert_cannot_save_an_episode_it_takes_over_no_later():
-    """The scenarios of an episode after the first one without an optimum are not tried."""
+    """Takeovers after the first one without an optimum are skipped."""
     solvable = sample_scenario("open", 7)
     hopeless = solvable.model_copy(update={"horizon": 1.0})
-    settings = Settings()
+    settings = EnvironmentSettings()
     found = _label(settings, {"quick": True}, [[solvable, hopeless, solvable], [solvable]], 0.5)
     assert [len(part) for part in found] == [10, 10]
     assert _label(settings, {"quick": True}, [[hopeless, solvable]], 0.5) == []
 
 
 def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, monkeypatch):
-    monkeypatch.setattr("leapnav.training.dagger.PORTION", 1)
+    monkeypatch.setattr("leapnav.training.learning.dagger.EPISODES_PER_TASK", 1)
     found = []
     for workers in (1, 1, 2):
         policy = fresh(env)
         venv = make_vec_env(n_envs=2, family="open", split="fresh")
-        config = DAggerConfig(rounds=1, episodes=3, lead=0.5, seed=4)
+        config = DAggerConfig(rounds=1, max_episodes=3, lead=0.5, seed=4)
         dagger = DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK, workers=workers)
         dagger.run(progress=False)
         found.append((policy.parameters_to_vector().tobytes(), dagger.dataset.observations.tobytes()))
@@ -91,7 +91,7 @@ def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, mo
 
 
 @pytest.mark.parametrize(
-    "settings", [{"rounds": 0}, {"failures": 0}, {"successes": -1.0}, {"learning_rate": -1.0}, {"lead": 0.0}]
+    "settings", [{"rounds": 0}, {"max_failures": 0}, {"successes": -1.0}, {"learning_rate": -1.0}, {"lead": 0.0}]
 )
 def test_bad_settings_of_dagger_are_named(settings, env, dataset):
     venv = make_vec_env(n_envs=1, family="open", split="fresh")
@@ -99,12 +99,12 @@ def test_bad_settings_of_dagger_are_named(settings, env, dataset):
         DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(**settings))
     with pytest.raises(ValueError, match="expert: expected one for venv"):
         DAgger(fresh(env), ExpertPolicy(make_vec_env(n_envs=1, family="open")), venv)
-    for arguments, name in (({"disturbance": 0.1}, "disturbed"), ({"actuation": "motor"}, "motors")):
+    for arguments, name in (({"disturbance": 0.1}, "disturbances"), ({"actuation": "motor"}, "motors")):
         robots = make_vec_env(n_envs=1, family="open", split="fresh", **arguments)
-        with pytest.raises(ValueError, match=f"venv: DAgger needs robots that are not {name}"):
+        with pytest.raises(ValueError, match=f"venv: expected an environment without {name}"):
             DAgger(fresh(env), ExpertPolicy(robots), robots)
     shaped = make_vec_env(n_envs=1, family="open", split="fresh", reward="shaped")
-    with pytest.raises(ValueError, match="dataset: reward: expected that of the robots, 'shaped', got 'cost'"):
+    with pytest.raises(ValueError, match="dataset: reward: expected that of the environment, 'shaped', got 'cost'"):
         DAgger(fresh(env), ExpertPolicy(shaped), shaped, dataset=dataset)
     with pytest.raises(TypeError, match="venv: expected one from"):
         DAgger(fresh(env), ExpertPolicy(venv), ScaledReward(venv, 2.0))

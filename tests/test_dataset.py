@@ -8,10 +8,10 @@ import torch as th
 from helpers import QUICK, fresh
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
-from leapnav.envs.settings import Settings
-from leapnav.experts.demonstrations import load_demonstrations
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.experts.data.demonstrations import load_demonstrations
 from leapnav.training import Dataset, behaviour_clone
-from leapnav.training.symmetries import mirror, turn_round
+from leapnav.training.learning.symmetries import mirror, time_reverse
 
 
 def test_a_dataset_is_the_same_from_a_folder_and_from_demonstrations(demonstrated, dataset):
@@ -38,7 +38,7 @@ def test_datasets_are_joined_saved_and_loaded(dataset, tmp_path):
     np.testing.assert_array_equal(loaded.costates, joined.costates)
     assert loaded.scenarios == joined.scenarios
     (tmp_path / "part.npz").write_bytes((tmp_path / "part.npz").read_bytes()[:5000])
-    with pytest.raises(ValueError, match=r"part\.npz: not a dataset's file"):
+    with pytest.raises(ValueError, match=r"part\.npz: not a dataset file"):
         Dataset.load(tmp_path / "part.npz")
 
 
@@ -55,23 +55,23 @@ def test_datasets_that_cannot_be_learned_from_are_refused(demonstrated, dataset,
     content = json.loads(metadata.read_text())
     content["env_spec"] = content["env_spec"].replace("Navigate-v0", "Navigate-v1")
     metadata.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"a dataset of leapnav/Navigate-v1; leapnav learns from leapnav/Navigate-v0"):
+    with pytest.raises(ValueError, match="expected a dataset of leapnav/Navigate-v0, got one of leapnav/Navigate-v1"):
         Dataset.of(other)
     fewer = gym.make("leapnav/Navigate-v0", lidar_beams=16)
     with pytest.raises(ValueError, match="its observations have 41 numbers, the policy's 25"):
         behaviour_clone(fresh(fewer), dataset, QUICK, progress=False)
 
 
-def test_mirroring_and_turning_round_are_symmetries_of_the_environment():
+def test_mirroring_and_time_reversal_are_symmetries_of_the_environment():
     fields = sample_scenario("clutter", 5).to_dict()
 
     def mirrored(pose):
         return [10.0 - pose[0], pose[1], math.pi - pose[2]]
 
-    def turned(pose):
+    def rotated(pose):
         return [pose[0], pose[1], pose[2] + math.pi]
 
-    twins = {
+    transformed = {
         mirror: {
             **fields,
             "start": mirrored(fields["start"]),
@@ -81,40 +81,40 @@ def test_mirroring_and_turning_round_are_symmetries_of_the_environment():
                 for o in fields["obstacles"]
             ],
         },
-        turn_round: {**fields, "start": turned(fields["start"]), "goal": turned(fields["goal"])},
+        time_reverse: {**fields, "start": rotated(fields["start"]), "goal": rotated(fields["goal"])},
     }
-    for transform, twin_fields in twins.items():
+    for transform, other_fields in transformed.items():
         env = NavigateEnv(scenario=Scenario.from_dict(fields))
-        twin = NavigateEnv(scenario=Scenario.from_dict(twin_fields))
-        observation, twin_observation = env.reset()[0], twin.reset()[0]
+        other = NavigateEnv(scenario=Scenario.from_dict(other_fields))
+        observation, other_observation = env.reset()[0], other.reset()[0]
         for step in range(20):
             action = np.array([0.2, 0.3 * math.cos(step)], np.float32)
             inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None])
-            assert inputs[0].numpy() == pytest.approx(twin_observation, abs=1e-4)
+            assert inputs[0].numpy() == pytest.approx(other_observation, abs=1e-4)
             observation, reward, *_ = env.step(action)
-            twin_observation, twin_reward, *_ = twin.step(targets[0].numpy())
-            assert twin_reward == pytest.approx(reward, rel=1e-6)
+            other_observation, other_reward, *_ = other.step(targets[0].numpy())
+            assert other_reward == pytest.approx(reward, rel=1e-6)
 
 
-def test_an_odd_number_of_beams_cannot_be_turned_round():
+def test_time_reversal_needs_an_even_number_of_beams():
     with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
-        turn_round(th.zeros(1, 12), th.zeros(1, 2))
+        time_reverse(th.zeros(1, 12), th.zeros(1, 2))
 
 
 def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):
-    """What another lidar would have shown at the demonstrations' states; files keep which it was."""
+    """Observations can be computed for another lidar; the file contains its settings."""
     found = Dataset.of(demonstrated)
-    seen = found.observed(Settings(lidar_beams=64))
+    seen = found.observed(EnvironmentSettings(lidar_beams=64))
     assert seen.observations.shape == (len(found), 9 + 64)
-    # Every other of 64 beams is one of the 32.
+    # Every second of the 64 beams is one of the 32.
     assert seen.observations[:, 9::2] == pytest.approx(found.observations[:, 9:], abs=1e-4)
     assert seen.observations[:, :9] == pytest.approx(found.observations[:, :9], abs=1e-4)
     assert found.observed(found.settings) is found
     seen.save(tmp_path / "seen.npz")
-    assert Dataset.load(tmp_path / "seen.npz").settings == Settings(lidar_beams=64)
-    # What the samples are samples of does not change with what is seen.
-    assert found.observed(Settings(reward="shaped", control_period=0.2)) is found
-    with pytest.raises(ValueError, match="actuation: the samples are of 'velocity', got 'motor'"):
-        found.observed(Settings(actuation="motor"))
+    assert Dataset.load(tmp_path / "seen.npz").settings == EnvironmentSettings(lidar_beams=64)
+    # Settings that do not belong to the sensors are ignored.
+    assert found.observed(EnvironmentSettings(reward="shaped", control_period=0.2)) is found
+    with pytest.raises(ValueError, match="actuation: expected that of the samples, 'velocity', got 'motor'"):
+        found.observed(EnvironmentSettings(actuation="motor"))
     with pytest.raises(ValueError, match="datasets: lidar_beams: expected the same for all, got 32 and 64"):
         Dataset.joined([found, seen])

@@ -3,9 +3,9 @@ import pytest
 
 from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank, sample_scenario
 from leapnav.experts import ExpertPolicy, NoOptimumError, find_optimum
-from leapnav.experts.demonstrations import dataset_id, demonstrate, load_demonstrations, open_dataset
-from leapnav.experts.policy import plan_actions
-from leapnav.experts.rollouts import rollout
+from leapnav.experts.acting.policy import plan_actions
+from leapnav.experts.data.demonstrations import dataset_id, demonstrate, load_demonstrations, open_dataset
+from leapnav.experts.data.rollouts import rollout
 
 
 @pytest.fixture(scope="module")

@@ -3,29 +3,34 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Scenario
-from leapnav.experts import Path, find_optimum
-from leapnav.experts.direct import descend, discretise, optimise
-from leapnav.experts.lattice import Lattice
-from leapnav.experts.problem import OptimalControlProblem
+from leapnav.experts import OptimalControlProblem, Trajectory, find_optimum
+from leapnav.experts.numerics.flow import EndCondition
+from leapnav.experts.search.candidates import CandidateSearch
+from leapnav.experts.search.descent import descend
+from leapnav.experts.search.direct import discretise, optimise
+from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.transcription import DiscreteProblem
 
 BEST_KNOWN = best_known()
 
 
 def first_candidate(scenario):
-    candidate = next(Lattice(scenario).candidates())
-    path = Path(candidate.times, candidate.poses)
+    candidate = next(CandidateSearch(Lattice(scenario)).candidates())
+    path = Trajectory(candidate.times, candidate.poses)
     return OptimalControlProblem.from_scenario(scenario).with_winding_of(path.states), path
 
 
 @pytest.mark.parametrize("scenario", [s for s, _ in BEST_KNOWN[::6]], ids=lambda s: s.name)
 def test_it_converges_to_the_extremal_with_order_two(scenario):
     optimum = find_optimum(scenario)
-    path = Path(np.linspace(0.0, scenario.horizon, 65), optimum.evaluate(np.linspace(0.0, scenario.horizon, 65))[0])
+    path = Trajectory(
+        np.linspace(0.0, scenario.horizon, 65), optimum.evaluate(np.linspace(0.0, scenario.horizon, 65))[0]
+    )
     direct = optimise(optimum.problem, discretise(path))
     errors = []
     for _ in range(4):
         assert direct.converged
-        assert direct.gap < 1e-4
+        assert direct.violation < 1e-4
         errors.append(abs(direct.cost - optimum.cost))
         direct = optimise(optimum.problem, direct.refined())
     assert errors[-1] < 1e-4 * optimum.cost
@@ -61,7 +66,7 @@ def test_controls_stay_within_the_robot_s_limits():
     assert direct.converged
     assert np.abs(direct.controls[:, 0]).max() == pytest.approx(1.3)
     assert np.abs(direct.controls[:, 1]).max() <= 0.8
-    assert direct.gap < 1e-4
+    assert direct.violation < 1e-4
 
 
 def test_a_free_goal_heading_has_no_costate_at_the_end():
@@ -94,8 +99,13 @@ def test_what_cannot_be_solved_is_not_called_converged():
     limits.flags.writeable = False
     states = np.linspace([2.0, 5.0, 0.0], [5.0, 5.0, 0.0], 33)
     controls, costates = np.full((32, 2), [2.0, 0.0]), np.zeros((33, 3))
-    converged, _, gap = descend(
-        np.full(32, 1 / 32), states, controls, costates, np.array([5.0, 5.0, 0.0]), np.zeros(3, bool), 0.5, 1.0,
-        limits, field, 1e-3, 40,
-    )  # fmt: skip
-    assert not converged or gap > 0.5
+    problem = DiscreteProblem(
+        h=np.full(32, 1 / 32),
+        end=EndCondition(goal=np.array([5.0, 5.0, 0.0]), free=np.zeros(3, bool)),
+        turn_weight=0.5,
+        unit=1.0,
+        limits=limits,
+        field=field,
+    )
+    converged, _, violation = descend(problem, states, controls, costates, 1e-3, 40)
+    assert not converged or violation > 0.5

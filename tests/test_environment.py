@@ -11,8 +11,8 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import leapnav  # noqa: F401 (registers)
 from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
-from leapnav.envs.observations import GOAL_ENTRIES
-from leapnav.envs.obstacles import clearance, clearances
+from leapnav.envs.shapes.clearance import clearance, clearances
+from leapnav.envs.simulation.observations import GOAL_ENTRIES
 
 ID = "leapnav/Navigate-v0"
 EMPTY = {"start": [5.0, 5.0, 0.3], "goal": [6.0, 5.0, 0.0], "obstacles": []}
@@ -56,11 +56,11 @@ def test_the_same_seed_gives_the_same_episode_bit_for_bit():
 
 
 def test_an_episode_does_not_depend_on_those_before_it():
-    fresh = gym.make(ID)
-    used = gym.make(ID, terminate_on_collision=False)
+    fresh, used = (gym.make(ID, terminate_on_collision=False) for _ in range(2))
     task = sample_scenario("clutter", 3)
-    play(used, [np.array([1.0, 0.1], np.float32)] * 200, seed=1)  # runs into something
-    used.unwrapped.terminate_on_collision = True
+    used.reset(seed=1)
+    collided = [used.step(np.array([1.0, 0.1], np.float32))[4]["collision"] for _ in range(200)]
+    assert collided[-1]  # the earlier episode has contacts
     for one, other in zip(
         play(fresh, actions(300), options={"scenario": task}),
         play(used, actions(300), options={"scenario": task}),

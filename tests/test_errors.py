@@ -1,7 +1,7 @@
-"""What is said to bad input, in two tables: the input, and below it the line that comes of it. Nothing is written.
+"""Error messages of invalid input, from two tables of an input and, below it, its message. No file is written.
 
-`data/errors_on_the_command_line.txt` has words for `leapnav`, `data/errors_in_python.txt` expressions, whose names are
-the public ones and those of `names` below.
+`data/errors_on_the_command_line.txt` contains arguments of `leapnav`; `data/errors_in_python.txt` contains expressions,
+whose names are the public ones and those of the fixture `names`.
 """
 
 import json
@@ -22,10 +22,16 @@ import leapnav.experts
 import leapnav.training
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
-from leapnav.envs.settings import Settings
-from leapnav.experts import ControlAffineSystem, ExpertPolicy, OptimalControlProblem, find_optimum, solve, unicycle
-from leapnav.experts import Path as Guess
-from leapnav.experts.rollouts import rollout
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.experts import (
+    ControlAffineSystem,
+    ExpertPolicy,
+    OptimalControlProblem,
+    find_optimum,
+    rollout,
+    solve,
+    unicycle,
+)
 from leapnav.training import Dataset, evaluate, make_policy, make_vec_env
 
 BANK = ScenarioBank.shipped("open", "test")
@@ -59,14 +65,14 @@ FILES = {
 
 
 def rows(name):
-    """Pairs of an input and what comes of it."""
+    """Pairs of an input and its message."""
     lines = (DATA / name).read_text().splitlines()
-    return [pytest.param(text, found.strip(), id=text) for text, found in zip(lines[::2], lines[1::2], strict=True)]
+    return [pytest.param(text, message.strip(), id=text) for text, message in zip(lines[::2], lines[1::2], strict=True)]
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with files of all kinds, and in the end still those alone."""
+    """A directory with valid and invalid files; no test may add or remove any."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "data").mkdir()
@@ -89,12 +95,13 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("words", "line"), rows("errors_on_the_command_line.txt"))
 def test_the_line_that_is_printed(words, line, folder, capsys):
     assert main(words.split()) == 2
-    assert capsys.readouterr().err == f"leapnav: {line.replace('{folder}', str(folder))}\n"
+    lines = [text for text in capsys.readouterr().err.splitlines() if not text.startswith("leapnav: compiling")]
+    assert lines == [f"leapnav: {line.replace('{folder}', str(folder))}"]
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory):
-    """What the expressions speak of."""
+    """The names in the expressions."""
     public = {
         name: getattr(package, name)
         for package in (leapnav.envs, leapnav.experts, leapnav.training)
@@ -120,8 +127,7 @@ def names(tmp_path_factory):
     motors = make_vec_env(n_envs=2, seed=0, family="open", split="fresh", actuation="motor")
     return {
         **public,
-        "Path": Guess,
-        "Settings": Settings,
+        "EnvironmentSettings": EnvironmentSettings,
         "replace": replace,
         "rollout": rollout,
         "nan": math.nan,
@@ -161,6 +167,6 @@ def names(tmp_path_factory):
 
 @pytest.mark.parametrize(("expression", "line"), rows("errors_in_python.txt"))
 def test_the_exception_that_is_raised(expression, line, folder, names):
-    with pytest.raises(Exception) as raised:  # noqa: PT011 (which one, and what it says, is below)
+    with pytest.raises(Exception) as raised:  # noqa: PT011 (type and message are checked below)
         eval(expression, dict(names))
     assert f"{raised.type.__name__}: {raised.value}" == line.replace("{folder}", str(folder))

@@ -7,7 +7,7 @@ from stable_baselines3 import PPO
 
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
 from leapnav.experts import ExpertPolicy, find_optimum
-from leapnav.experts.policy import plan_actions
+from leapnav.experts.acting.policy import plan_actions
 from leapnav.training import (
     Episode,
     Evaluation,
@@ -20,13 +20,13 @@ from leapnav.training import (
     save_policy,
     score,
 )
-from leapnav.training.contest import contest
-from leapnav.training.entrants import grouped, load_entrant, make_entrant
-from leapnav.training.reports import extremes, plot_episodes, plot_scores, print_scores, write_scores
+from leapnav.training.scoring.comparison import compare_policies
+from leapnav.training.scoring.policy_specs import group_by_row, load_policy_spec, make_policy_from_spec
+from leapnav.training.scoring.reports import extremes, plot_episodes, plot_scores, print_scores, write_scores
 
 
 class Planned:
-    """Drives the banks' optima, with another speed."""
+    """Drives the optima of the bank, with the speed multiplied by a factor."""
 
     def __init__(self, env, factor):
         self.env, self.factor, self.step = env.unwrapped, factor, 0
@@ -71,7 +71,7 @@ def test_going_to_the_goal_suffices_where_nothing_is_in_the_way():
 
 
 def test_the_episodes_are_those_of_the_single_environment():
-    """One by one, in the environment that users have, the same policy does the same."""
+    """The same policy has the same episodes in the single environment."""
     env = NavigateEnv("open", split="test")
     policy = make_policy(env.observation_space, env.action_space, 0, (16,))
     found = evaluate(policy, "open", count=5, timed=False, progress=False)
@@ -100,7 +100,7 @@ def test_evaluation_is_deterministic():
 
 
 def test_regret_is_measured_against_the_pose_that_was_reached():
-    """A policy that stops a little short saves cost; the optimum to where it stopped does too."""
+    """A policy that stops before the goal has a lower cost than J*; the optimum to its final pose has, too."""
     found = evaluate(lambda env: Planned(env, 0.995), "open", count=COUNT, timed=False, progress=False)
     assert found.success == 1.0
     for episode in found:
@@ -114,7 +114,7 @@ def test_regret_is_measured_against_the_pose_that_was_reached():
 def test_bad_arguments_are_named():
     env = NavigateEnv("open", lidar_beams=16)
     policy = PPO("MlpPolicy", env, policy_kwargs=network((16,)))
-    with pytest.raises(ValueError, match=r"policy: it observes \(25,\), the environment shows \(41,\)"):
+    with pytest.raises(ValueError, match=r"policy: expected observations \(25,\), got \(41,\)"):
         evaluate(policy, "open", count=1, progress=False)
     found = evaluate(policy, "open", count=1, environment={"lidar_beams": 16}, progress=False)
     assert len(found) == 1
@@ -169,7 +169,7 @@ def test_bootstrap_intervals_cover_the_truth():
 
 
 def test_with_several_runs_the_runs_are_resampled_for_each_scenario():
-    """All runs alike: nothing is uncertain, though scenarios differ. Runs that differ: as uncertain as they are."""
+    """Identical runs have an interval of width zero; the interval of different runs has the width of their spread."""
     same = run(episode(True), episode(False), episode(True))
     found = score("policy", [same, same, same])
     assert found.runs == 3
@@ -178,11 +178,11 @@ def test_with_several_runs_the_runs_are_resampled_for_each_scenario():
     found = score("policy", runs)
     # The mean of 250 independent draws has a standard deviation of 0.03.
     assert 0.08 < found.success.high - found.success.low < 0.16
-    with pytest.raises(ValueError, match="its runs have played different scenarios"):
+    with pytest.raises(ValueError, match="expected runs with the same scenarios"):
         score("policy", [same, run(episode())])
 
 
-def test_resamples_keep_the_families_shares():
+def test_resamples_keep_the_number_of_scenarios_of_each_family():
     episodes = [episode(True, family="open")] * 30 + [episode(False, family="rooms")] * 10
     found = score("policy", run(*episodes)).success
     assert found.low == found.value == found.high == 0.75
@@ -212,7 +212,7 @@ def test_a_random_policy_repeats_itself_for_the_same_seed():
 
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory):
-    """Folders of two seeds of one method, and of another policy."""
+    """A directory with two seeds of one method and another policy."""
     root, env = tmp_path_factory.mktemp("policies"), NavigateEnv("open")
     for seed in (0, 1):
         training = {"algorithm": "bc", "family": "open", "seed": seed, "out": f"anything-{seed}"}
@@ -224,22 +224,22 @@ def policies(tmp_path_factory):
 
 def test_seeds_of_one_method_share_a_row(policies):
     names = [str(policies / name) for name in ("seed0", "other", "seed1")]
-    rows = grouped([load_entrant(name) for name in [*names, "expert"]])
+    rows = group_by_row([load_policy_spec(name) for name in [*names, "expert"]])
     assert [[member.name for member in members] for members in rows.values()] == [
         [names[0], names[2]],
         [names[1]],
         ["expert"],
     ]
-    labelled = grouped([load_entrant(f"mine={names[0]}"), load_entrant(f"mine={names[1]}")])
+    labelled = group_by_row([load_policy_spec(f"mine={names[0]}"), load_policy_spec(f"mine={names[1]}")])
     assert list(labelled) == ["mine"]
-    with pytest.raises(ValueError, match="expert: named more than once"):
-        grouped([load_entrant("expert"), load_entrant("expert")])
+    with pytest.raises(ValueError, match="expert: given more than once"):
+        group_by_row([load_policy_spec("expert"), load_policy_spec("expert")])
 
 
-def test_the_contest_is_printed_written_and_drawn(policies, tmp_path, capsys):
+def test_a_comparison_is_printed_written_and_plotted(policies, tmp_path, capsys):
     names = [str(policies / "seed0"), str(policies / "seed1"), "expert", "random", "go-to-goal"]
     banks = [ScenarioBank.shipped(family, "test") for family in ("open", "rooms")]
-    found = contest([load_entrant(name) for name in names], banks, count=4, progress=False)
+    found = compare_policies([load_policy_spec(name) for name in names], banks, count=4, progress=False)
     print_scores(found)
     printed = capsys.readouterr().out
     assert "expert" in printed
@@ -267,11 +267,11 @@ def test_extremes_are_the_best_the_median_and_the_worst():
     assert list(extremes([episode(False, True)], 2)) == ["worst"]
 
 
-def test_entrants_drive_single_and_vector_environments(policies):
+def test_policies_by_name_drive_single_and_vector_environments(policies):
     for env in (NavigateEnv("open"), NavigateVectorEnv(3, "open")):
         observation, _ = env.reset(seed=0)
         for name in ("expert", "random", "go-to-goal", str(policies / "other")):
-            action, _ = make_entrant(name, env).predict(observation, deterministic=True)
+            action, _ = make_policy_from_spec(name, env).predict(observation, deterministic=True)
             assert action.shape == env.action_space.shape
     with pytest.raises(FileNotFoundError):
-        load_entrant("nobody")
+        load_policy_spec("nobody")

@@ -8,9 +8,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
-from leapnav.envs.obstacles import clearance
-from leapnav.experts import ExpertPolicy, NoOptimumError, Path, find_optimum
-from leapnav.experts.feedback import Feedback
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.experts import ExpertPolicy, NoOptimumError, Trajectory, find_optimum
+from leapnav.experts.acting.feedback import Feedback
 from leapnav.training import make_vec_env
 
 SETTINGS = [{}, {"disturbance": {"actuation": 0.1}}, {"actuation": "motor"}]
@@ -59,7 +59,7 @@ def test_after_a_push_it_goes_on_from_there():
         bank = ScenarioBank.shipped(family, "test")
         for index in range(4):
             scenario, reference = bank[index], bank.reference(index)
-            feedback = Feedback(scenario, Path(reference.times, reference.states, reference.costates))
+            feedback = Feedback(scenario, Trajectory(reference.times, reference.states, reference.costates))
             k = int(rng.uniform(0.2, 0.6) * len(reference.times))
             direction = rng.uniform(-np.pi, np.pi)
             push = [0.5 * np.cos(direction), 0.5 * np.sin(direction), rng.choice([-0.5, 0.5])]
@@ -101,7 +101,7 @@ def test_value_costate_and_return_agree(family):
 def test_the_gains_are_the_slope_of_the_costate():
     bank = ScenarioBank.shipped("clutter", "test")
     reference = bank.reference(3)
-    feedback = Feedback(bank[3], Path(reference.times, reference.states, reference.costates))
+    feedback = Feedback(bank[3], Trajectory(reference.times, reference.states, reference.costates))
     gains = feedback.gains()
     for k in (0, 20, len(gains.times) // 2):
         time, state, h = gains.times[k], gains.extremal[k, :3], 1e-5
@@ -163,7 +163,7 @@ def test_known_optima_are_used():
     task = Scenario.from_dict(scenario_fields())
     optimum = find_optimum(task)
     env = NavigateEnv(scenario=task)
-    path = Path(optimum.times, optimum.states, optimum.costates)
+    path = Trajectory(optimum.times, optimum.states, optimum.costates)
     total, info = drive(env, ExpertPolicy(env, {task: path}))
     assert info["is_success"]
     assert total == pytest.approx(-optimum.cost, rel=1e-3)
@@ -172,7 +172,7 @@ def test_known_optima_are_used():
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="feedback: expected one of resolve, gains, none, got 'pid'"):
         ExpertPolicy(NavigateEnv(), feedback="pid")
-    with pytest.raises(TypeError, match="env: expected leapnav's environment"):
+    with pytest.raises(TypeError, match="env: expected an environment of leapnav, got CartPoleEnv"):
         ExpertPolicy(gym.make("CartPole-v1"))
     env = NavigateEnv("open")
     env.reset(seed=0)

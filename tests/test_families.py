@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from leapnav.envs import FAMILIES, sample_scenario
-from leapnav.envs.obstacles import clearance
+from leapnav.envs.shapes.clearance import clearance
 
 
 @pytest.mark.parametrize("family", FAMILIES)

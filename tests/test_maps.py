@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from leapnav.envs import Robot, Scenario, ScenarioError
-from leapnav.envs.maps import read_movingai, rectangles
+from leapnav.envs.scenarios.maps import read_movingai, rectangles
 from leapnav.experts import find_optimum
 
 ROOMS = """type octile
@@ -82,7 +82,7 @@ def test_a_pose_in_a_blocked_cell_is_refused(rooms):
     rooms.write_text("type octile\nheight 5\nwidth 5\nmap\n@.@.@\n@@@.@\n.@@@@\n@.@@@\n@.@@@\n")
     with pytest.raises(ScenarioError, match=r"'rooms': start: \(3\.5, 1\.5\) is in a blocked cell of .*rooms\.map"):
         Scenario.from_movingai(rooms, start=(3.5, 1.5, 0.0), goal=(3.5, 3.5, 0.0), horizon=9.0)
-    with pytest.raises(ValueError, match="cell_size: expected a positive number of metres, got 0"):
+    with pytest.raises(ValueError, match="cell_size: expected a positive number, got 0"):
         Scenario.from_movingai(rooms, cell_size=0, **POSES)
 
 

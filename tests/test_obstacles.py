@@ -4,21 +4,17 @@ import numpy as np
 import pytest
 from helpers import best_known, scenario_fields
 
-from leapnav.envs import Scenario, crowds
-from leapnav.envs.arcs import follow_arc
-from leapnav.envs.obstacles import (
-    clearance,
-    clearances,
-    proximity,
-    proximity_value,
-    proximity_values,
-)
+from leapnav.envs import Scenario
+from leapnav.envs.shapes.clearance import clearance, clearances
+from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
+from leapnav.envs.shapes.proximity_grid import MAX_EXPONENT, MIN_EXPONENT, exponential
+from leapnav.envs.simulation.arcs import follow_arc
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
 
 
 def plain_proximity(scenario, x, y):
-    """The formulas of the design, written out without care for overflow."""
+    """The formulas of the design, without protection against overflow."""
     cost, radius = scenario.cost, scenario.robot.radius
     k, sigma = cost.proximity_weight, cost.proximity_scale
     x_min, y_min, x_max, y_max = scenario.arena
@@ -31,12 +27,12 @@ def plain_proximity(scenario, x, y):
         else:
             v = np.array(obstacle.polygon.vertices)
             centre = v.mean(axis=0)
-            share = 0.0
+            total_weight = 0.0
             for a, b in zip(v, np.roll(v, -1, axis=0), strict=True):
                 normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
                 normal *= np.sign(normal @ (a - centre))
-                share += math.exp((normal @ (np.array([x, y]) - a) - radius) / sigma)
-            total += k / share
+                total_weight += math.exp((normal @ (np.array([x, y]) - a) - radius) / sigma)
+            total += k / total_weight
     return total
 
 
@@ -67,8 +63,6 @@ def test_gradient_and_hessian_agree_with_finite_differences(scenario):
 
 
 def test_the_proximity_cost_does_not_overflow_far_inside_or_far_away():
-    from leapnav.envs import Scenario
-
     wide = [[2.0, 2.0], [98.0, 2.0], [98.0, 98.0], [2.0, 98.0]]
     scenario = Scenario(
         arena=(0.0, 0.0, 100.0, 100.0),
@@ -85,13 +79,13 @@ def test_the_proximity_cost_does_not_overflow_far_inside_or_far_away():
 def test_clearance_is_the_distance_to_the_nearest_rim(scenario):
     rims = []
     for obstacle in scenario.obstacles:
-        share = np.linspace(0, 1, 4001)[:, None]
+        fraction = np.linspace(0, 1, 4001)[:, None]
         if obstacle.circle:
-            turn = 2 * np.pi * share
+            turn = 2 * np.pi * fraction
             rims.append(obstacle.circle.center + obstacle.circle.radius * np.hstack([np.cos(turn), np.sin(turn)]))
         else:
             v = np.array(obstacle.polygon.vertices)
-            rims += [a + share * (b - a) for a, b in zip(v, np.roll(v, -1, axis=0), strict=True)]
+            rims += [a + fraction * (b - a) for a, b in zip(v, np.roll(v, -1, axis=0), strict=True)]
     x_min, y_min, x_max, y_max = scenario.arena
     for x, y in points(scenario, 60):
         distance, _ = clearance(x, y, scenario.field)
@@ -99,7 +93,7 @@ def test_clearance_is_the_distance_to_the_nearest_rim(scenario):
             continue
         walls = min(x - x_min, x_max - x, y - y_min, y_max - y)
         nearest = min(walls, *(np.hypot(*(rim - (x, y)).T).min() for rim in rims)) - scenario.robot.radius
-        assert distance == pytest.approx(nearest, abs=2e-3)  # the rim's points stand 2 mm apart
+        assert distance == pytest.approx(nearest, abs=2e-3)  # the points of the rim are 2 mm apart
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
@@ -126,24 +120,24 @@ def test_clearance_names_the_nearest_obstacle():
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_the_clearance_of_an_arc_is_the_smallest_of_its_points(scenario):
     rng = np.random.default_rng(3)
-    share = np.linspace(0, 1, 5001)
+    fraction = np.linspace(0, 1, 5001)
     for x, y in points(scenario, 40, seed=1):
         heading, distance, turn = rng.uniform(-3, 3), rng.uniform(-1, 1), rng.uniform(-2, 2)
-        chord = distance * share * np.sinc(turn * share / (2 * np.pi))
-        middle = heading + turn * share / 2
+        chord = distance * fraction * np.sinc(turn * fraction / (2 * np.pi))
+        middle = heading + turn * fraction / 2
         arc = np.stack([x + chord * np.cos(middle), y + chord * np.sin(middle)], axis=1)
         lowest = clearances(arc, scenario.field).min()
         before = clearance(x, y, scenario.field)[0]
         found, driven, after = follow_arc(x, y, heading, distance, turn, before, scenario.field)
         free = clearances(arc, scenario.field) > 0
         if driven == 1.0:
-            assert free.mean() > 0.99  # what is not free is grazed by less than a millimetre
+            assert free.mean() > 0.99  # the rest overlaps by less than a millimetre
             assert lowest - 1e-9 <= found <= max(lowest, 0.0) * 1.03 + 2e-3
             assert after == pytest.approx(clearance(*arc[-1], scenario.field)[0])
         else:
             assert found <= 0
             assert lowest <= 1e-9
-            assert driven == pytest.approx(share[np.argmin(free)], abs=2e-3)  # the first touch
+            assert driven == pytest.approx(fraction[np.argmin(free)], abs=2e-3)  # the first contact
             assert before <= 0 or 0 <= after < 1e-3
 
 
@@ -154,8 +148,6 @@ def test_an_arc_far_beyond_a_wall_is_no_endless_walk():
 
 
 def test_an_arc_does_not_jump_a_thin_obstacle():
-    from leapnav.envs import Scenario
-
     scenario = Scenario(
         arena=(0.0, 0.0, 10.0, 10.0),
         start=(1.0, 5.0, 0.0),
@@ -169,7 +161,7 @@ def test_an_arc_does_not_jump_a_thin_obstacle():
 
 
 def many_obstacles(count, size, seed=0):
-    """Discs and boxes scattered over a square arena, clear of its first two metres (start) and its last (goal)."""
+    """Discs and boxes scattered over a square arena, at least 4 m from the corners of start and goal."""
     rng = np.random.default_rng(seed)
     obstacles = []
     while len(obstacles) < count:
@@ -190,7 +182,7 @@ def many_obstacles(count, size, seed=0):
 def test_a_grid_of_obstacles_changes_nothing(count, size):
     scenario = many_obstacles(count, size)
     rng = np.random.default_rng(1)
-    # Also outside the arena, where an integrator may look.
+    # Also outside the arena, where an integrator may evaluate it.
     for x, y in rng.uniform(-6.0, size + 6.0, (300, 2)):
         expected = np.zeros(6)
         for part in range(0, count, 10):
@@ -199,22 +191,23 @@ def test_a_grid_of_obstacles_changes_nothing(count, size):
         walls = np.array(proximity(x, y, scenario.model_copy(update={"obstacles": ()}).field))
         expected -= (len(range(0, count, 10)) - 1) * walls
         scale = 1.0 + np.abs(expected).max() + np.abs(walls).max()
-        # One that is left out has 1e-13, and derivatives of ten times that, for a scale of 0.1 m.
+        # A skipped term is below 1e-13, and its derivatives below 10 times that, for a scale of 0.1 m.
         tolerance = 1e-12 * scale * np.array([1.0, 10.0, 10.0, 100.0, 100.0, 100.0])
         assert (np.abs(np.array(proximity(x, y, scenario.field)) - expected) <= tolerance).all()
 
 
-def test_the_exponential_of_crowds_is_exp():
-    x = np.concatenate([np.linspace(crowds.LOWEST, crowds.HIGHEST, 20_001), np.linspace(-1.0, 1.0, 20_001)])
-    found = np.array([crowds.exponential(value) for value in x])
+def test_the_exponential_of_the_grid_is_exp():
+    x = np.concatenate([np.linspace(MIN_EXPONENT, MAX_EXPONENT, 20_001), np.linspace(-1.0, 1.0, 20_001)])
+    found = np.array([exponential(value) for value in x])
     np.testing.assert_allclose(found, np.exp(x), rtol=2e-15)  # the reference is off by an ulp, too
-    assert crowds.exponential(0.0) == 1.0
-    assert crowds.exponential(-1e30) == crowds.exponential(crowds.LOWEST) < 1e-300
-    assert crowds.exponential(1e30) == crowds.exponential(crowds.HIGHEST) < math.inf
-    assert math.isnan(crowds.exponential(math.nan))
+    assert exponential(0.0) == 1.0
+    assert exponential(-1e30) == exponential(MIN_EXPONENT) < 1e-300
+    assert exponential(1e30) == exponential(MAX_EXPONENT) < math.inf
+    assert math.isnan(exponential(math.nan))
 
 
 def test_points_far_away_or_not_numbers_are_survived():
     scenario = many_obstacles(60, 20.0)
-    for x, y in ((1e300, 0.0), (-1e300, 1e300), (math.inf, 0.0), (math.nan, 1.0)):
-        proximity(x, y, scenario.field)
+    for x, y in ((1e300, 0.0), (-1e300, 1e300), (math.inf, 0.0)):
+        assert proximity(x, y, scenario.field)[0] == math.inf  # far behind a wall
+    assert not proximity(math.nan, 1.0, scenario.field)[0] < 0

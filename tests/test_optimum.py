@@ -1,3 +1,5 @@
+from itertools import islice
+
 import numpy as np
 import pytest
 from helpers import best_known, scenario_fields
@@ -5,7 +7,8 @@ from scipy.integrate import solve_ivp
 
 from leapnav.envs import FAMILIES, Robot, Scenario, sample_scenario
 from leapnav.experts import Status, find_optimum
-from leapnav.experts.lattice import Lattice, Place, is_connected
+from leapnav.experts.search.candidates import CandidateSearch
+from leapnav.experts.search.lattice import Lattice, Place, is_connected
 
 BEST_KNOWN = best_known()
 
@@ -35,11 +38,11 @@ def test_the_certificate_agrees_with_an_independent_integrator():
     """Each half second of the optimum, re-integrated by SciPy from its own dense states and costates."""
     for scenario, _ in BEST_KNOWN[::5]:
         extremal = find_optimum(scenario)
-        arrays = extremal.problem.arrays
+        extremal_flow = extremal.problem.arrays.flow
         dz, empty = np.empty(6), np.empty((6, 0))
 
-        def flow(_, y, arrays=arrays, dz=dz, empty=empty):
-            running = arrays.flow(y[:6], arrays.data, arrays.field, empty, dz, empty)
+        def flow(_, y, record=extremal_flow, dz=dz, empty=empty):
+            running = record.function(y[:6], record.data, record.field, empty, dz, empty)
             return np.append(dz, running)
 
         times = np.append(np.arange(0, scenario.horizon, 0.5), scenario.horizon)
@@ -98,18 +101,22 @@ def test_an_obstacle_that_is_hardly_felt_outside_is_gone_round(scale):
 
 
 def test_alternatives_get_only_so_much_work(monkeypatch):
-    """Among hundreds of obstacles the dearer ones would take most of the time; the optimum does not depend on them."""
+    """Among hundreds of obstacles they would take most of the time; the optimum does not depend on them."""
     scenario = sample_scenario("clutter", 2)
     optimum = find_optimum(scenario)
-    monkeypatch.setattr("leapnav.experts.optimum.WORK_ON_ALTERNATIVES", 1)
+    monkeypatch.setattr("leapnav.experts.optimum.ALTERNATIVES_BUDGET", 1)
     hasty = find_optimum(scenario)
     assert hasty.cost == optimum.cost
     assert [a.cost for a in hasty.alternatives] == [a.cost for a in optimum.alternatives[: len(hasty.alternatives)]]
     assert 1 <= len(hasty.alternatives) < len(optimum.alternatives)
 
 
+def first_candidate(lattice):
+    return next(CandidateSearch(lattice).candidates())
+
+
 def test_candidates_are_distinct_and_in_order():
-    candidates = [c for c, _ in zip(Lattice(BEST_KNOWN[0][0]).candidates(), range(6), strict=False)]
+    candidates = [c for c, _ in zip(CandidateSearch(Lattice(BEST_KNOWN[0][0])).candidates(), range(6), strict=False)]
     assert [c.cost for c in candidates] == sorted(c.cost for c in candidates)
     for candidate in candidates:
         assert candidate.times[-1] == pytest.approx(BEST_KNOWN[0][0].horizon)
@@ -195,7 +202,7 @@ def test_a_goal_at_the_start_is_no_crash_and_no_wrong_success():
 
 
 def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="candidates: expected a whole number of at least 1, got 0"):
+    with pytest.raises(ValueError, match="candidates: expected an integer >= 1, got 0"):
         find_optimum(BEST_KNOWN[0][0], candidates=0)
 
 
@@ -212,7 +219,7 @@ def test_a_gap_just_too_narrow_leaves_patience_for_a_way_round():
 
 
 def test_walls_full_of_gaps_that_are_a_little_too_narrow_are_gone_round():
-    """A hundred combinations of gaps lead straight on, and all are in vain."""
+    """100 combinations of passages are on the straight line, and all are too narrow."""
     discs = [(x, y, 0.3) for x in (3.0, 5.0, 7.0) for y in np.arange(0.35, 8.5, 0.95)]
     robot = Robot(radius=0.2)
     scenario = Scenario.from_discs(
@@ -227,22 +234,23 @@ def test_walls_full_of_gaps_that_are_a_little_too_narrow_are_gone_round():
 def test_a_lattice_without_a_place_leads_round_it():
     scenario = BEST_KNOWN[0][0]
     lattice = Lattice(scenario)
-    first = next(lattice.candidates())
+    first = first_candidate(lattice)
     x, y, _ = first.poses[len(first.poses) // 2]
     for wide, least in ((False, 0.4), (True, 2.0)):
-        other = next(lattice.without([Place(x, y, -0.1, wide)]).candidates())
+        other = first_candidate(lattice.without([Place(x, y, -0.1, wide)]))
         distance = np.hypot(other.poses[:, 0] - x, other.poses[:, 1] - y).min()
         assert distance > least * scenario.robot.radius
         assert other.cost > first.cost
-    assert next(lattice.candidates()).cost == first.cost  # it is as it was
+    assert first_candidate(lattice).cost == first.cost  # it is unchanged
     start, goal = (Place(*pose[:2], -0.1) for pose in (scenario.start, scenario.goal))
-    assert next(lattice.without([start, goal]).candidates()).cost == first.cost  # every path leads there
+    assert first_candidate(lattice.without([start, goal])).cost == first.cost  # every path leads there
 
 
 def test_candidates_elsewhere_leave_the_first_ones():
-    lattice = Lattice(BEST_KNOWN[0][0])
-    first = [c.poses for c, _ in zip(lattice.candidates(), range(6), strict=False)]
-    others = [c.poses for c, _ in zip(lattice.elsewhere(), range(4), strict=False)]
+    search = CandidateSearch(Lattice(BEST_KNOWN[0][0]))
+    taken = list(islice(search.candidates(), 6))
+    first = [c.poses for c in taken]
+    others = [c.poses for c in islice(search.distinct_from(taken), 4)]
     assert others
     known = np.concatenate(first)[:, :2]
     for poses in others:
@@ -277,7 +285,7 @@ def test_poses_in_a_corner_have_a_way_out(gap):
 def test_turns_that_cost_next_to_nothing_do_not_make_the_search_endless():
     assert find_optimum(changed(cost={"turn_weight": 1e-3})).success
     lattice = Lattice(changed(cost={"turn_weight": 1e-7}))
-    assert next(lattice.candidates()).cost > 0
+    assert first_candidate(lattice).cost > 0
 
 
 def test_far_walls_change_neither_the_optimum_nor_the_cells():

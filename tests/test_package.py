@@ -11,21 +11,30 @@ def run(code, **options):
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, **options).stdout
 
 
+HEAVY = {
+    "h5py",
+    "matplotlib",
+    "minari",
+    "numba",
+    "pydantic",
+    "pygame",
+    "pymunk",
+    "scipy",
+    "stable_baselines3",
+    "sympy",
+    "torch",
+}
+
+
 def test_importing_leapnav_registers_and_loads_nothing_heavy():
-    heavy = {
-        "numba",
-        "torch",
-        "pymunk",
-        "matplotlib",
-        "scipy",
-        "sympy",
-        "pygame",
-        "pydantic",
-        "stable_baselines3",
-        "minari",
-    }
     loaded = run("import leapnav, sys, gymnasium; gymnasium.spec('leapnav/Navigate-v0'); print(*sys.modules)").split()
-    assert not heavy & set(loaded)
+    assert not HEAVY & set(loaded)
+
+
+def test_the_command_line_loads_nothing_heavy():
+    """Help is printed at once."""
+    loaded = run("import leapnav.cli, sys; print(*sys.modules)").split()
+    assert not HEAVY & set(loaded)
 
 
 def test_the_solvers_load_neither_torch_nor_minari():
@@ -43,7 +52,7 @@ def test_the_module_prefix_form_works_without_an_import():
 
 
 def test_the_package_works_from_any_folder(tmp_path):
-    # A user's own folders of these names are not shadowed, and do not shadow ours.
+    # Directories of a user with these names do not shadow the packages, and are not shadowed.
     for name in ("envs", "experts", "training"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("MINE = True\n")

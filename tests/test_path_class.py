@@ -4,7 +4,7 @@ from helpers import scenario_fields
 
 from leapnav.envs import Scenario, sample_scenario
 from leapnav.experts import find_optimum
-from leapnav.experts.path_class import driving_modes, heading_winding, path_sides
+from leapnav.experts.search.path_class import driving_modes, heading_winding, path_sides
 
 # A disc before a polygon in the file; circles are packed first, so that their order there is another.
 OBSTACLES = [

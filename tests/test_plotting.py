@@ -9,9 +9,9 @@ from helpers import best_known, published_problems
 from matplotlib.image import imread
 
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, solve
-from leapnav.experts.certificate import failure
-from leapnav.experts.extremal import Status
-from leapnav.experts.plotting import SWEEPS_DRAWN, plot_extremal, plot_solution
+from leapnav.experts.plotting import MAX_SWEEPS, plot_extremal, plot_solution
+from leapnav.experts.problem.certificate import failure
+from leapnav.experts.problem.extremal import Status
 
 SCENARIOS = {scenario.name: scenario for scenario, _ in best_known()}
 OVER_TIME = ["states", "controls", "costates", "Hamiltonian"]
@@ -42,7 +42,7 @@ def test_a_leapfrog_solve_shows_the_plane_its_sweeps_and_their_costs(swept):
     axes = axes_of(figure)
     assert list(axes) == ["", "$|J_k - J|$", "segments", *OVER_TIME]
     paths = sweep_paths(axes[""])
-    assert len(extremal.history) > len(paths) == SWEEPS_DRAWN
+    assert len(extremal.history) > len(paths) == MAX_SWEEPS
     numbers = [int(line.get_label().split()[1]) for line in paths]
     assert numbers[:4] == [0, 1, 2, 3]
     assert numbers[-1] == len(extremal.history) - 1
@@ -51,7 +51,7 @@ def test_a_leapfrog_solve_shows_the_plane_its_sweeps_and_their_costs(swept):
     assert lightness == sorted(lightness, reverse=True)
     costs = labelled(axes["$|J_k - J|$"])
     assert len(costs["nodes removed"].get_xdata()) == sum(row.phase == "reduce" for row in extremal.history)
-    falling = costs["sweep, in its path's colour"].get_ydata()
+    falling = costs["sweep (colour of its path)"].get_ydata()
     assert len(falling) == len(extremal.history)
     assert falling[0] == pytest.approx(extremal.history[0].cost - extremal.cost)
     assert np.diff(falling).max() <= 1e-10
@@ -61,9 +61,9 @@ def test_a_leapfrog_solve_shows_the_plane_its_sweeps_and_their_costs(swept):
 
 def test_a_failure_that_ended_above_its_sweeps_shows_their_costs_as_they_are(swept):
     failed = replace(swept[1], status=Status.STALLED, cost=swept[1].cost + 0.1)
-    axes = axes_of(failed.plot())["$J_k$"]
+    axes = axes_of(plot_extremal(failed))["$J_k$"]
     assert axes.get_yscale() == "linear"
-    costs = labelled(axes)["sweep, in its path's colour"].get_ydata()
+    costs = labelled(axes)["sweep (colour of its path)"].get_ydata()
     assert list(costs) == [row.cost for row in failed.history]
 
 
@@ -99,7 +99,7 @@ def test_the_polished_solve_shows_newton_after_the_sweeps():
 def test_every_published_problem_can_be_drawn(name, polish):
     problem = published_problems()[name][0]
     extremal = solve(problem, method="leapfrog", polish=polish)
-    axes = axes_of(extremal.plot())
+    axes = axes_of(plot_extremal(extremal))
     assert set(OVER_TIME) < set(axes)
     for panel, names in (("states", problem.system.state), ("controls", problem.system.fields)):
         assert len(labelled(axes[panel])) == len(names)
@@ -112,7 +112,7 @@ def test_every_published_problem_can_be_drawn(name, polish):
 def test_a_method_without_sweeps_and_a_system_without_a_position_leave_four_panels():
     problem = published_problems()["double-integrator-energy"][0]
     extremal = solve(problem, method="multiple_shooting")
-    axes = axes_of(extremal.plot())
+    axes = axes_of(plot_extremal(extremal))
     assert list(axes) == OVER_TIME
     # u = 6 - 12 t
     line = labelled(axes["controls"])["$u_{1}$"]
@@ -128,14 +128,14 @@ def test_a_system_of_one_state_is_drawn_over_time():
     problem = OptimalControlProblem(
         system, start=(0,), goal=(1,), horizon=1.0, control_weight=(1,), control_bounds=((-np.inf, 4.0),)
     )
-    axes = axes_of(solve(problem, method="leapfrog").plot())
+    axes = axes_of(plot_extremal(solve(problem, method="leapfrog")))
     assert axes["$x$"].get_xlabel() == "time"
     bounds = [line for line in axes["controls"].get_lines() if np.ptp(line.get_ydata()) == 0]
     assert [line.get_ydata()[0] for line in bounds] == [4.0]
 
 
 def test_the_hamiltonian_is_drawn_about_its_mean(swept):
-    axes = axes_of(swept[1].plot())["Hamiltonian"]
+    axes = axes_of(plot_extremal(swept[1]))["Hamiltonian"]
     hamiltonian = swept[1].hamiltonian
     (label,) = labelled(axes)
     line = labelled(axes)[label]
@@ -149,12 +149,12 @@ def test_the_hamiltonian_is_drawn_about_its_mean(swept):
 def test_rounding_does_not_fill_the_axes_of_the_hamiltonian():
     extremal = solve(published_problems()["double-integrator-energy"][0], method="multiple_shooting")
     assert extremal.certificate.hamiltonian_drift < 1e-10
-    assert axes_of(extremal.plot())["Hamiltonian"].get_ylim()[1] >= 1e-9
+    assert axes_of(plot_extremal(extremal))["Hamiltonian"].get_ylim()[1] >= 1e-9
 
 
 def test_obstacles_and_bounds_are_drawn_without_the_scenario_too(swept):
     scenario, extremal = swept
-    axes = axes_of(extremal.plot())
+    axes = axes_of(plot_extremal(extremal))
     plane, controls = axes["$y$"], axes["controls"]
     filled = plane.collections[0].get_paths()
     (x_min, x_max), (y_min, y_max) = plane.get_xlim(), plane.get_ylim()
@@ -171,20 +171,20 @@ def test_obstacles_and_bounds_are_drawn_without_the_scenario_too(swept):
 
 def test_pictures_are_written_with_their_title(swept, tmp_path):
     scenario, extremal = swept
-    assert extremal.plot(tmp_path / "plot.png", title="A title").get_suptitle() == "A title"
+    assert plot_extremal(extremal, tmp_path / "plot.png", title="A title").get_suptitle() == "A title"
     plot_solution(scenario, extremal, tmp_path / "solution.png")
     for name in ("plot.png", "solution.png"):
         height, width, _ = imread(tmp_path / name).shape
         assert (height, width) == (1110, 1725)
     with pytest.raises(ValueError, match="xyz"):
-        extremal.plot(tmp_path / "plot.xyz")
+        plot_extremal(extremal, tmp_path / "plot.xyz")
 
 
 def test_a_failure_without_a_path_cannot_be_drawn(swept, tmp_path):
     scenario, extremal = swept
     failed = failure(extremal.problem, Status.NO_PATH)
     with pytest.raises(ValueError, match="no path to draw: no path from start to goal"):
-        failed.plot()
+        plot_extremal(failed)
     with pytest.raises(ValueError, match="no path to draw"):
         plot_solution(scenario, failed, tmp_path / "plot.png")
     assert not (tmp_path / "plot.png").exists()
@@ -193,12 +193,13 @@ def test_a_failure_without_a_path_cannot_be_drawn(swept, tmp_path):
 def test_only_drawing_loads_matplotlib():
     code = """
 import sys, sympy
+import leapnav.experts
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, solve
 x = sympy.Symbol("x")
 system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
 extremal = solve(OptimalControlProblem(system, (0,), (1,), 1.0, (1,)), method="single_shooting")
-assert "matplotlib" not in sys.modules
-extremal.plot()
+assert not {"matplotlib", "minari", "torch"} & sys.modules.keys()
+leapnav.experts.plot_extremal(extremal)
 assert "matplotlib" in sys.modules
 assert "matplotlib.pyplot" not in sys.modules
 """

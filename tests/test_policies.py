@@ -9,7 +9,7 @@ from helpers import SMALL
 from stable_baselines3 import PPO, SAC
 
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
-from leapnav.training.rewards import ScaledReward
+from leapnav.training.robots.rewards import ScaledReward
 
 
 def test_the_features_have_the_promised_size_and_are_finite(env):
@@ -61,7 +61,7 @@ def test_a_policy_with_another_network_is_not_saved(env, tmp_path):
 
 def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
     save_policy(clone[0], tmp_path)
-    with pytest.raises(ValueError, match=r"observes another environment than this one: lidar_beams=32 \(here 16\)"):
+    with pytest.raises(ValueError, match=r"was trained with other observations: lidar_beams=32 \(here 16\)"):
         load_policy(tmp_path, gym.make("leapnav/Navigate-v0", lidar_beams=16))
     with pytest.raises(ValueError, match=r"actuation='velocity' \(here 'motor'\)"):
         load_policy(tmp_path, gym.make("leapnav/Navigate-v0", actuation="motor"))
@@ -69,7 +69,7 @@ def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
     half = len(weights) // 2
     for damaged in (weights[:1000], weights[:half] + bytes([weights[half] ^ 255]) + weights[half + 1 :]):
         (tmp_path / "weights.pt").write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"weights\.pt: not this policy's weights: damaged"):
+        with pytest.raises(ValueError, match=r"weights\.pt: not the weights of this policy: damaged"):
             load_policy(tmp_path)
     (tmp_path / "weights.pt").unlink()
     with pytest.raises(FileNotFoundError):
@@ -77,11 +77,11 @@ def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
     description = json.loads((tmp_path / "policy.json").read_text())
     faults = [
         ({**description, "format": 99}, "format: expected 2, got 99"),
-        ({}, "not a policy's description"),
+        ({}, "not the description of a policy"),
         ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
         ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, tqc, got 'dqn'"),
-        ({**description, "hidden": ["wide"]}, "not a policy's description"),
-        ({**description, "observation_low": [0.0]}, "not a policy's description"),
+        ({**description, "hidden": ["wide"]}, "not the description of a policy"),
+        ({**description, "observation_low": [0.0]}, "not the description of a policy"),
     ]
     for content, message in faults:
         (tmp_path / "policy.json").write_text(json.dumps(content))
@@ -102,6 +102,6 @@ def test_loading_a_policy_executes_nothing(clone, tmp_path):
     description = json.loads((tmp_path / "policy.json").read_text())
     description["sha256"] = hashlib.sha256((tmp_path / "weights.pt").read_bytes()).hexdigest()
     (tmp_path / "policy.json").write_text(json.dumps(description))
-    with pytest.raises(ValueError, match="not this policy's weights"):
+    with pytest.raises(ValueError, match="not the weights of this policy"):
         load_policy(tmp_path)
     assert not (tmp_path / "executed").exists()

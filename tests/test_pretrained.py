@@ -4,8 +4,8 @@ import pytest
 
 from leapnav.envs import FAMILIES
 from leapnav.training import evaluate, load_policy, policy_environment, shipped_policies
-from leapnav.training.entrants import load_entrant
-from leapnav.training.policies import SHIPPED, read_description
+from leapnav.training.policies.files import SHIPPED, read_description
+from leapnav.training.scoring.policy_specs import load_policy_spec
 
 
 def test_the_policies_that_ship_are_small():
@@ -21,16 +21,16 @@ def test_a_policy_that_ships_is_loaded_by_its_name_and_drives(name):
     assert env.action_space.contains(policy.predict(observation, deterministic=True)[0])
     families = FAMILIES if name == "all" else (name,)
     found = [evaluate(policy, family, count=30, environment=sensors, progress=False) for family in families]
-    least = 0.7 if name == "rooms" else 0.9  # which doors are open cannot be seen from behind a wall
-    assert np.mean([evaluation.success for evaluation in found]) >= least
+    min_success = 0.7 if name == "rooms" else 0.9  # an open door is not visible from behind a wall
+    assert np.mean([evaluation.success for evaluation in found]) >= min_success
     assert read_description(name)["training"]["family"] == name
 
 
 def test_a_shipped_policys_name_is_a_policy_wherever_one_is_asked_for(tmp_path, monkeypatch):
     name = shipped_policies()[0]
-    assert load_entrant(name).environment == policy_environment(name)
+    assert load_policy_spec(name).environment == policy_environment(name)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / name).mkdir()  # a folder of that name comes first
+    (tmp_path / name).mkdir()  # a directory takes precedence over a shipped policy
     with pytest.raises(FileNotFoundError, match=f"{name}/policy.json"):
         load_policy(name)
     with pytest.raises(FileNotFoundError, match="nowhere"):

@@ -3,16 +3,16 @@ import math
 import numpy as np
 import pytest
 
-from leapnav.envs.scenario import Circle, Obstacle, Scenario
+from leapnav.envs.scenarios.scenario import Circle, Obstacle, Scenario
 from leapnav.training import make_vec_env
-from leapnav.training.rewards import GradedMiss, ScaledReward
+from leapnav.training.robots.rewards import GradedMiss, ScaledReward
 
 ARENA = (0.0, 0.0, 8.0, 8.0)
 STILL = np.zeros((1, 2), np.float32)
 
 
-def paid(scenario, wrap=lambda venv: venv, action=STILL, **arguments):
-    """What the last step of an episode pays, and what its infos tell."""
+def last_step(scenario, wrap=lambda venv: venv, action=STILL, **arguments):
+    """The reward and the infos of the last step of an episode."""
     venv = wrap(make_vec_env(n_envs=1, scenario=scenario, miss_penalty=30.0, **arguments))
     venv.reset()
     done = [False]
@@ -26,7 +26,7 @@ def scenario(start, goal):
 
 
 @pytest.mark.parametrize(
-    ("goal", "share"),
+    ("goal", "fraction"),
     [
         ((5.0, 4.0, 0.0), 0.2 + 0.1 * 1.0),
         ((4.0, 5.0, 1.5), 0.2 + 0.1 * (1.0 + 1.5)),
@@ -34,37 +34,37 @@ def scenario(start, goal):
         ((7.0, 7.0, 3.0), 0.2 + 0.1 * (3 * math.sqrt(2) + 3.0)),
     ],
 )
-def test_a_miss_costs_the_more_the_farther_it_is(goal, share):
+def test_a_miss_costs_the_more_the_farther_it_is(goal, fraction):
     task = scenario((4.0, 4.0, 0.0), goal)
-    assert paid(task)[0] == pytest.approx(-30.0)
-    graded, info = paid(task, GradedMiss)
-    assert graded == pytest.approx(-30.0 * min(1.0, share), rel=1e-5)
-    assert info["episode"]["r"] == pytest.approx(-30.0)  # the record keeps what the environment paid
+    assert last_step(task)[0] == pytest.approx(-30.0)
+    graded, info = last_step(task, GradedMiss)
+    assert graded == pytest.approx(-30.0 * min(1.0, fraction), rel=1e-5)
+    assert info["episode"]["r"] == pytest.approx(-30.0)  # the record keeps the reward of the environment
 
 
 def test_a_miss_costs_no_more_than_the_penalty():
     task = scenario((0.5, 0.5, 0.0), (7.5, 7.5, 3.0))
-    assert paid(task, GradedMiss)[0] == paid(task)[0] == pytest.approx(-30.0, abs=0.05)
+    assert last_step(task, GradedMiss)[0] == last_step(task)[0] == pytest.approx(-30.0, abs=0.05)
 
 
 def test_a_success_is_paid_as_before():
     task = scenario((4.0, 4.0, 0.0), (4.05, 4.0, 0.0))
-    reward, info = paid(task, GradedMiss)
+    reward, info = last_step(task, GradedMiss)
     assert info["is_success"]
-    assert reward == paid(task)[0] == 0.0
+    assert reward == last_step(task)[0] == 0.0
 
 
 def test_a_free_heading_is_never_off():
     task = scenario((4.0, 4.0, 0.0), (5.0, 4.0, None))
-    assert paid(task, GradedMiss)[0] == pytest.approx(-30.0 * 0.3, rel=1e-5)
+    assert last_step(task, GradedMiss)[0] == pytest.approx(-30.0 * 0.3, rel=1e-5)
 
 
 def test_a_collision_is_paid_in_full_and_as_a_miss_by_how_far_it_is():
     disc = Obstacle(circle=Circle(center=(4.0, 4.0), radius=0.5))
     task = Scenario(start=(2.0, 4.0, 0.0), goal=(6.0, 4.0, 0.0), horizon=6.0, arena=ARENA, obstacles=(disc,))
     forwards = np.array([[1.0, 0.0]], np.float32)
-    plain, info = paid(task, action=forwards, collision_penalty=20.0)
-    graded, _ = paid(task, GradedMiss, action=forwards, collision_penalty=20.0)
+    plain, info = last_step(task, action=forwards, collision_penalty=20.0)
+    graded, _ = last_step(task, GradedMiss, action=forwards, collision_penalty=20.0)
     assert info["collision"]
     away = math.hypot(*info["terminal_observation"][:2])
     assert graded - plain == pytest.approx(30.0 * (1 - 0.2 - 0.1 * away), rel=1e-5)
@@ -72,5 +72,5 @@ def test_a_collision_is_paid_in_full_and_as_a_miss_by_how_far_it_is():
 
 def test_a_scale_is_of_the_reward_alone():
     task = scenario((4.0, 4.0, 0.0), (5.0, 4.0, 0.0))
-    reward, info = paid(task, lambda venv: ScaledReward(GradedMiss(venv), 0.1))
+    reward, info = last_step(task, lambda venv: ScaledReward(GradedMiss(venv), 0.1))
     assert (reward, info["episode"]["r"]) == (pytest.approx(-0.9), pytest.approx(-30.0))

@@ -1,4 +1,4 @@
-"""Rollouts that are stopped, resumed, damaged, repeated."""
+"""Rollouts that are interrupted, resumed, damaged, repeated."""
 
 import errno
 import os
@@ -16,12 +16,17 @@ import pytest
 
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv
-from leapnav.experts import ExpertPolicy, rollouts
-from leapnav.experts.demonstrations import dataset_id, load_demonstrations
-from leapnav.experts.rollouts import DONE, RECORD, SHARD, WORK, check_dataset, rollout
-from leapnav.experts.shards import Shards
+from leapnav.experts import ExpertPolicy
+from leapnav.experts.data import rollouts
+from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
+from leapnav.experts.data.rollouts import DONE, RECORD, SHARD_SIZE, WORK, check_dataset, rollout
+from leapnav.experts.data.store import ResumableStore
 
 SETTINGS = {"family": "open", "seed": 3}
+
+
+def opened(folder, **changes):
+    return ResumableStore(folder / WORK, "rollout", {**SETTINGS, **changes})
 
 
 def contents(folder):
@@ -71,7 +76,7 @@ def test_killed_and_resumed_it_is_the_dataset_of_one_that_was_not(whole, tmp_pat
 
 
 def test_stopped_while_the_dataset_is_written_it_writes_it_again(whole, tmp_path, monkeypatch):
-    def stop(*arguments):
+    def stop(*arguments, **options):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
@@ -80,7 +85,7 @@ def test_stopped_while_the_dataset_is_written_it_writes_it_again(whole, tmp_path
             rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
     (tmp_path / "out" / WORK / "root" / "leapnav").mkdir(parents=True)  # half of a dataset
     with monkeypatch.context() as patched:
-        patched.setattr(rollouts, "_shard", None)  # nothing is solved again
+        patched.setattr(rollouts, "_shard", stop)  # nothing is solved again
         rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
     assert contents(tmp_path / "out") == contents(whole)
 
@@ -103,7 +108,7 @@ def test_stopped_just_before_the_end_it_ends(whole, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
-    write, written = Shards.write, []
+    write, written = ResumableStore.write, []
 
     def fill(self, number, arrays):
         if len(written) == 2:
@@ -112,7 +117,7 @@ def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
         write(self, number, arrays)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Shards, "write", fill)
+        patched.setattr(ResumableStore, "write", fill)
         with pytest.raises(OSError, match="No space left"):
             rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
     assert len(list((tmp_path / "out" / WORK).glob("shard-*.npz"))) == 2
@@ -122,11 +127,12 @@ def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_named(tmp_path, monkeypatch):
-    shards = Shards(tmp_path / WORK, SETTINGS)
-    monkeypatch.setattr(np, "savez", fail)
-    with pytest.raises(OSError, match="No space left") as caught:
-        shards.write(7, {})
-    assert caught.value.filename == str(shards.path(7))
+    with opened(tmp_path) as store:
+        monkeypatch.setattr(np, "savez", fail)
+        with pytest.raises(OSError, match="No space left") as caught:
+            store.write(7, {})
+    assert caught.value.filename == str(store.path(7))
+    assert 7 not in store
 
 
 def fail(*arguments, **options):
@@ -138,7 +144,7 @@ def unfinished(folder, monkeypatch, **changes):
     with monkeypatch.context() as patched:
         patched.setattr(rollouts, "_write", lambda *arguments: 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            rollout(**{"count": 2 * SHARD, "out": folder, "progress": False, **SETTINGS, **changes})
+            rollout(**{"count": 2 * SHARD_SIZE, "out": folder, "progress": False, **SETTINGS, **changes})
     return sorted(folder.glob(f"{WORK}/shard-*.npz"))
 
 
@@ -148,28 +154,32 @@ def test_a_damaged_shard_is_refused_by_name(tmp_path, monkeypatch):
     content[len(content) // 2] ^= 0xFF
     second.write_bytes(content)
     with pytest.raises(ValueError, match=r"shard-000001\.npz: damaged: .*; remove it"):
-        rollout("open", 2 * SHARD, tmp_path / "out", seed=3, progress=False)
+        rollout("open", 2 * SHARD_SIZE, tmp_path / "out", seed=3, progress=False)
     second.write_bytes(first.read_bytes())
     with pytest.raises(ValueError, match=r"shard-000001\.npz: a shard of another rollout"):
-        rollout("open", 2 * SHARD, tmp_path / "out", seed=3, progress=False)
+        rollout("open", 2 * SHARD_SIZE, tmp_path / "out", seed=3, progress=False)
     second.unlink()
-    assert rollout("open", 2 * SHARD, tmp_path / "out", seed=3, progress=False).demonstrations == 2 * SHARD
+    assert rollout("open", 2 * SHARD_SIZE, tmp_path / "out", seed=3, progress=False).demonstrations == 2 * SHARD_SIZE
 
 
 def test_other_arguments_do_not_continue_it(tmp_path, monkeypatch):
     unfinished(tmp_path / "out", monkeypatch)
     for changes in ({"seed": 4}, {"noise": 0.1}, {"family": "slalom"}, {"recoveries": 2}):
-        with pytest.raises(ValueError, match=r"rollout\.json: holds an unfinished rollout of other settings"):
+        message = rf"rollout\.json: holds an unfinished rollout of other settings: {next(iter(changes))} is"
+        with pytest.raises(ValueError, match=message):
             rollout(**{"count": 4, "out": tmp_path / "out", "progress": False, **SETTINGS, **changes})
     # A longer one goes on.
-    assert rollout("open", 2 * SHARD + 3, tmp_path / "out", seed=3, progress=False).demonstrations == 2 * SHARD + 3
+    assert (
+        rollout("open", 2 * SHARD_SIZE + 3, tmp_path / "out", seed=3, progress=False).demonstrations
+        == 2 * SHARD_SIZE + 3
+    )
 
 
 def test_nothing_is_overwritten_without_force(tmp_path):
     out = tmp_path / "out"
     rollout("open", 2, out, progress=False)
     for changes, message in (({"count": 3}, "count is 2, got 3"), ({"noise": 0.1}, r"noise is 0\.0, got 0\.1")):
-        with pytest.raises(FileExistsError, match=f"holds a rollout whose {message}; choose another folder"):
+        with pytest.raises(FileExistsError, match=f"holds a rollout whose {message}; choose another directory"):
             rollout(**{"family": "open", "count": 2, "out": out, "progress": False, **changes})
     (out / RECORD).rename(tmp_path / "record")
     with pytest.raises(FileExistsError, match="not empty"):
@@ -185,11 +195,28 @@ def test_nothing_is_overwritten_without_force(tmp_path):
 
 
 def test_two_processes_do_not_share_a_rollout(tmp_path):
-    first = Shards(tmp_path / WORK, SETTINGS)
-    with pytest.raises(ValueError, match="another process is at work"):
-        Shards(tmp_path / WORK, SETTINGS)
-    first.close()
-    Shards(tmp_path / WORK, SETTINGS).close()
+    with opened(tmp_path), pytest.raises(ValueError, match="another process is at work"), opened(tmp_path):
+        pass
+    with opened(tmp_path):
+        pass
+
+
+def test_a_store_of_other_settings_can_be_opened_with_its_own_afterwards(tmp_path):
+    with opened(tmp_path) as store:
+        store.write(0, {"values": np.arange(3)})
+    with pytest.raises(ValueError, match="seed is 3, got 4"), opened(tmp_path, seed=4):
+        pass
+    with opened(tmp_path) as store:
+        assert store.read(0)["values"].tolist() == [0, 1, 2]
+
+
+def test_what_a_killed_process_left_of_a_file_is_removed(tmp_path):
+    with opened(tmp_path) as store:
+        leftover = store.directory / ".shard-000000.npz.1.partial"
+        leftover.write_bytes(b"half of a shard")
+    with opened(tmp_path) as store:
+        assert not leftover.exists()
+        assert 0 not in store
 
 
 @mock.patch.dict(os.environ)  # Dask leaves OMP_NUM_THREADS=1 there, and processes started later compute other last bits

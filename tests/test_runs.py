@@ -12,10 +12,9 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from leapnav.experts.rollouts import rollout
+from leapnav.experts.data.rollouts import rollout
 from leapnav.training import config as configuration
 from leapnav.training import load_policy, shipped_policies
-from leapnav.training.actors import actor_parameters
 from leapnav.training.config import (
     ALGORITHMS,
     BCConfig,
@@ -27,11 +26,12 @@ from leapnav.training.config import (
     WarmStartConfig,
     read_config,
 )
-from leapnav.training.html_report import write_report
-from leapnav.training.imitation import train_bc, train_dagger
-from leapnav.training.reinforcement import _robots, _start, train_ppo, train_sac
-from leapnav.training.rewards import GradedMiss
-from leapnav.training.vec_env import environment_seed
+from leapnav.training.policies.actors import actor_parameters
+from leapnav.training.robots.rewards import GradedMiss
+from leapnav.training.robots.vec_env import environment_seed
+from leapnav.training.runs.imitation import train_bc, train_dagger
+from leapnav.training.runs.reinforcement import _resolve_warm_start, _training_env, train_ppo, train_sac
+from leapnav.training.scoring.html_report import write_report
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
 COMMON = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 4}
@@ -82,17 +82,17 @@ def test_a_run_leaves_its_configuration_policy_and_evaluations(demos, tmp_path):
     assert load_policy(config.out).observation_space.shape == (25,)
 
 
-def test_a_folder_is_used_once_and_resumed_with_the_same_settings_only(demos, tmp_path):
+def test_a_run_directory_is_used_once_and_resumed_with_the_same_settings_only(demos, tmp_path):
     config = bc(tmp_path / "run", demos)
     train_bc(config, progress=False)
-    with pytest.raises(FileExistsError, match="exists; --resume goes on with it"):
+    with pytest.raises(FileExistsError, match="exists; use --resume to continue this run"):
         train_bc(config, progress=False)
     with pytest.raises(ValueError, match=r"seed: the run in .* has 0, got 1"):
         train_bc(replace(config, resume=True, seed=1), progress=False)
     with pytest.raises(FileNotFoundError, match="no such run to resume"):
         train_bc(bc(tmp_path / "other", demos, resume=True), progress=False)
     before = weights(config.out)
-    train_bc(replace(config, resume=True), progress=False)  # there is nothing left to do
+    train_bc(replace(config, resume=True), progress=False)  # the run is finished
     assert weights(config.out) == before
 
 
@@ -122,9 +122,9 @@ def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):
 @pytest.mark.parametrize("name", shipped_policies())
 def test_a_policy_that_ships_starts_a_run_with_the_defaults(name, tmp_path):
     config = PPOConfig.tuned(name, out=tmp_path, warm_start=(Path(name),))
-    demos, start = _start(config)
+    demos, start = _resolve_warm_start(config)
     assert demos == []
-    assert start.observation_space == _robots(config).observation_space
+    assert start.observation_space == _training_env(config).observation_space
 
 
 def test_misses_are_graded_but_not_for_ppo_from_a_warm_start(tmp_path):
@@ -135,7 +135,7 @@ def test_misses_are_graded_but_not_for_ppo_from_a_warm_start(tmp_path):
         (SACConfig.tuned("open", warm=True), True),
         (replace(PPOConfig.tuned("open", out=tmp_path), graded_miss=False), False),
     ):
-        venv, found = _robots(config), False
+        venv, found = _training_env(config), False
         while isinstance(venv, VecEnvWrapper):
             venv, found = venv.venv, found or isinstance(venv, GradedMiss)
         assert found == graded
@@ -171,7 +171,7 @@ def run(name, out, demos, resume):
         train_bc(bc(out, demos, resume=resume), progress=False)
     elif name == "ppo":
         train_ppo(warm(out, demos, resume=resume), progress=False)
-    else:  # killed while the actions are random, or while it learns
+    else:  # "sac" is killed while the actions are random, "sac, learning" during learning
         start = WarmStartConfig(critic_epochs=1, slopes=100)
         changes = {
             "learning_starts": 200 if name == "sac" else 20,
@@ -200,7 +200,7 @@ def warm(out, demos, **changes):
 
 @pytest.mark.parametrize("name", ["bc", "ppo", "sac", "sac, learning"])
 def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
-    """SIGKILL as soon as there is a checkpoint; PPO with all that a warm start brings, SAC with demonstrations."""
+    """SIGKILL after the first checkpoint; PPO with all parts of a warm start, SAC with demonstrations."""
     straight, killed = tmp_path / "straight", tmp_path / "killed"
     arguments = [sys.executable, "-c", SCRIPT, os.path.dirname(__file__), name, killed, demos, "new"]
     process = subprocess.Popen([str(a) for a in arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
@@ -219,11 +219,11 @@ def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
 
 def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
     def config(out, **changes):
-        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, failures=4, lead=0.5)}
+        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, max_failures=4, lead=0.5)}
         return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
 
     train_dagger(config(tmp_path / "straight"), progress=False)
-    from leapnav.training import dagger
+    from leapnav.training.learning import dagger
 
     whole, calls = dagger.DAgger.run_round, []
 
@@ -260,30 +260,33 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         np.testing.assert_allclose(*found, atol=1e-4)
     with pytest.raises(ValueError, match="warm_start: expected at most one policy"):
         train_ppo(ppo(tmp_path / "two", warm_start=(tmp_path / "clone", tmp_path / "policy")), progress=False)
-    with pytest.raises(FileNotFoundError, match=r"warm_start: .*nowhere: no such folder"):
+    with pytest.raises(FileNotFoundError, match=r"warm_start: .*nowhere: no such directory"):
         train_ppo(ppo(tmp_path / "none", warm_start=(tmp_path / "nowhere",)), progress=False)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"evaluate_every": 0}, r"evaluate_every: expected at least 1, got 0"),
+        ({"evaluate_every": 0}, r"evaluate_every: expected an integer >= 1, got 0"),
         ({"std": 0.0}, r"std: expected a positive number, got 0.0"),
-        ({"seed": -1}, r"seed: expected a number from 0"),
+        ({"seed": -1}, r"seed: expected an integer from 0"),
         ({"family": "maze"}, r"family: expected one of .*got 'maze'"),
         ({"hidden": (0,)}, r"hidden: expected widths of at least 1"),
         ({"jump_start": 3.0}, r"jump_start: expected a number in \[0, 1\], got 3.0"),
         ({"critic_first": 1.0}, r"critic_first: expected a number in \[0, 1\), got 1.0"),
-        ({"last_std": 0.1, "ent_coef": 0.01}, "ent_coef: with last_std the noise is not learned; expected 0, got 0.01"),
-        ({"lidar_beams": 7}, "lidar_beams: expected an even number from 2 on, got 7"),
-        ({"divergence": 0.1}, r"divergence: without a clone there is nothing to diverge from, got 0.1"),
+        (
+            {"last_std": 0.1, "ent_coef": 0.01},
+            "ent_coef: expected 0, because last_std > 0 fixes the noise and its entropy, got 0.01",
+        ),
+        ({"lidar_beams": 7}, "lidar_beams: expected an even number >= 2, got 7"),
+        ({"divergence": 0.1}, r"divergence: expected 0 without a warm start of the actor .*, got 0.1"),
         ({"cloning": CloningConfig(epochs=0)}, r"cloning.epochs: expected a positive number, got 0"),
-        ({"cloning": CloningConfig(seed=3)}, r"cloning.seed: a run has one seed for all"),
+        ({"cloning": CloningConfig(seed=3)}, r"cloning.seed: expected 0, got 3; set the seed of the run"),
         ({"start": WarmStartConfig(slopes=0)}, r"start.slopes: expected a positive number, got 0"),
         ({"ent_coef": -1.0}, r"ent_coef: expected a number >= 0"),
     ],
 )
-def test_impossible_settings_are_told_before_anything_is_made(changes, message, tmp_path):
+def test_invalid_settings_are_reported_before_the_run_directory_is_created(changes, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         train_ppo(ppo(tmp_path / "run", **changes), progress=False)
     assert not (tmp_path / "run").exists()
@@ -293,31 +296,31 @@ def test_ppo_may_let_the_critic_learn_first_and_end_with_little_noise(demos, tmp
     clone, out = tmp_path / "clone", tmp_path / "ppo"
     train_bc(bc(clone, demos), progress=False)
     start = load_policy(clone)
-    for share in (0.99, 0.5):
-        config = ppo(out / str(share), warm_start=(clone,), critic_first=share, last_std=0.2)
+    for fraction in (0.99, 0.5):
+        config = ppo(out / str(fraction), warm_start=(clone,), critic_first=fraction, last_std=0.2)
         train_ppo(config, progress=False)
         policy = load_policy(config.out)
         same = [th.equal(a, b) for a, b in zip(actor_parameters(start), actor_parameters(policy), strict=True)]
-        assert all(same) if share == 0.99 else not any(same)
+        assert all(same) if fraction == 0.99 else not any(same)
         assert not th.equal(start.value_net.weight, policy.value_net.weight)
         assert th.allclose(policy.log_std.exp(), th.tensor(0.2))
 
 
 def test_ppos_robots_have_the_settings_of_the_run(tmp_path):
-    robots = _robots(ppo(tmp_path, control_period=0.1, penalty=7.0, lidar_beams=8))
+    robots = _training_env(ppo(tmp_path, control_period=0.1, penalty=7.0, lidar_beams=8))
     settings = robots.get_attr("settings")[0]
     assert (settings.control_period, settings.lidar_beams) == (0.1, 8)
     assert settings.collision_penalty == settings.miss_penalty == 7.0
-    assert _robots(sac(tmp_path)).get_attr("settings")[0].control_period == 0.05
+    assert _training_env(sac(tmp_path)).get_attr("settings")[0].control_period == 0.05
 
 
 def test_demonstrations_have_one_reward_only(demos, tmp_path):
-    with pytest.raises(ValueError, match="reward: demonstrations have the rewards of 'cost', got 'shaped'"):
+    with pytest.raises(ValueError, match="reward: expected 'cost', the reward of demonstrations, got 'shaped'"):
         train_ppo(ppo(tmp_path / "run", warm_start=(demos,), reward="shaped"), progress=False)
 
 
 def test_no_training_run_meets_the_scenarios_of_the_banks():
-    """The banks' own seeds are 0 and 1, and NumPy's first stream of a seed is that of the seed alone."""
+    """The seeds of the banks are 0 and 1; the first stream of a NumPy seed equals the seed itself."""
     from leapnav.envs import ScenarioBank, sample_scenario
 
     assert sample_scenario("clutter", 1).obstacles == ScenarioBank.shipped("clutter", "test")[0].obstacles
@@ -336,7 +339,7 @@ def test_tuned_settings_depend_on_the_family_and_the_warm_start():
     for kind, tables in configuration._DEFAULTS.items():
         settings = {field.name for field in fields(getattr(configuration, kind.removesuffix("-warm")))}
         assert set(tables) <= settings | {"open", "clutter", "polygons", "rooms", "slalom", "all"}
-    # A family's own, and of a part of the configuration.
+    # Settings of a family, in the run and in a nested configuration.
     assert DAggerRunConfig.tuned("open").hidden == (128, 128)
     assert DAggerRunConfig.tuned("open").dagger == DAggerConfig(rounds=2)
     assert DAggerRunConfig.tuned("clutter").dagger == DAggerConfig()

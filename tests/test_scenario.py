@@ -7,7 +7,8 @@ import pytest
 from helpers import scenario_fields
 
 from leapnav.envs import Scenario, ScenarioError
-from leapnav.envs.obstacles import clearance, proximity
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.proximity import proximity
 
 
 def square(x, y, side=1.0):

@@ -5,7 +5,7 @@ import pytest
 
 from leapnav.envs import Scenario, ScenarioBank, sample_scenario
 from leapnav.experts import find_optimum
-from leapnav.experts.problem import OptimalControlProblem, Path
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.second_opinion import Opinion, second_opinion, verify_bank
 
 
@@ -25,6 +25,7 @@ def test_a_reference_that_is_not_the_best_is_found_out(scenario):
     assert opinion.tried > 200
 
 
+@pytest.mark.slow
 def test_the_optimum_stands_against_a_hundred_times_the_effort(scenario):
     opinion = second_opinion(scenario)
     assert opinion.cost == find_optimum(scenario).cost
@@ -38,6 +39,7 @@ def test_a_scenario_without_a_path_has_none():
     assert (opinion.cost, opinion.tried, opinion.improvement) == (math.inf, 0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_whole_bank_gets_opinions_in_order_whatever_the_number_of_workers(tmp_path):
     from leapnav.experts import build_bank
 
@@ -50,13 +52,13 @@ def test_a_whole_bank_gets_opinions_in_order_whatever_the_number_of_workers(tmp_
 
 def test_ipopt_finds_the_same_optimum_by_other_means(scenario):
     pytest.importorskip("casadi")
-    from leapnav.experts.ipopt import Transcription
+    from leapnav.experts.search.ipopt import Transcription
 
     for other in (scenario, sample_scenario("polygons", 3)):
         optimum = find_optimum(other)
         times = np.linspace(0.0, other.horizon, 101)
         rng = np.random.default_rng(0)
-        guess = Path(times, optimum.evaluate(times)[0] + 0.02 * rng.normal(size=(101, 3)))
+        guess = Trajectory(times, optimum.evaluate(times)[0] + 0.02 * rng.normal(size=(101, 3)))
         problem = OptimalControlProblem.from_scenario(other).with_winding_of(guess.states)
         solution = Transcription(other, 100).solve(problem, guess)
         assert solution is not None

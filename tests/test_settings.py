@@ -23,7 +23,7 @@ from leapnav.envs import (
     Scenario,
     ScenarioBank,
 )
-from leapnav.envs.observations import GOAL_ENTRIES, MOTION_ENTRIES, WALL_ENTRIES
+from leapnav.envs.simulation.observations import GOAL_ENTRIES, MOTION_ENTRIES, WALL_ENTRIES
 
 ID, GOAL_ID = "leapnav/Navigate-v0", "leapnav/NavigateGoal-v0"
 EMPTY = {"start": [5.0, 5.0, 0.3], "goal": [6.0, 5.0, 0.0], "obstacles": []}
@@ -157,7 +157,7 @@ def test_shaping_leaves_the_optimal_policy_of_a_small_problem_as_it_is():
 
 
 def test_the_potential_rises_along_the_optimum():
-    """Following the reference, the shaped rewards tell early that all goes well; the plain ones do not."""
+    """Following the reference, the shaped rewards are positive early in the episode."""
     bank = ScenarioBank.shipped("rooms", "test")
     env = gym.make(ID, bank=bank, reward="shaped", discount=1.0)
     reference = bank.reference(3)
@@ -222,13 +222,13 @@ def test_the_motors_effort_is_that_of_the_motion():
 def test_in_contact_friction_slows_a_robot_down():
     wall = {"polygon": {"vertices": [[0.5, 5.3], [9.5, 5.3], [9.5, 5.6], [0.5, 5.6]]}}
     task = scenario(start=[1.0, 5.0, 0.3], goal=[9.0, 2.0, 0.0], obstacles=[wall], horizon=4.0)
-    ways = []
+    distances = []
     for friction in (0.0, 0.9):
         env = NavigateEnv(scenario=task, actuation="motor", motor={"friction": friction}, terminate_on_collision=False)
         steps = drive(env, [(0.5, 0.0)] * 60)
         assert steps[-1][4]["collision"]
-        ways.append(env.pose[0] - 1.0)
-    assert ways[1] < ways[0] - 0.2
+        distances.append(env.pose[0] - 1.0)
+    assert distances[1] < distances[0] - 0.2
 
 
 # Disturbances.
@@ -305,7 +305,7 @@ def test_the_reward_is_the_one_computed_from_the_goals(reward):
     assert steps[-1][4]["is_success"]
     if reward == "sparse":
         assert rewards.tolist() == [0.0] * 17 + [1.0] * 13
-        # After the end nothing is paid.
+        # After the end the reward is 0.
         assert env.step(np.zeros(2, np.float32))[1] == 0.0
         elsewhere = env.unwrapped.compute_reward(achieved, np.roll(desired, 1, axis=1), [{}] * len(steps))
         assert not elsewhere.any()

@@ -6,11 +6,17 @@ from helpers import best_known
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from leapnav.experts.lattice import Lattice
-from leapnav.experts.shortest_paths import (
+from leapnav.experts import OptimalControlProblem, Trajectory
+from leapnav.experts.search.candidates import CandidateSearch
+from leapnav.experts.search.direct import discretise, optimise
+from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.shortest_paths import (
     ANGLES,
     HEADINGS,
     MOVES,
+    Limits,
+    Metric,
+    Nodes,
     meeting_nodes,
     path_through,
     plane_costs,
@@ -21,7 +27,7 @@ COLUMNS, LINES, CELL, SPEED_WEIGHT, TURN_WEIGHT = 14, 12, 0.3, 1.5, 0.4
 
 
 def random_speed(seed):
-    """Speeds on the half-cell grid with some cells shut, and the border that the kernels rely on."""
+    """Return speeds on the half-cell grid with some closed cells, and the border that the kernels require."""
     rng = np.random.default_rng(seed)
     speed = rng.uniform(0.5, 2.0, (2 * COLUMNS - 1, 2 * LINES - 1))
     speed[rng.random(speed.shape) < 0.1] = np.inf
@@ -35,7 +41,7 @@ def node(i, j, heading):
 
 
 def graph(speed):
-    """The lattice as an explicit graph, from the definition of its edges."""
+    """Return the lattice as an explicit graph, from the definition of its edges."""
     heads, tails, weights = [], [], []
     for i in range(2, COLUMNS - 2):
         for j in range(2, LINES - 2):
@@ -60,11 +66,11 @@ def ends(speed):
 
 def trees(speed, reach):
     start, goal = ends(speed)
-    root, target, zero = np.array([start]), np.array([goal]), np.zeros(1)
-    bound = plane_costs(speed, root // HEADINGS, zero, CELL, SPEED_WEIGHT)
-    parameters = (CELL, SPEED_WEIGHT, TURN_WEIGHT, reach, 0.5)
-    behind = tree(speed, target, zero, root, zero, bound, False, *parameters, np.inf)
-    ahead = tree(speed, root, zero, target, zero, behind[0], True, *parameters, behind[2])
+    root, target = Nodes(np.array([start]), np.zeros(1)), Nodes(np.array([goal]), np.zeros(1))
+    metric = Metric(speed, CELL, SPEED_WEIGHT, TURN_WEIGHT)
+    bound = plane_costs(metric, root._replace(nodes=root.nodes // HEADINGS))
+    behind = tree(metric, target, root, bound, False, Limits(reach, 0.5, np.inf))
+    ahead = tree(metric, root, target, behind[0], True, Limits(reach, 0.5, behind[2]))
     return start, goal, bound, ahead, behind
 
 
@@ -101,14 +107,14 @@ def test_paths_through_meeting_nodes_are_paths_of_their_cost_in_order():
     assert (np.diff(costs) >= 0).all()
     assert costs[0] == pytest.approx(ahead[goal])
     edges = graph(speed)
-    for number in nodes[:: max(1, len(nodes) // 20)]:
-        path = path_through(number, parent, child)
+    for through in nodes[:: max(1, len(nodes) // 20)]:
+        path = path_through(through, parent, child)
         assert path[0] == start
         assert path[-1] == goal
-        assert number in path
-        assert sum(edges[a, b] for a, b in pairwise(path)) == pytest.approx(ahead[number] + behind[number])
-        # The edge behind the node is one of both trees: the path is no detour there.
-        assert child[number] < 0 or parent[child[number]] == number
+        assert through in path
+        assert sum(edges[a, b] for a, b in pairwise(path)) == pytest.approx(ahead[through] + behind[through])
+        # Both trees contain the edge behind the node, so the path is not a detour there.
+        assert child[through] < 0 or parent[child[through]] == through
 
 
 def test_a_goal_that_cannot_be_reached_leaves_both_trees_apart():
@@ -121,14 +127,11 @@ def test_a_goal_that_cannot_be_reached_leaves_both_trees_apart():
 
 
 def test_the_best_path_is_among_the_first_candidates():
-    """That the metric's order is one of promise is what the whole search rests on."""
-    from leapnav.experts.direct import discretise, optimise
-    from leapnav.experts.problem import OptimalControlProblem, Path
-
+    """The search relies on the cost in the metric to rank the candidates."""
     ranks = []
     for scenario, cost in best_known()[::4]:
         problem = OptimalControlProblem.from_scenario(scenario)
-        paths = (Path(c.times, c.poses) for c in Lattice(scenario).candidates())
+        paths = (Trajectory(c.times, c.poses) for c in CandidateSearch(Lattice(scenario)).candidates())
         optima = (optimise(problem.with_winding_of(path.states), discretise(path)).cost for path in paths)
         ranks.append(next(rank for rank, found in enumerate(optima) if found < cost * 1.005))
     assert np.median(ranks) == 0

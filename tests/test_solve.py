@@ -10,15 +10,15 @@ from leapnav.envs import Scenario
 from leapnav.experts import (
     ControlAffineSystem,
     OptimalControlProblem,
-    Path,
     SolveError,
     Status,
+    Trajectory,
     differential_drive,
     find_optimum,
     solve,
     unicycle_with_inertia,
 )
-from leapnav.experts.methods import METHODS
+from leapnav.experts.solve import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
@@ -60,7 +60,7 @@ def test_published_problems_are_solved_from_nothing(name, method):
     assert extremal.success, (extremal.status, extremal.certificate)
     assert extremal.cost == pytest.approx(cost, rel=1e-7)
     assert extremal.certificate.hamiltonian_drift <= 1e-8
-    assert extremal.work > 0
+    assert extremal.n_evaluations > 0
     assert extremal.history
 
 
@@ -93,13 +93,13 @@ def test_controls_that_saturate_do_so_to_the_last_digit(method):
 
 @pytest.mark.parametrize("method", ["multiple_shooting", "leapfrog", "collocation"])
 def test_a_horizon_too_long_for_simple_shooting(method):
-    # Simple shooting would have to know the costate to e^-T.
+    # Single shooting would need the costate to a precision of e^-T.
     costs = []
     for horizon in (10.0, 25.0, 100.0):
         extremal = solve(hyper_sensitive(horizon), method=method)
         assert extremal.success, extremal.status
         costs.append(extremal.cost)
-    assert costs[2] == pytest.approx(costs[1], rel=1e-8)  # all that happens, happens at the ends
+    assert costs[2] == pytest.approx(costs[1], rel=1e-8)  # the extremal is at rest except at the ends
     assert not solve(hyper_sensitive(100.0), method="single_shooting").success
 
 
@@ -148,7 +148,7 @@ def test_the_robot_with_other_controls_or_with_inertia():
         field=scenario.field,
     )
     optimum = find_optimum(scenario)
-    guess = Path(optimum.times, optimum.states)
+    guess = Trajectory(optimum.times, optimum.states)
     same = solve(unicycle_problem, method="multiple_shooting", guess=guess)
     assert same.success
     found = solve(wheels, method="multiple_shooting", guess=guess)
@@ -167,7 +167,7 @@ def test_the_robot_with_other_controls_or_with_inertia():
         (1.0, 1.0),
         field=scenario.field,
     )
-    found = solve(heavy, method="multiple_shooting", guess=Path(times, np.hstack([states, controls])))
+    found = solve(heavy, method="multiple_shooting", guess=Trajectory(times, np.hstack([states, controls])))
     assert found.success
     assert found.states[-1, 3:] == pytest.approx((0.0, 0.0), abs=1e-8)
     assert found.certificate.clearance > 0
@@ -207,14 +207,14 @@ def past_a_conjugate_point():
     return OptimalControlProblem(system, (0,), (0,), 4.0, (1.0,), state_cost=-(x**2) / 2)
 
 
-def shut():
+def blocked():
     walls = [{"polygon": {"vertices": [[5, y], [5.5, y], [5.5, y + 5.0], [5, y + 5.0]]}} for y in (0.0, 5.0)]
     fields = SCENARIOS["clutter-0"][0].to_dict()
     return Scenario.from_dict({**fields, "obstacles": walls, "start": [2, 5, 0.0], "goal": [8, 5, 0.0]})
 
 
 def in_the_way():
-    # A thin disc in the middle of the way, driven through because it is hardly felt.
+    # A thin disc on the straight path; its proximity cost is too small to prevent a collision.
     fields = SCENARIOS["clutter-0"][0].to_dict()
     fields["cost"]["proximity_weight"] = 1e-3
     disc = [{"circle": {"center": [5, 5], "radius": 0.02}}]
@@ -227,9 +227,9 @@ def straight(problem):
 
 
 VAN_DER_POL = PROBLEMS["van-der-pol-free-end"][0]
-# What provokes each status; HORIZON_TOO_SHORT is find_optimum's, see test_optimum.
+# A solve that ends with each status; only find_optimum returns HORIZON_TOO_SHORT, see test_optimum.
 FAILURES = {
-    Status.NO_PATH: lambda: solve(shut()),
+    Status.NO_PATH: lambda: solve(blocked()),
     Status.STALLED: lambda: solve(unreachable(), method="multiple_shooting"),
     Status.DIVERGED: lambda: solve(hyper_sensitive(100.0), method="single_shooting"),
     Status.SINGULAR: lambda: solve(uncontrollable(), method="multiple_shooting"),
@@ -265,8 +265,21 @@ def test_a_failure_is_raised_on_request_with_the_failed_result():
     assert caught.value.extremal.status is Status.STALLED
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     with pytest.raises(SolveError, match="clutter-0: NO_PATH"):
-        solve(shut(), raise_on_failure=True)
+        solve(blocked(), raise_on_failure=True)
     assert solve(VAN_DER_POL, raise_on_failure=True).success
+
+
+@pytest.mark.parametrize(("old", "new"), [("nodes", "n_nodes"), ("work", "n_evaluations")])
+def test_old_names_of_an_extremal_still_work(old, new):
+    extremal = solve(VAN_DER_POL)
+    with pytest.warns(DeprecationWarning, match=f"Extremal.{old} is now Extremal.{new}"):
+        assert getattr(extremal, old) == getattr(extremal, new) > 0
+
+
+def test_the_old_method_plot_of_an_extremal_draws_it(tmp_path):
+    with pytest.warns(DeprecationWarning, match=r"Extremal.plot is now leapnav.experts.plot_extremal"):
+        solve(VAN_DER_POL).plot(tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").exists()
 
 
 def test_half_of_a_cost_that_is_not_positive_moves_no_node():
@@ -279,7 +292,7 @@ def test_half_of_a_cost_that_is_not_positive_moves_no_node():
 
 
 def test_a_tighter_tolerance_gives_a_smaller_residual():
-    # H drifts where nodes do not fit together.
+    # H drifts because of the defects at the nodes.
     drifts = [
         solve(PROBLEMS["se2-side-step"][0], method="multiple_shooting", tol=tol).certificate.hamiltonian_drift
         for tol in (1e-6, 1e-11)
@@ -349,13 +362,13 @@ def test_no_path_has_its_own_status():
         ({"tol": 0.0}, "tol: .*0.0"),
         ({"max_iterations": 0}, "max_iterations: .*0"),
         ({"segments": 0}, "segments: .*0"),
-        ({"guess": Path(np.array([0.0]), np.zeros((1, 3)))}, "guess: its times"),
+        ({"guess": Trajectory(np.array([0.0]), np.zeros((1, 3)))}, "guess: its times"),
         (
-            {"guess": Path(np.array([0.0, 1.0]), np.zeros((2, 3)))},
+            {"guess": Trajectory(np.array([0.0, 1.0]), np.zeros((2, 3)))},
             "guess: its times must run from 0 to 5.4, not 0 to 1",
         ),
-        ({"guess": Path(np.array([0.0, 5.4]), np.zeros((2, 2)))}, "guess: its states must have shape"),
-        ({"guess": Path(np.array([0.0, 5.4]), np.full((2, 3), np.nan))}, "guess: its states are not finite"),
+        ({"guess": Trajectory(np.array([0.0, 5.4]), np.zeros((2, 2)))}, "guess: its states must have shape"),
+        ({"guess": Trajectory(np.array([0.0, 5.4]), np.full((2, 3), np.nan))}, "guess: its states are not finite"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

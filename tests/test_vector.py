@@ -10,7 +10,7 @@ from helpers import scenario_fields
 
 import leapnav  # noqa: F401 (registers)
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
-from leapnav.envs.obstacles import clearance
+from leapnav.envs.shapes.clearance import clearance
 
 ID, GOAL_ID = "leapnav/Navigate-v0", "leapnav/NavigateGoal-v0"
 SETTINGS = [
@@ -232,7 +232,7 @@ def test_gymnasium_s_vector_wrappers_accept_the_environment(tmp_path):
         (lambda: make(2, render_mode="human"), "render_mode: expected None or one of rgb_array, got 'human'"),
         (lambda: make(2, lidar_beams=-3), "lidar_beams: .*-3"),
         (lambda: make(2).reset(seed=1.5), "seed: expected an integer or a list of them, got 1.5"),
-        (lambda: make(2).reset(seed=[1, 2.7]), "seed: expected integers >= 0, got 2.7"),
+        (lambda: make(2).reset(seed=[1, 2.7]), "seed: expected an integer >= 0, got 2.7"),
         (lambda: make(2).reset(seed=[1, 2, 3]), "seed: expected one for each of 2 robots, got 3"),
         (lambda: make(2).reset(options={"index": [1, 2, 3]}), "index: expected one for each of 2 robots, got 3"),
         (lambda: make(2).reset(options={"mask": 1}), "options: .*'mask'"),

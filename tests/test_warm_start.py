@@ -5,20 +5,20 @@ from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
 from leapnav.envs import NavigateEnv, ScenarioBank, sample_scenario
-from leapnav.envs.observer import Observer
+from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import ExpertPolicy
-from leapnav.experts.rollouts import rollout
+from leapnav.experts.data.rollouts import rollout
 from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_vec_env, network, warm_start
-from leapnav.training.actors import mean_action
-from leapnav.training.anchored import AnchoredPolicy
 from leapnav.training.config import WarmStartConfig
-from leapnav.training.jump_start import JumpStart
-from leapnav.training.replay import DemonstrationReplayBuffer, imitate
-from leapnav.training.rewards import ScaledReward
+from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
+from leapnav.training.policies.actors import mean_action
+from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
+from leapnav.training.robots.jump_start import JumpStart
+from leapnav.training.robots.rewards import ScaledReward
 
 
 def small():
-    return network((64, 64))  # a new one for each: SB3 adds to it
+    return network((64, 64))  # a new dict for each model: SB3 modifies it
 
 
 CLONING = CloningConfig(epochs=4, batch_size=256)
@@ -64,7 +64,7 @@ def test_the_critic_of_ppo_is_the_cost_to_go(dataset):
 
 
 def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
-    """The slope of the value along the state, on scenarios that were not seen, with and without the costates."""
+    """Fitting the costates reduces the error of the value's gradient on unseen scenarios."""
     test = [sample_scenario("open", seed) for seed in range(900, 906)]
     errors = []
     for gradient in (True, False):
@@ -87,12 +87,12 @@ def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
 
 
 def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
-    """At the expert's action the value; at others less, by what the Hamiltonian says."""
+    """Q is the value at the expert's action, and lower at other actions by the cost according to the Hamiltonian."""
     model = SAC("MlpPolicy", make_vec_env(n_envs=1, family="open"), policy_kwargs=small(), gamma=1.0, seed=0)
     config = WarmStartConfig(actor=False, critic_epochs=90, critic_batch_size=512, slopes=5000)
     found = warm_start(model, dataset, config, progress=False)
     assert found.value_error < 0.05
-    # What an action costs beside the expert's, as the first differences of the Q functions have it.
+    # The excess cost of other actions, as the difference of the Q values.
     chosen = np.random.default_rng(0).integers(len(dataset), size=2000)
     inputs, best = th.as_tensor(dataset.observations[chosen]), th.as_tensor(dataset.actions[chosen])
     other = (best + th.tensor([0.6, 0.6]) * th.sign(-best)).clamp(-1, 1)
@@ -106,7 +106,7 @@ def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
 
 
 def test_discounted_values_shrink():
-    from leapnav.training.warmstart import _Rewards
+    from leapnav.training.learning.warm_start import _Rewards
 
     # Ten steps of cost 1 each.
     assert _Rewards(0.9, 0.05, 1.0).factors(np.array([0.5])) * 10 == pytest.approx(sum(0.9**k for k in range(10)))
@@ -140,13 +140,13 @@ def test_bad_settings_are_named(settings, message, dataset):
 
 
 @pytest.mark.parametrize("quiet", [0.0, 10.0])
-def test_the_divergence_from_the_anchor_is_that_of_two_gaussians(quiet):
+def test_the_divergence_from_the_reference_is_that_of_two_gaussians(quiet):
     env = NavigateEnv("open")
     weights = {"divergence_weight": 2.0, "entropy_weight": 0.5, "quiet": quiet}
-    policy = AnchoredPolicy(env.observation_space, env.action_space, lambda _: 1e-3, **weights, **small())
+    policy = KLRegularizedPolicy(env.observation_space, env.action_space, lambda _: 1e-3, **weights, **small())
     observations = th.as_tensor(np.stack([env.reset(seed=seed)[0] for seed in range(5)]))
     actions = th.zeros(5, 2)
-    policy.drop_anchor()
+    policy.set_reference()
     entropy = policy.get_distribution(observations).entropy()
     assert th.allclose(policy.evaluate_actions(observations, actions)[2], 0.5 * entropy)
     before = policy.get_distribution(observations).distribution
@@ -154,18 +154,19 @@ def test_the_divergence_from_the_anchor_is_that_of_two_gaussians(quiet):
         policy.action_net.bias += 0.3
         policy.log_std += 0.2
     now = policy.get_distribution(observations).distribution
-    divergence = th.distributions.kl_divergence(now, before).sum(dim=1)
+    ratio, distance = (now.stddev / before.stddev).square(), (now.mean - before.mean) / before.stddev
+    divergence = 0.5 * (ratio - 1 - ratio.log() + distance.square()).sum(dim=1)
     found = policy.evaluate_actions(observations, actions)[2]
     assert th.allclose(found, 0.5 * now.entropy().sum(dim=1) - 2.0 * divergence, atol=1e-5)
     assert policy.divergence == pytest.approx(divergence.mean().item(), rel=1e-5)
-    # The anchor is no parameter that an optimiser would move.
+    # The optimiser does not change the reference.
     moved = {id(p) for group in policy.optimizer.param_groups for p in group["params"]}
-    assert not any(id(p) in moved for p in policy.anchor.parameters())
+    assert not any(id(p) in moved for p in policy.reference_actor.parameters())
 
 
 def test_exploration_fades_before_the_horizon(tmp_path):
     env = NavigateEnv("open")
-    policy = AnchoredPolicy(
+    policy = KLRegularizedPolicy(
         env.observation_space, env.action_space, lambda _: 1e-3, quiet=2.0, log_std_init=0.0, **small()
     )
     observations = th.as_tensor(np.stack([env.reset(seed=0)[0]] * 3))
@@ -177,17 +178,17 @@ def test_exploration_fades_before_the_horizon(tmp_path):
     assert th.allclose(likelihoods, again)
     assert values.shape == (3, 1)
     policy.save(tmp_path / "policy")
-    loaded = AnchoredPolicy.load(tmp_path / "policy")
+    loaded = KLRegularizedPolicy.load(tmp_path / "policy")
     assert th.equal(loaded.get_distribution(observations).distribution.stddev, spread)
 
 
-def test_a_divergence_holds_ppo_near_its_anchor():
+def test_a_divergence_keeps_ppo_close_to_its_reference():
     distances = []
     for weight in (0.0, 10.0):
         venv = make_vec_env(n_envs=4, family="open", seed=0)
         kwargs = {**small(), "log_std_init": -1.0}
         model = PPO(
-            AnchoredPolicy,
+            KLRegularizedPolicy,
             venv,
             n_steps=64,
             batch_size=64,
@@ -196,7 +197,7 @@ def test_a_divergence_holds_ppo_near_its_anchor():
             policy_kwargs=kwargs,
             seed=0,
         )
-        model.policy.drop_anchor()
+        model.policy.set_reference()
         model.policy.divergence_weight = weight
         model.learn(1024)
         observations = th.as_tensor(venv.reset())
@@ -208,7 +209,7 @@ def test_a_divergence_holds_ppo_near_its_anchor():
 def test_a_jump_start_begins_on_the_optimum_with_the_time_that_is_left():
     bank = ScenarioBank.shipped("open", "train")
     robots = make_vec_env(n_envs=8, family="open", split="fresh", seed=0)
-    venv = JumpStart(robots, [bank], share=0.9, probability=1.0, seed=0)
+    venv = JumpStart(robots, [bank], max_fraction=0.9, probability=1.0, seed=0)
     venv.reset()
     names = {bank[i].name: i for i in range(len(bank))}
     jumped = 0
@@ -216,9 +217,9 @@ def test_a_jump_start_begins_on_the_optimum_with_the_time_that_is_left():
         observations, _, dones, _ = venv.step(np.zeros((8, 2), np.float32))
         for i in np.flatnonzero(dones):
             scenario = robots.get_attr("scenario")[i]
-            number = names[scenario.name]
-            reference = bank.reference(number)
-            gone = bank[number].horizon - scenario.horizon
+            index = names[scenario.name]
+            reference = bank.reference(index)
+            gone = bank[index].horizon - scenario.horizon
             at = np.interp(gone, reference.times, reference.states[:, 0])
             assert scenario.start[0] == pytest.approx(at, abs=1e-3)
             assert observations[i, 4] == pytest.approx(scenario.horizon, abs=1e-4)
@@ -228,7 +229,9 @@ def test_a_jump_start_begins_on_the_optimum_with_the_time_that_is_left():
 
 def test_without_a_share_nothing_jumps():
     one = make_vec_env(n_envs=4, family="open", seed=0)
-    other = JumpStart(make_vec_env(n_envs=4, family="open", seed=0), [ScenarioBank.shipped("open", "train")], share=0.0)
+    other = JumpStart(
+        make_vec_env(n_envs=4, family="open", seed=0), [ScenarioBank.shipped("open", "train")], max_fraction=0.0
+    )
     np.testing.assert_array_equal(one.reset(), other.reset())
     for _ in range(300):
         found = [venv.step(np.zeros((4, 2), np.float32))[0] for venv in (one, other)]
@@ -261,7 +264,7 @@ def test_batches_hold_their_share_of_demonstrations(dataset):
 
 @pytest.mark.parametrize("kind", [SAC, TD3])
 def test_imitation_holds_an_actor_to_the_demonstrations(kind, dataset):
-    """With a critic that knows nothing the actor drifts from a clone, unless its errors are in its loss."""
+    """With an untrained critic the actor drifts away from a clone, unless its loss has the imitation term."""
     error = {}
     for weight in (0.0, 100.0):
         venv = make_vec_env(n_envs=2, seed=0, family="open", split="fresh")

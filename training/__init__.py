@@ -1,39 +1,33 @@
-"""Learning from the optimum, and the score that says how near a policy comes to it."""
+"""Training of policies with the expert and by reinforcement learning, and their evaluation against the optimum."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from leapnav.training.config import (
+    BCConfig,
+    CloningConfig,
+    DAggerConfig,
+    DAggerRunConfig,
+    PPOConfig,
+    SACConfig,
+    WarmStartConfig,
+)
+
 if TYPE_CHECKING:
-    from leapnav.training.baselines import GoToGoal, RandomPolicy
-    from leapnav.training.cloning import EpochLoss, behaviour_clone
-    from leapnav.training.config import (
-        BCConfig,
-        CloningConfig,
-        DAggerConfig,
-        DAggerRunConfig,
-        PPOConfig,
-        SACConfig,
-        WarmStartConfig,
-    )
-    from leapnav.training.dagger import DAgger
-    from leapnav.training.dataset import Dataset
-    from leapnav.training.evaluation import Episode, Evaluation, Policy, evaluate
-    from leapnav.training.html_report import write_report
-    from leapnav.training.imitation import train_bc, train_dagger
-    from leapnav.training.policies import (
-        NavigationFeatures,
-        load_policy,
-        make_policy,
-        network,
-        policy_environment,
-        save_policy,
-        shipped_policies,
-    )
-    from leapnav.training.reinforcement import train_ppo, train_sac
-    from leapnav.training.replay import DemonstrationReplayBuffer, imitate
-    from leapnav.training.scores import Interval, Score, profile, score
-    from leapnav.training.vec_env import NavigateVecEnv, make_vec_env
-    from leapnav.training.warmstart import WarmStart, warm_start
+    from leapnav.training.learning.cloning import EpochLoss, behaviour_clone
+    from leapnav.training.learning.dagger import DAgger
+    from leapnav.training.learning.dataset import Dataset
+    from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
+    from leapnav.training.learning.warm_start import WarmStart, warm_start
+    from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
+    from leapnav.training.policies.files import load_policy, policy_environment, save_policy, shipped_policies
+    from leapnav.training.policies.network import NavigationFeatures, make_policy, network
+    from leapnav.training.robots.vec_env import NavigateVecEnv, make_vec_env
+    from leapnav.training.runs.imitation import train_bc, train_dagger
+    from leapnav.training.runs.reinforcement import train_ppo, train_sac
+    from leapnav.training.scoring.evaluation import Episode, Evaluation, Policy, evaluate
+    from leapnav.training.scoring.html_report import write_report
+    from leapnav.training.scoring.scores import Interval, Score, profile, score
 
 __all__ = [
     "BCConfig",
@@ -77,43 +71,28 @@ __all__ = [
     "write_report",
 ]
 
-# Loaded when first used: torch takes seconds, which `leapnav solve` and `leapnav --help` need not spend.
-_MODULES = {
-    "baselines": ("GoToGoal", "RandomPolicy"),
-    "cloning": ("EpochLoss", "behaviour_clone"),
-    "config": (
-        "BCConfig",
-        "CloningConfig",
-        "DAggerConfig",
-        "DAggerRunConfig",
-        "PPOConfig",
-        "SACConfig",
-        "WarmStartConfig",
-    ),
-    "dagger": ("DAgger",),
-    "dataset": ("Dataset",),
-    "evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
-    "policies": (
-        "NavigationFeatures",
-        "load_policy",
-        "make_policy",
-        "network",
-        "policy_environment",
-        "save_policy",
-        "shipped_policies",
-    ),
-    "html_report": ("write_report",),
-    "imitation": ("train_bc", "train_dagger"),
-    "reinforcement": ("train_ppo", "train_sac"),
-    "replay": ("DemonstrationReplayBuffer", "imitate"),
-    "scores": ("Interval", "Score", "profile", "score"),
-    "vec_env": ("NavigateVecEnv", "make_vec_env"),
-    "warmstart": ("WarmStart", "warm_start"),
+# Names of modules that import torch, which takes seconds; `leapnav solve` and `leapnav --help` do not need it. They are
+# imported at first use. The imports above are for type checkers, which do not evaluate `__getattr__`.
+_LAZY = {
+    "learning.cloning": ("EpochLoss", "behaviour_clone"),
+    "learning.dagger": ("DAgger",),
+    "learning.dataset": ("Dataset",),
+    "learning.replay": ("DemonstrationReplayBuffer", "imitate"),
+    "learning.warm_start": ("WarmStart", "warm_start"),
+    "policies.baselines": ("GoToGoal", "RandomPolicy"),
+    "policies.files": ("load_policy", "policy_environment", "save_policy", "shipped_policies"),
+    "policies.network": ("NavigationFeatures", "make_policy", "network"),
+    "robots.vec_env": ("NavigateVecEnv", "make_vec_env"),
+    "runs.imitation": ("train_bc", "train_dagger"),
+    "runs.reinforcement": ("train_ppo", "train_sac"),
+    "scoring.evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
+    "scoring.html_report": ("write_report",),
+    "scoring.scores": ("Interval", "Score", "profile", "score"),
 }
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _MODULES.items():
+    for module, names in _LAZY.items():
         if name in names:
-            return getattr(import_module(f"leapnav.training.{module}"), name)
+            return getattr(import_module(f"{__name__}.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

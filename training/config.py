@@ -1,4 +1,4 @@
-"""Settings of the training runs: plain data, so that the command line can show them without loading torch."""
+"""Settings of the training runs: plain dataclasses, which the command line shows without loading torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self
 
-# Of the runs, by the name of their class; "-warm" for warm starts; in a table of its own what holds for a family alone.
+from leapnav.deprecated import renamed_fields
+
+# Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start; a sub-table
+# with the name of a family contains the changes for this family.
 _DEFAULTS: dict[str, Any] = tomllib.loads(files("leapnav.training").joinpath("defaults.toml").read_text())
 
 
@@ -18,115 +21,117 @@ class CloningConfig:
     """Settings of behaviour cloning."""
 
     epochs: int = 12
-    """Passes over the samples, at most."""
+    """Maximum number of passes over the samples."""
     patience: int = 5
-    """Stop after so many epochs without a lower validation loss; 0: never. The best epoch's weights are kept."""
+    """Epochs without a lower validation loss before the fit stops; 0: no early stopping. The weights of the best epoch
+    are kept."""
     batch_size: int = 2048
     """Samples per gradient step."""
     learning_rate: float = 2e-3
-    """Peak of the learning rate, which then falls to zero along a cosine."""
+    """Peak learning rate (cosine decay to zero)."""
     weight_decay: float = 1e-4
-    """Of AdamW."""
+    """AdamW weight decay."""
     validation_share: float = 0.05
-    """Share of the obstacle courses that is held out to measure the loss."""
+    """Fraction of the obstacle courses held out for the validation loss."""
     loss: Literal["action", "hamiltonian"] = "action"
-    """"action": Huber's loss of the error, each component in units of its spread; "hamiltonian": what the error costs
-    per second, H(q, lambda, u) - H(q, lambda, u*) with the expert's costate."""
+    """Loss of an action: "action": Huber loss of the error, each component in units of its spread; "hamiltonian": cost
+    of the error per second, H(q, lambda, u) - H(q, lambda, u*) with the expert's costate lambda."""
     augment: bool = True
-    """Use the mirrored and the turned-round twins of the samples too."""
+    """Augmentation with mirrored and time-reversed samples."""
     seed: int = 0
-    """Of the split, the order of the samples and the twins."""
+    """Random seed of the validation split, the order of the samples and the augmentation."""
 
 
+@renamed_fields(failures="max_failures", episodes="max_episodes")
 @dataclass(frozen=True)
 class DAggerConfig:
-    """Settings of dataset aggregation."""
+    """Settings of dataset aggregation (DAgger)."""
 
     rounds: int = 8
-    """How often the learner drives, the expert takes over, and the learner is fitted to all that the expert did."""
-    failures: int = 300
-    """Failed episodes after which a round's driving ends; in each the expert takes over a dozen times at most."""
-    episodes: int = 15_000
-    """Episodes that the learner drives in a round at most."""
+    """Number of rounds: rollouts of the learner, takeovers by the expert, fit to all samples."""
+    max_failures: int = 300
+    """Failed episodes per round before relabelling; the expert takes over at most 12 times in each."""
+    max_episodes: int = 15_000
+    """Maximum number of episodes per round."""
     successes: float = 1.0
-    """For each failed episode so many others in which the expert takes over, once each."""
+    """Successful episodes with one takeover each, per failed episode."""
     lead: float = 3.0
-    """s for which the expert drives; then it is where demonstrations lead anyway."""
+    """Time that the expert drives after a takeover (s)."""
     epochs: int = 2
-    """Passes over all samples after each round but the last."""
+    """Passes over all samples after each round except the last."""
     last_epochs: int = 8
     """Passes over all samples after the last round."""
     learning_rate: float = 1e-3
-    """Peak of the learning rate after each round, which then falls to zero along a cosine."""
+    """Peak learning rate of each round (cosine decay to zero)."""
     seed: int = 0
-    """Of the scenarios and of when the expert takes over."""
+    """Random seed of the scenarios and the times of the takeovers."""
 
 
 @dataclass(frozen=True)
 class WarmStartConfig:
-    """Settings of a warm start; each part can be left out."""
+    """Settings of a warm start from demonstrations. Each of its parts can be switched off."""
 
     actor: bool = True
-    """Clone the expert's actions."""
+    """Behaviour cloning of the actor."""
     critic: bool = True
-    """Fit the critic to the expert's cost-to-go."""
+    """Fit of the critic to the expert's cost-to-go."""
     gradient: bool = True
-    """Fit the critic's gradient to the costate too."""
+    """Fit of the critic's gradient to the costate."""
     critic_epochs: int = 3
-    """Passes over the samples, for the critic."""
+    """Passes over the samples for the critic."""
     critic_learning_rate: float = 3e-3
-    """Peak of the critic's learning rate, which then falls to zero along a cosine."""
+    """Peak learning rate of the critic (cosine decay to zero)."""
     critic_batch_size: int = 4096
-    """Samples per gradient step, for the critic."""
+    """Samples per gradient step of the critic."""
     gradient_weight: float = 0.3
-    """Of the error of the gradient by the state, and for Q functions by the action, beside that of the value; each in
-    units of its spread."""
+    """Weight of the gradient error (by the state; for Q functions also by the action) relative to the value error, both
+    in units of their spread."""
     slopes: int = 200_000
-    """How many samples the gradient is fitted at."""
+    """Number of samples at which the gradient is fitted."""
     seed: int = 0
-    """Of the order of the samples and of the directions of the gradient."""
+    """Random seed of the order of the samples and the directions of the gradient."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """What all training runs have in common."""
+    """Settings shared by all training runs."""
 
     out: Path
-    """Folder of the run: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
+    """Run directory: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms, slalom or all."""
     seed: int = 0
-    """Of everything that is random."""
+    """Random seed."""
     resume: bool = False
-    """Go on with the run that the folder holds."""
+    """Continuation of the run in the directory."""
     hidden: tuple[int, ...] = (256, 256, 256)
-    """Widths of the actor's and the critic's hidden layers."""
+    """Widths of the hidden layers of the actor and the critic."""
     lidar_beams: int = 128
-    """Beams of the robot's lidar. Demonstrations were seen with those of the environment's defaults, and are seen anew
-    with these: with 32 many a gap looks wide enough that is not. A policy to start from must have as many."""
+    """Number of lidar beams, an even number. Demonstrations are observed again with these beams; a policy to start from
+    must have the same number. With 32 beams, narrow passages cannot be distinguished from wide ones."""
     evaluation_scenarios: int = 100
-    """Scenarios of each family's test split that an evaluation on the way plays; the last one plays all."""
+    """Scenarios per family of the test split in an evaluation during the run; the final evaluation plays all."""
 
     @property
     def environment(self) -> dict[str, Any]:
-        """The arguments of the environment that what is observed depends on."""
+        """Arguments of the environment that determine the observation."""
         return {"lidar_beams": self.lidar_beams}
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, **changes: Any) -> Self:
-        """The settings that were tuned for a family, from the file `defaults.toml`, with changes.
+        """Return the settings tuned for a family (file `defaults.toml`), with changes.
 
         Args:
             family: one of the families, or "all".
-            warm: whether those for a warm start; None: if `changes` have a `warm_start`.
-            changes: of any settings.
+            warm: whether to use the settings of a warm start; None: if `changes` contains a `warm_start`.
+            changes: values of any settings.
 
         Raises:
-            ValueError: there is no such family.
+            ValueError: the family does not exist.
 
         """
-        if family != cls.family:  # the default is one; whoever only asks for help need not wait for the others
-            from leapnav.envs.families import check_family
+        if family != cls.family:  # the default is valid; `--help` does not have to load the environments
+            from leapnav.envs.scenarios.families import check_family
 
             check_family(family)
         if warm is None:
@@ -134,159 +139,160 @@ class RunConfig:
         config = cls(out=Path(), family=family)
         for section in ("RunConfig", cls.__name__, f"{cls.__name__}-warm")[: 3 if warm else 2]:
             table = _DEFAULTS.get(section, {})
-            settings = {setting.name for setting in fields(config)}
-            common = {name: value for name, value in table.items() if name in settings}  # the others are families
-            config = _changed(_changed(config, common), table.get(family, {}))
+            names = {setting.name for setting in fields(config)}
+            common = {name: value for name, value in table.items() if name in names}  # the other keys are families
+            config = _replace_nested(_replace_nested(config, common), table.get(family, {}))
         return replace(config, **changes)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BCConfig(RunConfig):
-    """Clone the expert: a policy fitted to its demonstrations."""
+    """Behaviour cloning: fit a policy to demonstrations of the expert."""
 
     demos: tuple[Path, ...] = ()
-    """Folders that `leapnav rollout` wrote; without any, demonstrations are made first, in the run's folder."""
+    """Directories written by `leapnav rollout`; if none is given, demonstrations are generated in the run directory."""
     scenarios: int = 10_000
-    """How many scenarios are demonstrated if none are given."""
+    """Number of scenarios to demonstrate if no demonstrations are given."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
-    """Settings of the fit; its seed is the run's."""
+    """Settings of the fit; the seed is that of the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DAggerRunConfig(RunConfig):
-    """Dataset aggregation: the learner drives, the expert says what it would have done there."""
+    """Dataset aggregation (DAgger): the learner drives, the expert takes over and provides the labels."""
 
     demos: tuple[Path, ...] = ()
-    """Folders that `leapnav rollout` wrote, for the clone that is the first learner and among the samples; without any,
-    demonstrations are made first, in the run's folder."""
+    """Directories written by `leapnav rollout`, for the clone that is the first learner and for the dataset; if none is
+    given, demonstrations are generated in the run directory."""
     scenarios: int = 10_000
-    """How many scenarios are demonstrated if none are given."""
+    """Number of scenarios to demonstrate if no demonstrations are given."""
     policy: Path | None = None
-    """A policy that is the first learner instead of a new clone."""
+    """Policy to use as the first learner instead of a new clone."""
     n_envs: int = 256
-    """Robots that drive at once."""
+    """Number of parallel robots."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
-    """Settings of the first clone, and of the loss and the batches of all fits; its seed is the run's."""
+    """Settings of the first clone, and loss and batch size of all fits; the seed is that of the run."""
     dagger: DAggerConfig = field(default_factory=DAggerConfig)
-    """Settings of the aggregation; its seed is the run's."""
+    """Settings of the aggregation; the seed is that of the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _LearnerConfig(RunConfig):
-    """What the runs of reinforcement learning have in common."""
+    """Settings shared by the runs of reinforcement learning."""
 
     reward_scale: float = 0.1
     """Factor of the rewards."""
     graded_miss: bool = True
-    """While it learns a miss costs from a fifth of the penalty on, by how far from the goal the episode ends. Otherwise
-    nothing says where success lies, and standing still is best. PPO from a clone knows where."""
+    """Penalty of a missed goal during training graded by the distance from the goal pose, from 1/5 of the penalty up to
+    the full penalty. Without it, the learner has no information about the goal and may learn to stand still; PPO from
+    a clone does not need it."""
     warm_start: tuple[Path, ...] = ()
-    """Demonstrations (folders that `leapnav rollout` wrote) and at most one policy (a run's folder) to start from: the
-    actor is a clone of the demonstrations, or the policy's; the critic is fitted to the demonstrations, if any."""
+    """Demonstrations (directories written by `leapnav rollout`) and at most one policy (a run directory) to start from:
+    the actor is the policy's, or else a clone of the demonstrations; the critic is fitted to the demonstrations."""
     start: WarmStartConfig = field(default_factory=WarmStartConfig)
-    """Settings of the warm start; its seed is the run's."""
+    """Settings of the warm start; the seed is that of the run."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
-    """Settings of the clone that a warm start makes; its seed is the run's."""
+    """Settings of the clone made by a warm start; the seed is that of the run."""
     jump_start: float = 0.0
-    """Share of an episode's time that the expert drives at most, at first; it falls to zero along a line. 0: none."""
+    """Maximum fraction of an episode driven by the expert at the start of the run (linear decay to zero); 0: none."""
     jump_start_until: float = 0.5
-    """Share of the steps after which the expert drives no more."""
+    """Fraction of the run after which the expert does not drive."""
     evaluate_every: int = 200_000
-    """Steps between evaluations."""
+    """Environment steps between evaluations."""
     checkpoint_every: int = 200_000
-    """Steps between checkpoints."""
+    """Environment steps between checkpoints."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig(_LearnerConfig):
-    """Proximal policy optimisation. These are the settings from scratch; `tuned` knows those of a warm start."""
+    """Proximal policy optimisation. The defaults are for training from scratch; `tuned` has those of a warm start."""
 
     total_timesteps: int = 5_000_000
-    """Control periods of all robots together."""
+    """Environment steps of all robots together."""
     n_envs: int = 64
-    """Robots that drive at once."""
+    """Number of parallel robots."""
     learning_rate: float = 1e-3
-    """At first; it falls to zero along a line."""
+    """Initial learning rate (linear decay to zero)."""
     gamma: float = 1.0
-    """Discount factor. The horizon is finite and observed, so 1 is possible, and the critic's values are minus the
-    costs to go then."""
+    """Discount factor. 1 is possible because the horizon is finite and observed; the critic's values are then the
+    negative cost-to-go."""
     control_period: float = 0.2
-    """s between actions while it learns: with fewer decisions in an episode each matters more. What it learns is
-    evaluated with the environment's own."""
+    """Time between actions during training (s); evaluations use the environment's default. With fewer decisions per
+    episode, each has a larger effect."""
     penalty: float = 50.0
-    """Of a collision, which is a miss too, and of a miss while it learns. The defaults of most warm starts have less
-    than the environment's own: most episodes succeed then, and the noise of a high penalty would drown the cost."""
+    """Penalty of a collision or of a missed goal during training. Most warm starts use less than the environment's
+    default: most of their episodes succeed, and a high penalty would add noise to the returns."""
     reward: Literal["cost", "shaped"] = "shaped"
-    """Reward of the environment; "shaped" tells on the way how near the goal is."""
+    """Reward of the environment; "shaped" adds potential-based shaping towards the goal."""
     n_steps: int = 64
-    """Control periods of each robot between two updates."""
+    """Environment steps of each robot between two updates."""
     batch_size: int = 512
     """Samples per gradient step."""
     n_epochs: int = 6
-    """Passes over the samples of an update."""
+    """Passes over the samples per update."""
     gae_lambda: float = 0.95
-    """Of the generalised advantage estimate."""
+    """Factor lambda of the generalised advantage estimate."""
     clip_range: float = 0.2
-    """Of the ratio of likelihoods."""
+    """Clipping range of the probability ratio."""
     ent_coef: float = 0.0
-    """Weight of the entropy."""
+    """Entropy coefficient."""
     std: float = 0.3
-    """Standard deviation of the actions at first."""
+    """Initial standard deviation of the actions."""
     last_std: float = 0.1
-    """Standard deviation of the actions at the end, to which it goes along a line; 0: it is learned."""
+    """Final standard deviation of the actions (linear schedule); 0: the standard deviation is learned."""
     quiet: float = 2.0
-    """s before the horizon from which on that noise fades, to a third."""
+    """Time before the horizon at which the action noise starts to decrease, to 30 % of its standard deviation (s)."""
     critic_first: float = 0.0
-    """Share of the steps, at first, in which the critic alone learns."""
+    """Initial fraction of the run in which only the critic learns."""
     divergence: float = 0.0
-    """Weight of the divergence from the clone, at first; it falls to zero along a line. 0: none."""
+    """Initial weight of the divergence from the clone (linear decay to zero); 0: none."""
     divergence_until: float = 0.5
-    """Share of the steps after which the divergence does not count any more."""
+    """Fraction of the run after which the weight of the divergence is zero."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SACConfig(_LearnerConfig):
-    """Soft actor-critic, or its variant with truncated quantile critics, from scratch or from a warm start."""
+    """Soft actor-critic (SAC), or truncated quantile critics (TQC), from scratch or from a warm start."""
 
     algorithm: Literal["sac", "tqc"] = "sac"
-    """"tqc" needs the extra `contrib`."""
+    """Algorithm; "tqc" requires the extra `contrib`."""
     total_timesteps: int = 200_000
-    """Control periods of all robots together."""
+    """Environment steps of all robots together."""
     n_envs: int = 16
-    """Robots that drive at once."""
+    """Number of parallel robots."""
     learning_rate: float = 3e-4
-    """At first; it falls to zero along a line."""
+    """Initial learning rate (linear decay to zero)."""
     gamma: float = 0.99
     """Discount factor."""
     reward: Literal["cost", "shaped"] = "shaped"
-    """Reward of the environment; "shaped" tells on the way how near the goal is."""
+    """Reward of the environment; "shaped" adds potential-based shaping towards the goal."""
     batch_size: int = 512
     """Samples per gradient step."""
     gradient_steps: int = 4
-    """Per control period of all robots."""
+    """Gradient steps per step of the vector environment."""
     buffer_size: int = 500_000
-    """Transitions that are remembered."""
+    """Capacity of the replay buffer (transitions)."""
     learning_starts: int = 5_000
-    """Steps of random actions before the first gradient step; a warm start's defaults have none."""
+    """Environment steps with random actions before the first gradient step; 0 in the defaults of a warm start."""
     ent_coef: str = "auto_0.01"
-    """Weight of the entropy: a number, or "auto" with the first value."""
+    """Entropy coefficient: a number, or "auto" with an optional initial value ("auto_0.01")."""
     demonstrations: float = 0.25
-    """Share of each batch that is demonstrations, if a warm start has some."""
+    """Fraction of demonstrations in each batch, if the warm start has any."""
     imitation: float = 0.0
-    """Weight, in the actor's loss, of the error of the demonstrations' actions, if a warm start has some; beside values
-    in units of `reward_scale`. What a single action is worth is small beside the critic's errors, which would soon
-    spoil a clone."""
+    """Weight of the imitation error in the actor's loss, if the warm start has demonstrations; the values in the loss
+    are multiplied by `reward_scale`. Differences between the values of actions are smaller than the critic's errors,
+    which would otherwise degrade a clone."""
     evaluate_every: int = 20_000
-    """Steps between evaluations."""
+    """Environment steps between evaluations."""
     checkpoint_every: int = 50_000
-    """Steps between checkpoints."""
+    """Environment steps between checkpoints."""
 
 
-def _changed(config: Any, table: dict[str, Any]) -> Any:
-    """A configuration with what a table says otherwise; its tables are those of the configuration's parts."""
+def _replace_nested(config: Any, table: dict[str, Any]) -> Any:
+    """Return a configuration with the values of a table; a nested table changes the nested configuration."""
     changes: dict[str, Any] = {}
     for name, value in table.items():
-        part = _changed(getattr(config, name), value) if isinstance(value, dict) else value
+        part = _replace_nested(getattr(config, name), value) if isinstance(value, dict) else value
         changes[name] = tuple(part) if isinstance(part, list) else part
     return replace(config, **changes)
 
@@ -300,27 +306,27 @@ ALGORITHMS: dict[str, type[RunConfig]] = {
 
 
 def read_config(folder: Path) -> tuple[str, RunConfig]:
-    """The algorithm and the configuration of the run in a folder.
+    """Read the algorithm and the configuration of the run in a directory.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is damaged.
+        FileNotFoundError: the directory contains no run.
+        ValueError: the configuration is damaged.
 
     """
     from pydantic import TypeAdapter, ValidationError
 
-    record = folder / "config.json"
-    if not record.is_file():
-        raise FileNotFoundError(f"{record}: there is no run in this folder")
+    path = folder / "config.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no run in this directory")
     try:
-        found: dict[str, Any] = json.loads(record.read_text())["config"]
-        algorithm = "sac" if found["algorithm"] == "tqc" else str(found["algorithm"])
+        stored: dict[str, Any] = json.loads(path.read_text())["config"]
+        algorithm = "sac" if stored["algorithm"] == "tqc" else str(stored["algorithm"])
         return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
-            {name: value for name, value in found.items() if name != "algorithm" or algorithm == "sac"}
+            {name: value for name, value in stored.items() if name != "algorithm" or algorithm == "sac"}
         )
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(map(str, first["loc"]))
-        raise ValueError(f"{record}: {name}: {first['msg']}, got {first['input']!r}") from None
+        raise ValueError(f"{path}: {name}: {first['msg']}, got {first['input']!r}") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{record}: not a run's configuration: {error!r}") from None
+        raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None

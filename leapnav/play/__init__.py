@@ -1,1 +1,1 @@
-"""The page of `leapnav play`: a scenario to drag about, and its optimum."""
+"""The interactive page of `leapnav play`: a scenario to edit, and its optimum."""

@@ -1,4 +1,4 @@
-"""The server of `leapnav play`: three files and a few questions, for one user on one machine."""
+"""The web server of `leapnav play`: the page, and requests in JSON, for one user on one machine."""
 
 from __future__ import annotations
 
@@ -16,124 +16,127 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from leapnav.envs.scenario import Scenario
-from leapnav.experts.policy import NoOptimumError
-from leapnav.play.answers import Answers, banked
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.experts.acting.policy import NoOptimumError
+from leapnav.play.solving import PlaySolver, bank_scenario
 
-LONGEST = 1_000_000  # bytes of a question
+MAX_REQUEST_SIZE = 1_000_000  # bytes
 FILES = {
     "/": ("page.html", "text/html"),
     "/page.css": ("page.css", "text/css"),
+    "/canvas.js": ("canvas.js", "text/javascript"),
     "/page.js": ("page.js", "text/javascript"),
 }
-# Nothing but what is served here: no script, font or picture from elsewhere, and no page around this one.
-POLICY = {
+# The page loads only what this server delivers, and cannot be embedded in another page.
+HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src data:; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
-LOCAL = ("127.0.0.1", "localhost", "[::1]")
+LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 Endpoint = Callable[[Request], Awaitable[Response]]
+Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
 
-def create_app(answers: Answers, scenario: Scenario, host: str = "127.0.0.1") -> Starlette:
-    """The application.
+def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") -> Starlette:
+    """Return the web application.
 
     Args:
-        answers: what solves.
-        scenario: that the page shows first.
-        host: where it listens; a request that names another host is refused, so that no page from elsewhere can ask by
-            giving this machine a name of its own.
+        solver: solves the scenarios of the page.
+        scenario: the initial scenario.
+        host: address of the server. Requests that name another host are refused, so that no page elsewhere can send
+            requests through a host name that resolves to this machine.
 
     """
 
-    async def first(request: Request) -> Response:
-        return JSONResponse({"scenario": scenario.to_dict(), "policies": answers.policies})
+    async def initial(request: Request) -> Response:
+        return JSONResponse({"scenario": scenario.to_dict(), "policies": solver.policies})
 
     async def bank(request: Request) -> Response:
         index = request.query_params.get("index", "0")
         try:
             if not re.fullmatch(r"-?[0-9]{1,9}", index):
-                raise ValueError(f"index: expected a number, got {index[:20]!r}")
-            found = banked(request.query_params.get("family", ""), int(index))
+                raise ValueError(f"index: expected an integer, got {index[:20]!r}")
+            found = bank_scenario(request.query_params.get("family", ""), int(index))
         except ValueError as error:
-            return _refused(error)
+            return _error_response(error)
         return JSONResponse({"scenario": found.to_dict()})
 
-    def check(question: dict[str, Any]) -> dict[str, Any]:
-        return {"scenario": _scenario(question).to_dict()}
+    def check(content: dict[str, Any]) -> dict[str, Any]:
+        return {"scenario": _scenario(content).to_dict()}
 
-    def follow(question: dict[str, Any]) -> dict[str, Any]:
-        before = question.get("before")
-        if before is not None and not isinstance(before, str):
-            raise ValueError(f"before: expected text, got {before!r}")
-        return answers.follow(_scenario(question), before)
+    def follow(content: dict[str, Any]) -> dict[str, Any]:
+        previous = content.get("previous")
+        if previous is not None and not isinstance(previous, str):
+            raise ValueError(f"previous: expected a string, got {previous!r}")
+        return solver.follow(_scenario(content), previous)
 
-    questions: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    handlers: dict[str, Handler] = {
         "/check": check,
         "/follow": follow,
-        "/search": lambda question: answers.search(_scenario(question)),
-        "/sweeps": lambda question: answers.sweeps(_scenario(question)),
-        "/drive": lambda question: answers.drive(_scenario(question), str(question.get("policy"))),
+        "/search": lambda content: solver.search(_scenario(content)),
+        "/sweeps": lambda content: solver.sweeps(_scenario(content)),
+        "/drive": lambda content: solver.drive(_scenario(content), str(content.get("policy"))),
     }
-    any_host = host in ("0.0.0.0", "::")
-    allowed = ["*"] if any_host else [host, *LOCAL]
+    is_public = host in ("0.0.0.0", "::")
+    allowed = ["*"] if is_public else [host, *LOCAL_HOSTS]
     return Starlette(
         routes=[
-            *(Route(path, _file(*file)) for path, file in FILES.items()),
-            Route("/first", first),
+            *(Route(path, _file_endpoint(*file)) for path, file in FILES.items()),
+            Route("/initial", initial),
             Route("/bank", bank),
-            *(Route(path, _question(answer), methods=["POST"]) for path, answer in questions.items()),
+            *(Route(path, _json_endpoint(handler), methods=["POST"]) for path, handler in handlers.items()),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=allowed)],
     )
 
 
-def _file(name: str, kind: str) -> Endpoint:
+def _file_endpoint(name: str, media_type: str) -> Endpoint:
     content = files("leapnav.play").joinpath(name).read_bytes()
 
     async def endpoint(request: Request) -> Response:
-        return Response(content, media_type=kind, headers=POLICY)
+        return Response(content, media_type=media_type, headers=HEADERS)
 
     return endpoint
 
 
-def _question(answer: Callable[[dict[str, Any]], dict[str, Any]]) -> Endpoint:
-    """An endpoint that reads a JSON object and answers with one; what is wrong with it is told in one line."""
+def _json_endpoint(handler: Handler) -> Endpoint:
+    """Return an endpoint that reads a JSON object and responds with one; errors are reported in one line."""
 
     async def endpoint(request: Request) -> Response:
-        # A form of another page could send text, but no JSON without being asked first.
+        # A form on another page can send text, but JSON only after a preflight request, which is refused here.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return JSONResponse({"error": "expected application/json"}, 415)
         body = b""
         try:
             async for part in request.stream():
                 body += part
-                if len(body) > LONGEST:
-                    return JSONResponse({"error": f"expected at most {LONGEST} bytes"}, 413)
+                if len(body) > MAX_REQUEST_SIZE:
+                    return JSONResponse({"error": f"expected at most {MAX_REQUEST_SIZE} bytes"}, 413)
         except ClientDisconnect:
             return Response(status_code=400)
         try:
             try:
-                question = json.loads(body)
+                content = json.loads(body)
             except (ValueError, RecursionError):
-                raise ValueError("the question is not JSON") from None
-            if not isinstance(question, dict):
+                raise ValueError("the request is not valid JSON") from None
+            if not isinstance(content, dict):
                 raise ValueError("expected a JSON object")
-            return JSONResponse(await run_in_threadpool(answer, question))
+            return JSONResponse(await run_in_threadpool(handler, content))
         except (ValueError, OSError, RecursionError, NoOptimumError) as error:
-            return _refused(error)
+            return _error_response(error)
 
     return endpoint
 
 
-def _refused(error: Exception) -> Response:
+def _error_response(error: Exception) -> Response:
     line = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return JSONResponse({"error": line.encode("utf-8", "replace").decode()}, 400)  # no halves of surrogate pairs
+    # A message may quote half of a surrogate pair, which cannot be encoded.
+    return JSONResponse({"error": line.encode("utf-8", "replace").decode()}, 400)
 
 
-def _scenario(question: dict[str, Any]) -> Scenario:
-    scenario = Scenario.from_dict(question.get("scenario"))
+def _scenario(content: dict[str, Any]) -> Scenario:
+    scenario = Scenario.from_dict(content.get("scenario"))
     if not scenario.name.isprintable():
         raise ValueError(f"Scenario: name: expected printable characters, got {ascii(scenario.name)[:80]}")
     return scenario

@@ -1,0 +1,154 @@
+"""Compiling many kernels at once, in parallel processes that fill the cache."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import walk_packages
+from queue import SimpleQueue
+
+from filelock import FileLock
+
+from leapnav.envs.kernels import progress
+from leapnav.envs.kernels.decorator import cache_directory, cache_root
+from leapnav.envs.kernels.numba_internals import Kernel
+
+MIN_PARALLEL = 6  # kernels; fewer are compiled in this process: starting others takes two seconds
+WORKER = "from leapnav.envs.kernels.compilation import serve; serve()"
+
+
+def prepare(*kernels: Kernel, jobs: int | None = None) -> None:
+    """Makes kernels ready, with those that they call.
+
+    Kernels that are not in the cache are compiled by several processes, if they are many. Processes that need them at
+    the same time wait for the first one.
+
+    Args:
+        kernels: the kernels.
+        jobs: number of processes; None for one per core.
+
+    """
+    if all(one.is_ready for one in kernels):
+        return
+    if len(missing(kernels)) >= MIN_PARALLEL and (jobs or usable_cores()) > 1 and sys.executable:
+        with FileLock(cache_root() / "compile.lock"):
+            remaining = missing(kernels)  # another process may have compiled them meanwhile
+            if remaining:
+                _compile(remaining, jobs or usable_cores())
+    for one in kernels:
+        one.prepare()
+
+
+def usable_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def missing(kernels: Iterable[Kernel]) -> list[Kernel]:
+    """The kernels, among these and those that they call, that are not in the cache; callees come first."""
+    ordered: dict[Kernel, None] = {}
+
+    def visit(one: Kernel) -> None:
+        if one not in ordered and not one.is_ready:
+            for callee in one.callees:
+                visit(callee)
+            ordered[one] = None
+
+    for one in kernels:
+        visit(one)
+    return [one for one in ordered if not one.is_cached(cache_directory(one.py_func.__module__))]
+
+
+def _compile(kernels: list[Kernel], jobs: int) -> None:
+    """Compiles kernels in processes; one is started when those that it calls are finished."""
+    waiting = dict.fromkeys(one for one in kernels if _is_importable(one))
+    unfinished, running = set(waiting), dict[Future[None], Kernel]()
+    idle: SimpleQueue[subprocess.Popen[str]] = SimpleQueue()
+
+    def compile_one(one: Kernel) -> None:
+        worker = idle.get()
+        _ask(worker, one)
+        idle.put(worker)
+
+    count = min(jobs, len(waiting))
+    with _workers(count) as workers, progress.counted(waiting) as done, ThreadPoolExecutor(jobs) as pool:
+        for worker in workers:
+            idle.put(worker)
+        while waiting or running:
+            for one in [one for one in waiting if not unfinished.intersection(one.callees)]:
+                del waiting[one]
+                running[pool.submit(compile_one, one)] = one
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                one = running.pop(future)
+                unfinished.remove(one)
+                future.result()
+                done(one)
+
+
+def _is_importable(one: Kernel) -> bool:
+    """Whether another process finds the kernel by its name; not so for the flows that are generated."""
+    return one.py_func.__module__.startswith("leapnav.")
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[list[subprocess.Popen[str]]]:
+    """Processes that compile the kernels whose names they read."""
+    command = [sys.executable, "-c", WORKER]
+    workers = [
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        for _ in range(count)
+    ]
+    try:
+        yield workers
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+            for stream in (worker.stdin, worker.stdout):
+                if stream is not None:
+                    stream.close()
+
+
+def _ask(worker: subprocess.Popen[str], one: Kernel) -> None:
+    """Lets a process compile a kernel; where that fails, this process does it and shows the error."""
+    assert worker.stdin is not None and worker.stdout is not None
+    function = one.py_func
+    try:
+        worker.stdin.write(f"{function.__module__} {function.__qualname__}\n")
+        worker.stdin.flush()
+        worker.stdout.readline()
+    except BrokenPipeError:  # the process has ended
+        return
+
+
+def serve() -> None:
+    """The loop of a process that compiles: reads names of kernels and answers when each is in the cache."""
+    from leapnav.envs.kernels.numba_internals import named
+
+    for line in sys.stdin:
+        module, name = line.split()
+        named(module, name).prepare()
+        print(name, flush=True)
+
+
+def all_kernels() -> list[Kernel]:
+    """Every kernel of leapnav, in the order of their modules' names."""
+    found: dict[Kernel, None] = {}
+    for package in ("leapnav.envs", "leapnav.experts"):
+        root = import_module(package)
+        for module in sorted(info.name for info in walk_packages(root.__path__, f"{package}.")):
+            spec = find_spec(module)
+            if spec is None or spec.origin is None or b"@kernel(" not in Path(spec.origin).read_bytes():
+                continue
+            for value in vars(import_module(module)).values():
+                if isinstance(value, Kernel):
+                    found[value] = None
+    return list(found)

@@ -1,0 +1,168 @@
+"""The `kernel` decorator: one declared signature, compiled at first use, cached on disk.
+
+A kernel has the kernels that it calls compiled into it, but Numba's cache compares the source of the kernel's own file
+only ("Caching Limitations" in https://numba.readthedocs.io/en/stable/developer/caching.html). The machine code of a
+module's kernels is therefore kept in a directory that is named after the source of the module and of every module of
+leapnav that it imports, directly or not.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib.util import find_spec, resolve_name
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import platformdirs
+from numba import types
+
+from leapnav.envs.kernels import progress
+from leapnav.envs.kernels.numba_internals import Kernel
+
+PACKAGE = "leapnav"
+# LLVM's highest level takes a quarter longer to compile and gives the same or slightly longer run times.
+OPTIMISATION_LEVEL = 1
+# Modules that do not change the machine code, although every kernel imports them.
+WITHOUT_EFFECT = frozenset({"leapnav.envs.kernels.compilation", "leapnav.envs.kernels.progress"})
+
+
+def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Declares a function that Numba compiles when it is first called.
+
+    Args:
+        signature: Numba's types of the result and the arguments, see `leapnav.envs.kernels.types`.
+        options: further options of `numba.njit`, such as `fastmath`. Division by zero gives infinity or NaN, and the
+            interpreter lock is released.
+
+    Raises:
+        TypeError: the function is nested in another one. In machine code a kernel is identified by its module, its
+            name and a number that a process counts up. Two kernels of one name, one of them compiled here and the
+            other loaded from the cache of a process that counted differently, may get the same number, and one of
+            them would then be called for both.
+
+    """
+
+    def declare(function: Callable[..., Any]) -> Kernel:
+        if "<" in function.__qualname__:
+            raise TypeError(f"{function.__qualname__}: a kernel needs a name that is unique in its module")
+        return Kernel(function, signature, {"error_model": "numpy", "nogil": True, **options}, _compilation)
+
+    return declare
+
+
+def record_type(record: type[NamedTuple], **fields: types.Type) -> types.NamedTuple:
+    """The Numba type of a `NamedTuple` that kernels take as one argument.
+
+    Args:
+        record: the class; its instances must hold exactly these types when they are passed from Python.
+        fields: the Numba type of each field, in the order of the class.
+
+    Raises:
+        TypeError: the fields are not those of the class.
+
+    """
+    names: tuple[str, ...] = getattr(record, "_fields", ())
+    if tuple(fields) != names:
+        raise TypeError(f"{record.__name__}: expected the fields {', '.join(names)}, got {', '.join(fields)}")
+    found = types.NamedTuple(tuple(fields.values()), record)
+    record.numba_record_type = found  # type: ignore[attr-defined]
+    return found
+
+
+@contextmanager
+def _compilation(compiled: Kernel) -> Iterator[tuple[Path, int | None]]:
+    """Yields cache directory and optimisation level (NUMBA_OPT takes precedence), and reports the progress."""
+    directory = cache_directory(compiled.py_func.__module__)
+    with progress.compiling(compiled, is_cached=compiled.is_cached(directory)):
+        yield directory, None if "NUMBA_OPT" in os.environ else OPTIMISATION_LEVEL
+
+
+def cache_directory(module: str) -> Path:
+    """The directory that keeps the machine code of a module's kernels."""
+    return kernel_cache() / f"{module.removeprefix(f'{PACKAGE}.')}-{source_stamp(module)[:12]}"
+
+
+def kernel_cache() -> Path:
+    """The directory below which all kernels are kept: NUMBA_CACHE_DIR, or `cache_root()`."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(chosen) if chosen else cache_root() / f"numba-{numba.__version__}"
+
+
+def cache_root() -> Path:
+    """The directory of everything that leapnav compiles: LEAPNAV_CACHE_DIR, or the user's cache directory.
+
+    A directory that cannot be written is replaced by a temporary one, for this process.
+    """
+    root = requested_cache_root()
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return _temporary_directory()
+    return root if os.access(root, os.W_OK) else _temporary_directory()
+
+
+def requested_cache_root() -> Path:
+    """`cache_root` as it is chosen, whether or not it can be written."""
+    return Path(os.environ.get("LEAPNAV_CACHE_DIR") or platformdirs.user_cache_dir(PACKAGE, appauthor=False))
+
+
+@cache
+def _temporary_directory() -> Path:
+    return Path(tempfile.mkdtemp(prefix=f"{PACKAGE}-"))
+
+
+@cache
+def source_stamp(module: str) -> str:
+    """A hash of the source of a module and of all modules of leapnav that it imports, directly or not."""
+    stamp = hashlib.sha256()
+    for name in sorted(_imported({module}, module) - WITHOUT_EFFECT):
+        stamp.update(_source(name))
+    return stamp.hexdigest()
+
+
+def _imported(found: set[str], module: str) -> set[str]:
+    """Adds to `found` the modules of leapnav that a module imports, directly or not."""
+    for name in _imports(module):
+        if name not in found:
+            found.add(name)
+            _imported(found, name)
+    return found
+
+
+@cache
+def _imports(module: str) -> frozenset[str]:
+    """The modules of leapnav that a module imports at its top level, in whatever form."""
+    spec = find_spec(module)
+    assert spec is not None
+    package = module if spec.submodule_search_locations is not None else module.rpartition(".")[0]
+    candidates: set[str] = set()
+    for node in ast.parse(_source(module)).body:
+        if isinstance(node, ast.Import):
+            candidates.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            name = resolve_name("." * node.level + (node.module or ""), package)
+            candidates.add(name)
+            candidates.update(f"{name}.{alias.name}" for alias in node.names)
+    return frozenset(name for name in candidates if name.startswith(f"{PACKAGE}.") and _has_source(name))
+
+
+def _has_source(module: str) -> bool:
+    try:
+        spec = find_spec(module)
+    except ModuleNotFoundError:  # a name in a module, not a module in a package
+        return False
+    return spec is not None and spec.origin is not None
+
+
+@cache
+def _source(module: str) -> bytes:
+    spec = find_spec(module)
+    assert spec is not None and spec.origin is not None
+    return Path(spec.origin).read_bytes()

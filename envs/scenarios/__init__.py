@@ -1,0 +1,1 @@
+"""Scenarios (navigation tasks), random families of scenarios, maps, and scenario banks."""

@@ -1,0 +1,360 @@
+"""Scenario banks: memory-mapped files of scenarios with their certified optima.
+
+A bank is an HDF5 file with contiguous, uncompressed, little-endian datasets. Any HDF5 reader can open it; this one maps
+it into memory. With n scenarios and N_i points of the i-th optimum, evenly spaced in time from 0 to the horizon:
+
+| Dataset | Shape, type | Content |
+|---|---|---|
+| `scenarios` | (bytes,) uint8 | the scenarios as JSON text, concatenated |
+| `scenario_ends` | (n,) int64 | the end of each text |
+| `tasks` | (n, 11) float64 | start (3), goal (3, heading NaN if free), horizon, limits (2), weights (2) |
+| `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field` |
+| `field_ends` | (n,) int64 | the end of each field |
+| `draws` | (n,) int64 | index of the random draw that produced the scenario |
+| `costs` | (n,) float64 | J* |
+| `second_costs` | (n,) float64 | J of the second-best local optimum found, NaN if there is none |
+| `certificates` | (n, 4) float64 | boundary residual, defect, drift of H, clearance (m) |
+| `path_ends` | (n,) int64 | the end of the points of each optimum |
+| `states` | (sum of N_i, 3) float32 | x, y (m), heading (rad, unwrapped) |
+| `controls` | (sum of N_i, 2) float32 | speed (m/s), turn rate (rad/s) |
+| `costates` | (sum of N_i, 3) float32 | lambda, the gradient of the cost-to-go |
+
+Attributes of the file: `format` ("leapnav-bank"), `version` (3), `family`, `seed`, `drawn` (number of scenarios drawn,
+of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason) and `software` (the version of
+leapnav that built the bank).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from leapnav.envs.scenarios.scenario import TASK_COLUMNS, Scenario
+from leapnav.envs.utils.files import atomic_path
+from leapnav.envs.utils.validation import check_choice, is_integer
+
+FORMAT, VERSION = "leapnav-bank", 3
+MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
+SPLITS = ("train", "test")
+BANK_DIRECTORY = Path(__file__).parent / "banks"  # of the shipped banks
+_TYPES = {
+    "scenarios": "u1",
+    "scenario_ends": "<i8",
+    "tasks": "<f8",
+    "fields": "<f8",
+    "field_ends": "<i8",
+    "draws": "<i8",
+    "costs": "<f8",
+    "second_costs": "<f8",
+    "certificates": "<f8",
+    "path_ends": "<i8",
+    "states": "<f4",
+    "controls": "<f4",
+    "costates": "<f4",
+}
+
+_WIDTHS = {"tasks": (TASK_COLUMNS,), "certificates": (4,), "states": (3,), "controls": (2,), "costates": (3,)}
+
+
+class BankError(ValueError):
+    """A file is not a scenario bank, is damaged, or has another format version. The message names file and fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The certified optimum of a scenario in a bank.
+
+    Attributes:
+        cost: J*.
+        second_cost: J of the second-best local optimum found, None if there is none.
+        certificate: boundary residual, defect, drift of H, clearance (m).
+        times (N,): times of the points (s), from 0 to the horizon.
+        states (N, 3): x, y (m) and heading (rad, unwrapped), float32.
+        controls (N, 2): speed (m/s) and turn rate (rad/s), float32.
+        costates (N, 3): gradient of the cost-to-go, float32.
+
+    """
+
+    cost: float
+    second_cost: float | None
+    certificate: tuple[float, float, float, float]
+    times: np.ndarray
+    states: np.ndarray
+    controls: np.ndarray
+    costates: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BankEntry:
+    """The data of one scenario in a bank.
+
+    Attributes:
+        scenario: the scenario as JSON text.
+        draw: index of the random draw that produced it.
+        cost, second_cost, certificate, states, controls, costates: see `Reference`.
+
+    """
+
+    scenario: str
+    draw: int
+    cost: float
+    second_cost: float | None
+    certificate: tuple[float, float, float, float]
+    states: np.ndarray
+    controls: np.ndarray
+    costates: np.ndarray
+
+
+class ScenarioBank(Sequence[Scenario]):
+    """A sequence of scenarios with their optima, see `reference`, read from a file on first access.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        path: the file.
+        family, seed: family and random seed of the scenarios.
+        drawn: number of scenarios drawn, admitted or not.
+        rejected: number of scenarios that were not admitted, by reason.
+        software: version of leapnav that built the bank.
+        costs (n,), second_costs (n,), certificates (n, 4), draws (n,), tasks (n, 11): see the module.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        BankError: the file is not a bank, is damaged, or has another format version.
+
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path).absolute()  # independent of the working directory, which differs between processes
+        self._open()
+
+    def _open(self) -> None:
+        import h5py  # imported here because that takes longer than loading a bank, and not every program uses one
+
+        if not self.path.is_file():
+            raise FileNotFoundError(f"{self.path}: no such bank")
+        try:
+            with h5py.File(self.path, "r") as file:
+                attributes: dict[str, Any] = dict(file.attrs)
+                if attributes.get("format") != FORMAT:
+                    raise BankError(f"{self.path}: an HDF5 file, but not a scenario bank")
+                if attributes.get("version") != VERSION:
+                    raise BankError(
+                        f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads {VERSION}"
+                    )
+                locations = {name: _locate(file[name], name) for name in _TYPES}
+            self.family, self.software = str(attributes["family"]), str(attributes["software"])
+            self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
+            self.rejected: dict[str, int] = dict(json.loads(attributes["rejected"]))
+            content = np.asarray(np.memmap(self.path, dtype="u1", mode="r"))
+            arrays = {
+                name: content[start : start + size].view(_TYPES[name]).reshape(shape)
+                for name, (start, size, shape) in locations.items()
+            }
+            _check_lengths(arrays)
+        except BankError:
+            raise
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            raise BankError(f"{self.path}: not a scenario bank, or damaged: {' '.join(str(error).split())}") from None
+        self._arrays = arrays
+        self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
+        self.certificates, self.draws = arrays["certificates"], arrays["draws"]
+        self.tasks = arrays["tasks"]
+        self._scenarios: dict[int, Scenario] = {}
+
+    @classmethod
+    def shipped(cls, family: str, split: str) -> ScenarioBank:
+        """Return a bank shipped with the package; repeated calls return the same object.
+
+        Args:
+            family: one of `leapnav.envs.FAMILIES`.
+            split: "train" or "test".
+
+        Raises:
+            ValueError: there is no such family or split.
+
+        """
+        families = sorted(path.name.removesuffix("-test.bank") for path in BANK_DIRECTORY.glob("*-test.bank"))
+        check_choice("family", family, families)
+        check_choice("split", split, SPLITS)
+        return _shipped(family, split)
+
+    def __len__(self) -> int:
+        return len(self.costs)
+
+    @overload
+    def __getitem__(self, index: int) -> Scenario: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Scenario]: ...
+    def __getitem__(self, index: int | slice) -> Scenario | list[Scenario]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        i = self._check_index(index)
+        if i not in self._scenarios:
+            start, end = self._span("scenario_ends", i)
+            try:
+                self._scenarios[i] = Scenario.from_json(self._arrays["scenarios"][start:end].tobytes().decode())
+            except ValueError as error:  # the encoding or the scenario is invalid
+                raise BankError(f"{self.path}: scenario {i}: damaged: {error}") from None
+        return self._scenarios[i]
+
+    def __iter__(self) -> Iterator[Scenario]:
+        return (self[i] for i in range(len(self)))
+
+    def reference(self, index: int) -> Reference:
+        """Return the optimum of a scenario.
+
+        Raises:
+            IndexError: the index is out of range.
+
+        """
+        i = self._check_index(index)
+        start, end = self._span("path_ends", i)
+        second = float(self.second_costs[i])
+        residual, defect, drift, clearance = self.certificates[i].tolist()
+        return Reference(
+            cost=float(self.costs[i]),
+            second_cost=None if math.isnan(second) else second,
+            certificate=(residual, defect, drift, clearance),
+            times=np.linspace(0.0, self[i].horizon, end - start),
+            states=self.states(i),
+            controls=self._arrays["controls"][start:end],
+            costates=self._arrays["costates"][start:end],
+        )
+
+    def field(self, index: int) -> np.ndarray:
+        """Return the packed obstacle field of a scenario, without parsing the scenario.
+
+        Raises:
+            IndexError: the index is out of range.
+
+        """
+        start, end = self._span("field_ends", self._check_index(index))
+        return self._arrays["fields"][start:end]
+
+    def states(self, index: int) -> np.ndarray:
+        """Return the states (N, 3) of the optimum of a scenario, see `Reference`.
+
+        Raises:
+            IndexError: the index is out of range.
+
+        """
+        start, end = self._span("path_ends", self._check_index(index))
+        return self._arrays["states"][start:end]
+
+    def _check_index(self, index: int) -> int:
+        """Return the index counted from the start."""
+        if not is_integer(index):
+            raise TypeError(f"index: expected an integer, got {index!r}")
+        i = int(index) + len(self) if index < 0 else int(index)
+        if not 0 <= i < len(self):
+            raise IndexError(f"index: {self.path.name} has {len(self)} scenarios, got {index}")
+        return i
+
+    def _span(self, ends: str, i: int) -> tuple[int, int]:
+        """Return start and end of the i-th entry of a concatenated dataset."""
+        return (0 if i == 0 else int(self._arrays[ends][i - 1])), int(self._arrays[ends][i])
+
+    def __repr__(self) -> str:
+        return f"ScenarioBank({str(self.path)!r}, {len(self)} scenarios of {self.family})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The file is mapped again when unpickled.
+        return {"path": self.path}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.path = state["path"]
+        self._open()
+
+
+@cache
+def _shipped(family: str, split: str) -> ScenarioBank:
+    return ScenarioBank(BANK_DIRECTORY / f"{family}-{split}.bank")
+
+
+def _locate(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
+    """Return the first byte of a dataset in the file, its number of bytes, and its shape."""
+    if (
+        dataset.dtype != np.dtype(_TYPES[name])
+        or dataset.chunks is not None
+        or dataset.shape[1:] != _WIDTHS.get(name, ())
+    ):
+        raise ValueError(f"{name}: type or layout differs from the format")
+    # A dataset without entries has no offset.
+    return dataset.id.get_offset() or 0, math.prod(dataset.shape) * dataset.dtype.itemsize, dataset.shape
+
+
+def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
+    count = len(arrays["costs"])
+    for name in ("scenario_ends", "tasks", "field_ends", "draws", "second_costs", "certificates", "path_ends"):
+        if len(arrays[name]) != count:
+            raise ValueError(f"{name}: {len(arrays[name])} entries for {count} scenarios")
+    paths = ("states", "controls", "costates")
+    for ends, contents in (("scenario_ends", ("scenarios",)), ("field_ends", ("fields",)), ("path_ends", paths)):
+        last = int(arrays[ends][-1]) if count else 0
+        if (np.diff(arrays[ends], prepend=0) <= 0).any() or any(len(arrays[name]) != last for name in contents):
+            raise ValueError(f"{ends}: not the ends of {' and '.join(contents)}")
+
+
+def point_times(horizon: float) -> np.ndarray:
+    """Return the times (N,) at which a bank stores the points of an optimum (s)."""
+    return np.linspace(0.0, horizon, math.ceil(horizon / MAX_POINT_INTERVAL - 1e-6) + 1)
+
+
+def write_bank(
+    path: str | os.PathLike[str],
+    entries: Sequence[BankEntry],
+    *,
+    family: str,
+    seed: int,
+    drawn: int,
+    rejected: Mapping[str, int],
+    software: str,
+) -> None:
+    """Write a bank atomically; the same arguments give the same bytes.
+
+    Args:
+        path: the file.
+        entries: the scenarios with their optima.
+        family, seed, drawn, rejected, software: see `ScenarioBank`.
+
+    """
+    import h5py
+
+    texts = [entry.scenario.encode() for entry in entries]
+    scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
+    arrays = {
+        "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
+        "scenario_ends": np.cumsum([len(text) for text in texts]),
+        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(-1, TASK_COLUMNS),
+        "fields": np.concatenate([np.empty(0), *(scenario.field for scenario in scenarios)]),
+        "field_ends": np.cumsum([len(scenario.field) for scenario in scenarios]),
+        "draws": [entry.draw for entry in entries],
+        "costs": [entry.cost for entry in entries],
+        "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],
+        "certificates": np.array([entry.certificate for entry in entries]).reshape(-1, 4),
+        "path_ends": np.cumsum([len(entry.states) for entry in entries]),
+        "states": np.concatenate([np.empty((0, 3)), *(entry.states for entry in entries)]),
+        "controls": np.concatenate([np.empty((0, 2)), *(entry.controls for entry in entries)]),
+        "costates": np.concatenate([np.empty((0, 3)), *(entry.costates for entry in entries)]),
+    }
+    # Alignment in the file makes the memory-mapped arrays aligned.
+    with (
+        atomic_path(path) as partial,
+        h5py.File(partial, "w", alignment_threshold=1, alignment_interval=64) as file,
+    ):
+        file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+        file.attrs["family"], file.attrs["seed"] = family, seed
+        file.attrs["drawn"], file.attrs["rejected"] = drawn, json.dumps(dict(sorted(rejected.items())))
+        file.attrs["software"] = software
+        for dataset, values in arrays.items():
+            file.create_dataset(dataset, data=np.asarray(values, dtype=_TYPES[dataset]))

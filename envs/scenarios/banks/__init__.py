@@ -1,0 +1,1 @@
+"""Banks of scenarios that ship with leapnav (data)."""

@@ -1,0 +1,357 @@
+"""A navigation task: arena, robot, obstacles, start, goal, horizon and cost weights.
+
+A `Scenario` is immutable and validated on construction. The same object is the environment's task and, through
+`leapnav.experts`, the optimal control problem. Units are metres, seconds and radians throughout.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
+
+from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.field import pack_field
+from leapnav.envs.utils.validation import check_positive
+
+# Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
+MAX_MAGNITUDE = 1e6
+# Columns of a packed task: start (x, y, heading), goal (x, y, heading; NaN if free), then one column each.
+START, GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, TURN_WEIGHT, TASK_COLUMNS = 0, 3, 6, 7, 8, 9, 10, 11
+Finite = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
+Point = tuple[Finite, Finite]
+
+
+class ScenarioError(ValueError):
+    """A scenario is invalid. The message is one line with the scenario, the field and the value."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class Robot(_Frozen):
+    """The robot: its model, radius (m), maximum speed (m/s) and maximum turn rate (rad/s)."""
+
+    model: Literal["unicycle"] = "unicycle"
+    radius: Positive = 0.25
+    max_speed: Positive = 2.0
+    max_turn_rate: Positive = 3.0
+
+
+class Cost(_Frozen):
+    """Weights of the running cost 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(x, y)."""
+
+    speed_weight: Positive = 1.0
+    turn_weight: Positive = 0.5
+    proximity_weight: Annotated[float, Field(ge=0, le=MAX_MAGNITUDE, allow_inf_nan=False)] = 1.0
+    proximity_scale: Positive = 0.1
+
+
+class Circle(_Frozen):
+    """A disc obstacle: center (x, y) and radius (m)."""
+
+    center: Point
+    radius: Positive
+
+
+class Polygon(_Frozen):
+    """A convex polygon obstacle: at least three vertices (x, y) (m), in either orientation."""
+
+    vertices: tuple[Point, ...]
+
+    @field_validator("vertices")
+    @classmethod
+    def _check_convex(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
+        if len(vertices) < 3:
+            raise ValueError(f"a polygon needs at least 3 vertices, this one has {len(vertices)}")
+        points = np.asarray(vertices)
+        edges = np.roll(points, -1, axis=0) - points
+        following = np.roll(edges, -1, axis=0)
+        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+        angles = np.arctan2(turns, np.sum(edges * following, axis=1))
+        # The boundary of a convex polygon turns in one direction only, by 2 pi in total (that of a star by more).
+        same_direction = bool(np.all(turns > 0) or np.all(turns < 0))
+        if not same_direction or not math.isclose(abs(float(angles.sum())), 2 * math.pi, rel_tol=1e-6):
+            raise ValueError("the polygon is not strictly convex; write a non-convex obstacle as several convex ones")
+        return vertices
+
+
+class Obstacle(_Frozen):
+    """An obstacle: exactly one of a circle or a polygon, `{"circle": {...}}` or `{"polygon": {...}}` in the file."""
+
+    circle: Circle | None = None
+    polygon: Polygon | None = None
+
+    @model_validator(mode="after")
+    def _check_one_shape(self) -> Self:
+        if (self.circle is None) == (self.polygon is None):
+            raise ValueError("an obstacle is exactly one of 'circle' or 'polygon'")
+        return self
+
+    @property
+    def shape(self) -> Circle | Polygon:
+        """The circle or the polygon."""
+        shape = self.circle or self.polygon
+        assert shape is not None  # validated
+        return shape
+
+
+class Scenario(_Frozen):
+    """A navigation task. Immutable; scenarios with equal fields are equal.
+
+    Args:
+        name: label used in messages and tables.
+        arena: (x_min, y_min, x_max, y_max), the positions of the walls (m).
+        robot: model, radius and limits of the robot.
+        start: pose (x, y, heading) at time 0.
+        goal: pose (x, y, heading) at the horizon; a heading of None is free.
+        horizon: duration of the task (s).
+        obstacles: circles and convex polygons.
+        cost: weights of the running cost.
+
+    Raises:
+        ScenarioError: a field is missing, unknown, not finite or invalid.
+
+    """
+
+    name: str = "scenario"
+    arena: tuple[Finite, Finite, Finite, Finite]
+    robot: Robot = Robot()
+    start: tuple[Finite, Finite, Finite]
+    goal: tuple[Finite, Finite, Finite | None]
+    horizon: Positive
+    obstacles: tuple[Obstacle, ...] = ()
+    cost: Cost = Cost()
+
+    def __init__(self, /, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise ScenarioError(_one_line(fields.get("name", "scenario"), error)) from None
+
+    @field_validator("arena")
+    @classmethod
+    def _check_arena(cls, arena: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+        x_min, y_min, x_max, y_max = arena
+        if x_min >= x_max or y_min >= y_max:
+            raise ValueError("the arena needs x_min < x_max and y_min < y_max")
+        return arena
+
+    @model_validator(mode="after")
+    def _check_poses_are_free(self) -> Self:
+        names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
+        for field, pose in (("start", self.start), ("goal", self.goal)):
+            distance, nearest = clearance(pose[0], pose[1], self.field)
+            if not distance > 0:
+                raise ValueError(
+                    f"{field}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
+                )
+        return self
+
+    @cached_property
+    def field(self) -> np.ndarray:
+        """The packed obstacle field, see `leapnav.envs.shapes.field` (read-only)."""
+        cost = self.cost
+        shapes = [obstacle.shape for obstacle in self.obstacles]
+        return pack_field(shapes, self.arena, self.robot.radius, cost.proximity_weight, cost.proximity_scale)
+
+    @cached_property
+    def task(self) -> np.ndarray:
+        """The packed task (TASK_COLUMNS,): start, goal, horizon, limits and weights (read-only)."""
+        goal, robot, cost = self.goal, self.robot, self.cost
+        heading = math.nan if goal[2] is None else goal[2]
+        limits, weights = (robot.max_speed, robot.max_turn_rate), (cost.speed_weight, cost.turn_weight)
+        task = np.array([*self.start, goal[0], goal[1], heading, self.horizon, *limits, *weights])
+        task.flags.writeable = False
+        return task
+
+    def __eq__(self, other: object) -> bool:
+        # pydantic would compare the cached arrays, too.
+        return isinstance(other, Scenario) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, name) for name in type(self).model_fields)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with some fields changed, which is validated."""
+        fields = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**fields, **(update or {})})
+
+    def __getstate__(self) -> dict[Any, Any]:
+        state = super().__getstate__()
+        # Arrays are writeable after unpickling, so the packed ones are computed again instead.
+        return {**state, "__dict__": {k: v for k, v in state["__dict__"].items() if k not in ("field", "task")}}
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """Return the scenario as JSON text, and write it to `path` if one is given."""
+        text = json.dumps(self.to_dict())
+        if path is not None:
+            Path(path).write_text(text + "\n")
+        return text
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the scenario as dictionaries, lists and numbers, with the structure of the scenario file."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    @classmethod
+    def from_dict(cls, fields: Any) -> Scenario:
+        """Return the scenario of a dictionary, the inverse of `to_dict`.
+
+        Raises:
+            ScenarioError: see the class.
+
+        """
+        if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
+            raise ScenarioError(f"a scenario is a JSON object, got {_shorten(fields)}")
+        try:
+            return cls(**_tuples(fields))
+        except RecursionError:
+            raise ScenarioError(f"Scenario {_shorten(fields.get('name'))}: the fields are nested too deeply") from None
+
+    @classmethod
+    def from_json(cls, path_or_text: str | Path) -> Scenario:
+        """Read a scenario from a file, or from JSON text (recognised by its opening brace).
+
+        Raises:
+            ScenarioError: the text is not JSON, or see the class.
+            OSError: the file cannot be read.
+
+        """
+        is_text = isinstance(path_or_text, str) and path_or_text.lstrip().startswith("{")
+        source, text = ("text", str(path_or_text)) if is_text else (str(path_or_text), None)
+        try:
+            text = Path(path_or_text).read_text(encoding="utf-8-sig") if text is None else text
+            fields = json.loads(text, object_pairs_hook=_unique_keys)
+        except ScenarioError:
+            raise
+        except (ValueError, RecursionError) as error:  # syntax, encoding, numbers with too many digits, nesting
+            raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
+        return cls.from_dict(fields)
+
+    @classmethod
+    def from_discs(
+        cls,
+        discs: Any,
+        *,
+        start: tuple[float, float, float],
+        goal: tuple[float, float, float | None],
+        horizon: float,
+        arena: tuple[float, float, float, float] | None = None,
+        **fields: Any,
+    ) -> Scenario:
+        """Return a scenario whose obstacles are discs.
+
+        Args:
+            discs (n, 3): x, y and radius of each disc (m).
+            start, goal, horizon: see the class.
+            arena: see the class; None for the smallest arena with 1 m around the discs, the start and the goal.
+            fields: name, robot and cost, see the class.
+
+        Raises:
+            ScenarioError: see the class.
+            ValueError: a disc is invalid.
+
+        """
+        array = check_discs(discs)
+        obstacles = tuple(Obstacle(circle=Circle(center=(x, y), radius=radius)) for x, y, radius in array.tolist())
+        arena = arena or disc_arena(array, (start[:2], goal[:2]))
+        return cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=obstacles, **fields)
+
+    @classmethod
+    def from_movingai(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        start: tuple[float, float, float],
+        goal: tuple[float, float, float | None],
+        horizon: float,
+        cell_size: float = 1.0,
+        **fields: Any,
+    ) -> Scenario:
+        """Return a scenario on a grid map of the Moving AI Lab.
+
+        Blocked cells are merged into few rectangles. Those without a free neighbour cannot be reached and may be
+        omitted. The lower left corner of the map is (0, 0): in units of the cell size, the cell in column c of line l,
+        both counted from 0 and l from the top, extends from x = c to c + 1 and from y = height - 1 - l to height - l.
+
+        Args:
+            path: the map file (`.map`).
+            start, goal, horizon: see the class, in metres and seconds.
+            cell_size: side length of a cell (m).
+            fields: name (by default that of the file), robot and cost, see the class.
+
+        Raises:
+            OSError: the file cannot be read.
+            ScenarioError: see the class.
+            ValueError: the file is not a valid map, or `cell_size` is not positive.
+
+        """
+        check_positive("cell_size", cell_size)
+        blocked = read_movingai(path)
+        height, width = blocked.shape
+        fields.setdefault("name", Path(path).stem)
+        obstacles = []
+        for top, left, bottom, right in rectangles(blocked):
+            low, high = cell_size * (height - bottom), cell_size * (height - top)
+            x_min, x_max = cell_size * left, cell_size * right
+            vertices = ((x_min, low), (x_max, low), (x_max, high), (x_min, high))
+            obstacles.append(Obstacle(polygon=Polygon(vertices=vertices)))
+        arena = (0.0, 0.0, cell_size * width, cell_size * height)
+        scenario = cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=tuple(obstacles), **fields)
+        # Validation has checked the poses against the obstacles, but some blocked cells are omitted from those.
+        for name, (x, y, _) in (("start", scenario.start), ("goal", scenario.goal)):
+            if blocked[height - 1 - int(y / cell_size), int(x / cell_size)]:
+                raise ScenarioError(
+                    f"Scenario {scenario.name!r}: {name}: ({x:g}, {y:g}) is in a blocked cell of {path}"
+                )
+        return scenario
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        repeated = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
+        raise ScenarioError(f"scenario: {repeated}: the key appears more than once")
+    return fields
+
+
+def _tuples(value: Any) -> Any:
+    """Return a value with lists replaced by tuples, as strict validation of immutable fields requires."""
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def _shorten(value: Any) -> str:
+    text = repr(value).replace("\n", " ")
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _one_line(name: Any, error: ValidationError) -> str:
+    """Return the first fault of a pydantic error as one line: scenario, field, fault and value."""
+    faults = error.errors(include_url=False)
+    first: ErrorDetails = faults[0]
+    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in first["loc"]).lstrip(".")
+    message = first["msg"].removeprefix("Value error, ")
+    message = message[:1].lower() + message[1:]
+    # The messages of whole-scenario checks contain field and value; a missing field has no value.
+    value = "" if not path or first["type"] == "missing" else f", got {_shorten(first['input'])}"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    line = f"Scenario {_shorten(name)}: {path}{': ' if path else ''}{message}{value}{more}"
+    return " ".join(line.splitlines())  # an unknown key may contain line breaks

@@ -1,0 +1,112 @@
+"""Sources of the scenarios of an environment's episodes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import ALL, check_family, sample_scenario
+from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
+from leapnav.envs.utils.validation import check_choice, is_integer
+
+SPLITS = ("train", "test", "fresh")
+
+
+class ScenarioSource:
+    """The source of an environment's scenarios: a fixed scenario, a bank, or a family.
+
+    Args:
+        family, scenario, split, bank: see `NavigateEnv`.
+
+    Attributes:
+        family: name of the family.
+        scenario: the fixed scenario, or None.
+        bank: the scenario bank, or None.
+
+    Raises:
+        ValueError: unknown or contradictory arguments.
+        ScenarioError: `scenario` is invalid.
+        FileNotFoundError, BankError: see `ScenarioBank`.
+
+    """
+
+    def __init__(
+        self,
+        family: str = "clutter",
+        scenario: Scenario | Mapping[str, Any] | str | None = None,
+        split: str | None = None,
+        bank: ScenarioBank | str | os.PathLike[str] | None = None,
+    ) -> None:
+        check_family(family)
+        arguments = (("scenario", scenario), ("split", split), ("bank", bank))
+        given = [name for name, value in arguments if value is not None]
+        if len(given) > 1:
+            raise ValueError(f"{given[1]}: cannot be combined with {given[0]}")
+        if split is not None:
+            check_choice("split", split, SPLITS)
+        if family == ALL and split not in (None, "fresh"):
+            raise ValueError(f"split: all families together have 'fresh' scenarios only, got {split!r}")
+        self.family = family
+        self.scenario = None if scenario is None else as_scenario(scenario)
+        self.bank: ScenarioBank | None = None
+        if bank is not None:
+            if not isinstance(bank, (ScenarioBank, str, os.PathLike)):
+                raise ValueError(f"bank: expected a ScenarioBank or its file, got {bank!r}")
+            self.bank = bank if isinstance(bank, ScenarioBank) else ScenarioBank(bank)
+            if len(self.bank) == 0:
+                raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
+        elif scenario is None and split != "fresh" and family != ALL:
+            self.bank = ScenarioBank.shipped(family, split or "train")
+
+    def select(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:
+        """Return the scenario that the options of a reset select, or its index in the bank; None without a selection.
+
+        Raises:
+            ValueError, ScenarioError, IndexError: there is no such scenario.
+
+        """
+        if index is not None and (scenario is not None or self.bank is None):
+            raise ValueError(f"options: 'index' needs a bank and no 'scenario', got {index!r}")
+        if scenario is not None:
+            return as_scenario(scenario)
+        if index is None or self.bank is None:
+            return None
+        if not is_integer(index):
+            raise ValueError(f"options: index: expected an integer, got {index!r}")
+        if not -len(self.bank) <= index < len(self.bank):
+            raise IndexError(f"options: index: {self.bank.path.name} has {len(self.bank)} scenarios, got {index}")
+        return int(index) % len(self.bank)
+
+    def draw(self, rng: np.random.Generator) -> Scenario | int:
+        """Sample the scenario of an episode, or its index in the bank."""
+        if self.bank is not None:
+            return int(rng.integers(len(self.bank)))
+        return sample_scenario(self.family, rng) if self.scenario is None else self.scenario
+
+
+def as_scenario(value: Scenario | Mapping[str, Any] | str) -> Scenario:
+    """Return a scenario given in any of the forms that the environments accept.
+
+    Raises:
+        ScenarioError: it is invalid.
+
+    """
+    if isinstance(value, Scenario):
+        return value
+    if isinstance(value, Mapping):
+        return Scenario.from_dict(dict(value))
+    if isinstance(value, str):  # the form in which datasets store it
+        return Scenario.from_json(value)
+    raise ScenarioError(f"scenario: expected a Scenario, a dict or JSON text, got {type(value).__name__}")
+
+
+def get_scenario(choice: Scenario | int, bank: ScenarioBank | None) -> Scenario:
+    """Return a selected scenario; an index is looked up in the bank."""
+    if isinstance(choice, Scenario):
+        return choice
+    assert bank is not None  # an index always refers to a bank
+    return bank[choice]

@@ -1,0 +1,55 @@
+"""The clearance of a packed obstacle field (kernels): signed distance from the robot's rim to the nearest obstacle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import float64, int64
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CONSTANT, VECTOR, tuple_of
+from leapnav.envs.shapes.field import ARENA, CIRCLES, GRID, POLYGONS, SHAPES
+from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
+
+
+@kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
+def clearance(x, y, field):
+    """Signed distance (m) from the robot's rim to the nearest obstacle or wall, and the index of that obstacle.
+
+    Negative inside. The wall has the index after the last obstacle.
+    """
+    radius = field[2]
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    indices = int(field[GRID]) - circles - polygons
+    best = min(
+        min(x - field[ARENA], field[ARENA + 2] - x),
+        min(y - field[ARENA + 1], field[ARENA + 3] - y),
+    )
+    nearest = circles + polygons
+    at = SHAPES
+    for i in range(circles):
+        dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2]
+        at += 3
+        if dx * dx + dy * dy < max(best + rim, 0.0) ** 2:  # compares squares, since most obstacles are farther away
+            distance = math.sqrt(dx * dx + dy * dy) - rim
+            if distance < best:
+                best, nearest = distance, int(field[indices + i])
+    for i in range(polygons):
+        edges = int(field[at])
+        rows = at + 1
+        at = rows + 5 * edges
+        if half_plane_distance(x, y, field, rows, edges) < best:
+            distance = polygon_distance(x, y, field, rows, edges)
+            if distance < best:
+                best, nearest = distance, int(field[indices + circles + i])
+    return best - radius, nearest
+
+
+@kernel(VECTOR(float64[:, :], CONSTANT))
+def clearances(points, field):
+    """Clearance (m) of many points, shape (N, >= 2) -> (N,)."""
+    result = np.empty(len(points))
+    for i in range(len(points)):
+        result[i] = clearance(points[i, 0], points[i, 1], field)[0]
+    return result

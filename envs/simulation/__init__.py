@@ -1,0 +1,1 @@
+"""Batched simulation of independent robots: motion, contacts, sensing, observations, rendering."""

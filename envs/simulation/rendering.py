@@ -1,0 +1,248 @@
+"""Rendering of episodes with pygame, to arrays or to a window."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pygame
+
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.sources import get_scenario
+from leapnav.envs.simulation import state as columns
+from leapnav.envs.simulation.simulator import BatchSimulator
+
+SIZE, STATUS_HEIGHT = 600, 40  # pixels: longer side of the arena, and height of the status line below it
+SUPERSAMPLING = 2  # frames are drawn at this multiple of their size and scaled down, which smooths the edges
+BACKGROUND, FLOOR, WALL = (255, 255, 255), (250, 250, 248), (60, 64, 72)
+OBSTACLE, EDGE = (184, 190, 200), (120, 126, 138)
+ROBOT, CRASHED, WHEEL, NOSE = (38, 98, 171), (192, 57, 43), (20, 30, 50), (255, 255, 255)
+GOAL, TRAIL, OPTIMUM, RAY = (34, 139, 84), (38, 98, 171), (236, 164, 92), (236, 200, 194)
+LIDAR, TEXT, OPTIMUM_TEXT = (222, 120, 120), (60, 64, 72), (186, 108, 34)
+
+ToPixels = Callable[[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The content of a frame.
+
+    Attributes:
+        scenario: the scenario of the episode.
+        pose: x, y (m) and heading (rad).
+        trail: the poses of the episode so far.
+        optimum (N, 3): the reference path, or None.
+        ranges: lidar ranges (m), counter-clockwise from straight ahead; empty without a lidar.
+        lidar_range: maximum range (m).
+        cost: cost of the episode so far.
+        reference_cost: cost of the optimum, or None.
+        time: time since the start of the episode (s).
+        collided: whether the robot has collided.
+
+    """
+
+    scenario: Scenario
+    pose: tuple[float, float, float]
+    trail: Sequence[tuple[float, float, float]] = ()
+    optimum: np.ndarray | None = None
+    ranges: Sequence[float] = ()
+    lidar_range: float = math.inf
+    cost: float = 0.0
+    reference_cost: float | None = None
+    time: float = 0.0
+    collided: bool = False
+
+
+def make_scene(
+    simulator: BatchSimulator,
+    robot: int,
+    choice: Scenario | int,
+    bank: ScenarioBank | None,
+    trail: list[tuple[float, float, float]],
+) -> Scene:
+    """Return the scene of one robot's episode."""
+    optimum, reference_cost = None, None
+    if bank is not None and isinstance(choice, int):
+        optimum, reference_cost = bank.states(choice), float(bank.costs[choice])
+    row = simulator.state[robot]
+    return Scene(
+        scenario=get_scenario(choice, bank),
+        pose=tuple(simulator.poses[robot].tolist()),
+        trail=trail,
+        optimum=optimum,
+        ranges=simulator.ranges(robot).tolist(),
+        lidar_range=simulator.settings.lidar_range,
+        cost=float(row[columns.COST]),
+        reference_cost=reference_cost,
+        time=float(row[columns.TIME]),
+        collided=bool(row[columns.COLLIDED]),
+    )
+
+
+def draw_scene(scene: Scene) -> np.ndarray:
+    """Return a frame (height, width, 3) of uint8; both sides are even, as video encoders require."""
+    scenario = scene.scenario
+    x_min, y_min, x_max, y_max = scenario.arena
+    margin = 0.02 * max(x_max - x_min, y_max - y_min)
+    scale = SUPERSAMPLING * SIZE / (max(x_max - x_min, y_max - y_min) + 2 * margin)
+    width = 2 * SUPERSAMPLING * math.ceil((x_max - x_min + 2 * margin) * scale / (2 * SUPERSAMPLING) - 1e-6)
+    height = 2 * SUPERSAMPLING * math.ceil((y_max - y_min + 2 * margin) * scale / (2 * SUPERSAMPLING) - 1e-6)
+    canvas = pygame.Surface((width, height))
+    canvas.fill(BACKGROUND)
+
+    def to_pixels(x: float, y: float) -> tuple[float, float]:
+        return (x - x_min + margin) * scale, height - (y - y_min + margin) * scale
+
+    line = max(1, round(0.03 * scale))
+    corner, opposite = to_pixels(x_min, y_max), to_pixels(x_max, y_min)
+    frame = pygame.Rect(*corner, opposite[0] - corner[0], opposite[1] - corner[1])
+    pygame.draw.rect(canvas, FLOOR, frame)
+    beams = _lidar_ends(to_pixels, scene)
+    for end, _ in beams:
+        pygame.draw.line(canvas, RAY, to_pixels(*scene.pose[:2]), end, max(1, line // 2))
+    for obstacle in scenario.obstacles:
+        if obstacle.circle is not None:
+            center, radius = to_pixels(*obstacle.circle.center), obstacle.circle.radius * scale
+            pygame.draw.circle(canvas, OBSTACLE, center, radius)
+            pygame.draw.circle(canvas, EDGE, center, radius, line)
+        elif obstacle.polygon is not None:
+            corners = [to_pixels(*vertex) for vertex in obstacle.polygon.vertices]
+            pygame.draw.polygon(canvas, OBSTACLE, corners)
+            pygame.draw.polygon(canvas, EDGE, corners, line)
+    pygame.draw.rect(canvas, WALL, frame, 2 * line)
+    for end, hit in beams:
+        if hit:
+            pygame.draw.circle(canvas, LIDAR, end, 1.5 * line)
+
+    if scene.optimum is not None:
+        _draw_path(canvas, OPTIMUM, [to_pixels(x, y) for x, y in scene.optimum[:, :2].tolist()], 2 * line)
+    radius = scenario.robot.radius
+    goal = scenario.goal
+    pygame.draw.circle(canvas, GOAL, to_pixels(goal[0], goal[1]), radius * scale, 2 * line)
+    if goal[2] is not None:
+        _draw_arrow(canvas, GOAL, to_pixels, (goal[0], goal[1], goal[2]), radius, 2 * line)
+    _draw_path(canvas, TRAIL, [to_pixels(x, y) for x, y, _ in scene.trail], 2 * line)
+    _draw_robot(canvas, CRASHED if scene.collided else ROBOT, to_pixels, scene.pose, radius, scale)
+    small = pygame.transform.smoothscale(canvas, (width // SUPERSAMPLING, height // SUPERSAMPLING))
+    whole = pygame.Surface((small.get_width(), small.get_height() + STATUS_HEIGHT))
+    whole.fill(BACKGROUND)
+    whole.blit(small, (0, 0))
+    _draw_status(whole, scene, small.get_height())
+    return np.ascontiguousarray(np.transpose(pygame.surfarray.array3d(whole), (1, 0, 2)))
+
+
+def _lidar_ends(to_pixels: ToPixels, scene: Scene) -> list[tuple[tuple[float, float], bool]]:
+    """Return the end of each beam on the canvas (pixels), and whether it has hit an obstacle or a wall."""
+    x, y, heading = scene.pose
+    angles = [heading + 2 * math.pi * k / len(scene.ranges) for k in range(len(scene.ranges))]
+    return [
+        (to_pixels(x + reach * math.cos(angle), y + reach * math.sin(angle)), reach < scene.lidar_range)
+        for angle, reach in zip(angles, scene.ranges, strict=True)
+    ]
+
+
+def _draw_path(
+    canvas: pygame.Surface, color: tuple[int, int, int], points: list[tuple[float, float]], width: int
+) -> None:
+    if len(points) > 1:
+        pygame.draw.lines(canvas, color, False, points, width)
+        for point in points:  # rounds the joints, which pygame leaves open
+            pygame.draw.circle(canvas, color, point, width / 2)
+
+
+def _draw_arrow(
+    canvas: pygame.Surface,
+    color: tuple[int, int, int],
+    to_pixels: ToPixels,
+    pose: tuple[float, float, float],
+    length: float,
+    line: int,
+) -> None:
+    x, y, heading = pose
+    tip = x + 1.7 * length * math.cos(heading), y + 1.7 * length * math.sin(heading)
+    pygame.draw.line(canvas, color, to_pixels(x, y), to_pixels(*tip), line)
+    barbs = [
+        (tip[0] + 0.5 * length * math.cos(heading + turn), tip[1] + 0.5 * length * math.sin(heading + turn))
+        for turn in (math.radians(150), -math.radians(150))
+    ]
+    pygame.draw.polygon(canvas, color, [to_pixels(*tip), *(to_pixels(*barb) for barb in barbs)])
+
+
+def _draw_robot(
+    canvas: pygame.Surface,
+    color: tuple[int, int, int],
+    to_pixels: ToPixels,
+    pose: tuple[float, float, float],
+    radius: float,
+    scale: float,
+) -> None:
+    x, y, heading = pose
+    cos, sin = math.cos(heading), math.sin(heading)
+
+    def outline(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        return [to_pixels(x + radius * (a * cos - b * sin), y + radius * (a * sin + b * cos)) for a, b in corners]
+
+    pygame.draw.circle(canvas, color, to_pixels(x, y), radius * scale)
+    for side in (-0.75, 0.75):  # wheels
+        wheel = [(a, side + b) for a, b in ((-0.4, -0.12), (0.4, -0.12), (0.4, 0.12), (-0.4, 0.12))]
+        pygame.draw.polygon(canvas, WHEEL, outline(wheel))
+    pygame.draw.polygon(canvas, NOSE, outline([(0.9, 0.0), (0.35, 0.3), (0.35, -0.3)]))
+
+
+def _draw_status(canvas: pygame.Surface, scene: Scene, top: int) -> None:
+    left = max(scene.scenario.horizon - scene.time, 0.0)
+    texts = [f"time left {left:.1f} s", f"cost {scene.cost:.2f}"]
+    if scene.reference_cost is not None:
+        texts.append(f"optimum {scene.reference_cost:.2f}")
+    font = _font(max(10, min(20, canvas.get_width() // 28)))
+    column = canvas.get_width() / len(texts)
+    for number, text in enumerate(texts):
+        image = font.render(text, True, OPTIMUM_TEXT if number == 2 else TEXT)
+        position = column * (number + 0.5) - image.get_width() / 2, top + (STATUS_HEIGHT - image.get_height()) / 2
+        canvas.blit(image, position)
+
+
+@cache
+def _font(size: int) -> pygame.font.Font:
+    pygame.font.init()
+    return pygame.font.Font(None, size + 4)
+
+
+class Window:
+    """A window that shows frames at a constant rate.
+
+    Args:
+        fps: frames per second.
+
+    Attributes:
+        closed: whether the user has closed the window.
+
+    """
+
+    def __init__(self, fps: float) -> None:
+        self._fps = fps
+        self._surface: pygame.Surface | None = None
+        self._clock = pygame.time.Clock()
+        self.closed = False
+
+    def show(self, frame: np.ndarray) -> None:
+        """Show a frame."""
+        size = frame.shape[1], frame.shape[0]
+        if self._surface is None or self._surface.get_size() != size:
+            pygame.display.init()
+            pygame.display.set_caption("leapnav")
+            self._surface = pygame.display.set_mode(size)
+        self._surface.blit(pygame.surfarray.make_surface(np.transpose(frame, (1, 0, 2))), (0, 0))
+        pygame.display.flip()
+        self._clock.tick(self._fps)
+        self.closed |= any(event.type == pygame.QUIT for event in pygame.event.get())
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._surface is not None:
+            pygame.display.quit()
+            self._surface = None

@@ -1,0 +1,154 @@
+"""Sensing of the robot's surroundings (kernels): lidar ranges, or a map of the nearest obstacles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import float64, int64
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
+from leapnav.envs.shapes.field import ARENA, CIRCLES, POLYGONS, SHAPES
+from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
+
+WALL_ENTRIES = 6  # of a map, before the obstacles
+
+
+@kernel(
+    NOTHING(float64, float64, float64, float64, CONSTANT, float64, MATRIX, MATRIX),
+)
+def scan(x, y, cos, sin, field, reach, beams, scratch):
+    """Compute lidar ranges (m).
+
+    Each obstacle is intersected with all beams in a loop without branches, which compilers vectorize.
+
+    Args:
+        x, y: position of the lidar (m).
+        cos, sin: of its heading.
+        field: the packed field of the scenario.
+        reach: maximum range (m).
+        beams (2, n): cosines and sines of the angles of the beams in the lidar's frame.
+        scratch (5, n): working memory; row 2 contains the ranges afterwards.
+
+    """
+    count = beams.shape[1]
+    dxs, dys, nearest, enter, leave = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    to_right, to_top = field[ARENA + 2] - x, field[ARENA + 3] - y
+    to_left, to_bottom = field[ARENA] - x, field[ARENA + 1] - y
+    for k in range(count):
+        dx = cos * beams[0, k] - sin * beams[1, k]
+        dy = sin * beams[0, k] + cos * beams[1, k]
+        dxs[k], dys[k] = dx, dy
+        across = (to_right if dx > 0.0 else to_left) / dx if dx != 0.0 else np.inf
+        along = (to_top if dy > 0.0 else to_bottom) / dy if dy != 0.0 else np.inf
+        first = across if across < along else along
+        nearest[k] = first if first < reach else reach
+    at = SHAPES
+    for _ in range(int(field[CIRCLES])):
+        cx, cy, r = field[at] - x, field[at + 1] - y, field[at + 2]
+        at += 3
+        if cx * cx + cy * cy >= (r + reach) ** 2:
+            continue
+        for k in range(count):
+            along = cx * dxs[k] + cy * dys[k]
+            beside = cx * dys[k] - cy * dxs[k]
+            square = r * r - beside * beside
+            half = math.sqrt(square if square > 0.0 else 0.0)
+            hit = along - half if square > 0.0 and along + half > 0.0 else reach
+            nearest[k] = hit if hit < nearest[k] else nearest[k]
+    for _ in range(int(field[POLYGONS])):
+        edges = int(field[at])
+        rows = at + 1
+        at = rows + 5 * edges
+        if half_plane_distance(x, y, field, rows, edges) >= reach:
+            continue
+        # A point of a ray is inside the polygon if it is inside the half-planes of all edges.
+        for k in range(count):
+            enter[k], leave[k] = -np.inf, np.inf
+        for j in range(edges):
+            row = rows + 5 * j
+            nx, ny = field[row], field[row + 1]
+            height = nx * x + ny * y - field[row + 2]
+            for k in range(count):
+                rate = nx * dxs[k] + ny * dys[k]
+                # A ray parallel to an edge is entirely inside or outside its half-plane.
+                crossing = -height / rate if rate != 0.0 else (-np.inf if height > 0.0 else np.inf)
+                enter[k] = crossing if rate < 0.0 and crossing > enter[k] else enter[k]
+                leave[k] = crossing if rate >= 0.0 and crossing < leave[k] else leave[k]
+        for k in range(count):
+            hit = enter[k] if enter[k] <= leave[k] and leave[k] > 0.0 else reach
+            nearest[k] = hit if hit < nearest[k] else nearest[k]
+    for k in range(count):
+        nearest[k] = nearest[k] if nearest[k] > 0.0 else 0.0
+
+
+@kernel(int64(CONSTANT))
+def max_vertices(field):
+    """Return the maximum number of vertices of a polygon in the field, 0 without polygons."""
+    at = SHAPES + 3 * int(field[CIRCLES])
+    largest = 0
+    for _ in range(int(field[POLYGONS])):
+        largest = max(largest, int(field[at]))
+        at += 1 + 5 * int(field[at])
+    return largest
+
+
+@kernel(
+    NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR),
+)
+def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
+    """Describe the walls and the nearest obstacles in the robot's frame, in order of distance.
+
+    An obstacle is a polygon rounded by a radius; a disc has one vertex, a polygon the radius 0. Its row contains 1, the
+    radius and the vertices, which are repeated to fill the row. Rows without an obstacle are zeros.
+
+    Args:
+        x, y: position of the robot (m).
+        cos, sin: of its heading.
+        field: the packed field of the scenario.
+        obstacles, vertices: number of rows, and of vertices in each.
+        out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten.
+
+    """
+    out[0], out[1] = x - field[ARENA], y - field[ARENA + 1]
+    out[2], out[3] = field[ARENA + 2] - x, field[ARENA + 3] - y
+    out[4], out[5] = cos, sin
+    width = 2 + 2 * vertices
+    for k in range(WALL_ENTRIES, WALL_ENTRIES + obstacles * width):
+        out[k] = 0.0
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    # Insertion sort into a list of the nearest obstacles; a polygon is marked by a negative index into the field.
+    distances = np.full(obstacles, np.inf)
+    indices = np.zeros(obstacles, np.int64)
+    at = SHAPES
+    for i in range(circles + polygons):
+        if i < circles:
+            distance = math.sqrt((field[at] - x) ** 2 + (field[at + 1] - y) ** 2) - field[at + 2]
+            size = 3
+        else:
+            edges = int(field[at])
+            distance = polygon_distance(x, y, field, at + 1, edges)
+            size = 1 + 5 * edges
+        rank = obstacles
+        while rank > 0 and distance < distances[rank - 1]:
+            rank -= 1
+        if rank < obstacles:
+            for k in range(obstacles - 1, rank, -1):
+                distances[k], indices[k] = distances[k - 1], indices[k - 1]
+            distances[rank], indices[rank] = distance, (at if i < circles else -at)
+        at += size
+    for k in range(obstacles):
+        if distances[k] == np.inf:
+            break
+        row = WALL_ENTRIES + k * width
+        at = abs(indices[k])
+        disc = indices[k] > 0
+        out[row] = 1.0
+        out[row + 1] = field[at + 2] if disc else 0.0
+        edges = 1 if disc else int(field[at])
+        for j in range(vertices):
+            vertex = at if disc else at + 1 + 5 * (j % edges) + 3
+            dx, dy = field[vertex] - x, field[vertex + 1] - y
+            out[row + 2 + 2 * j] = cos * dx + sin * dy
+            out[row + 3 + 2 * j] = cos * dy - sin * dx

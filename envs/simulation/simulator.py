@@ -1,0 +1,302 @@
+"""Batched simulation of independent robots, shared by the single and the vector environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from leapnav.envs.kernels import prepare
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import GOAL, TASK_COLUMNS, Scenario
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.simulation import stepping
+from leapnav.envs.simulation.arcs import sinc
+from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies
+from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
+from leapnav.envs.simulation.sensing import max_vertices
+from leapnav.envs.simulation.state import (
+    CLEARANCE,
+    COLUMNS,
+    EFFORT,
+    LAST_STEP,
+    N_GUIDE_POINTS,
+    POSE_CLEARANCE,
+    PROXIMITY,
+    REMAINING,
+    SPEED,
+    SPIN,
+    STEPS,
+    TURN_RATE,
+    VX,
+    SimulationState,
+)
+
+MAX_MOTOR_STEP = 0.01  # s, substep of a control period with motors
+MAX_CONTACT_STEP = 0.0025  # s, substep of a control period in contact
+NOISE_ROWS = 32  # control periods whose noise is sampled together
+
+
+class BatchSimulator:
+    """Simulate the episodes of independent robots, each in its own arena.
+
+    Args:
+        count: number of robots.
+        settings: settings of the environment.
+
+    Attributes:
+        settings: settings of the environment.
+        layout: observation space, and the parts of an observation.
+        poses (count, 3): x, y (m) and heading (rad, unwrapped).
+        state (count, COLUMNS): see `leapnav.envs.simulation.state`.
+        tasks (count, TASK_COLUMNS): see `leapnav.envs.scenarios.scenario`.
+        fields (count, L): packed obstacle fields; the end of a row is unused.
+
+    """
+
+    def __init__(self, count: int, settings: EnvironmentSettings) -> None:
+        prepare(*_kernels(settings))
+        self.settings = settings
+        self.layout = ObservationLayout(settings)
+        self.state = np.zeros((count, COLUMNS))
+        self.tasks = np.zeros((count, TASK_COLUMNS))
+        self.fields = np.zeros((count, 0))
+        self._packed = settings.packed()
+        self._record: tuple[np.ndarray, ...] | None = None
+        self._disturbed, self._motors = settings.disturbed, settings.motors
+        self._maps = settings.observation == "map"
+        self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
+        self._lengths = np.zeros(count, dtype=int)
+        self._guides = np.zeros((count, N_GUIDE_POINTS, 3))
+        motor = settings.motor
+        self._free = FreeBodies(count, motor.mass, motor.moment, forces=settings.motors)
+        self._contacts: dict[int, ContactWorld] = {}
+        width = 7 + settings.lidar_beams if settings.disturbed else 0
+        self._noise = np.zeros((count, NOISE_ROWS if settings.disturbed else 1, width))
+        self._noise_rows = np.zeros(count, dtype=np.int64)
+        self._generators: list[np.random.Generator | None] = [None] * count
+        self._all_active, self._all_robots = np.ones(count, dtype=bool), np.arange(count)
+
+    @property
+    def poses(self) -> np.ndarray:  # noqa: D102 (documented as an attribute of the class)
+        return self._free.rows[:, :3]
+
+    @property
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        """The episodes as the record that the kernels take."""
+        if self._record is None:
+            self._record = tuple(
+                SimulationState(
+                    bodies=self._free.rows,
+                    state=self.state,
+                    tasks=self.tasks,
+                    fields=self.fields,
+                    guides=self._guides,
+                    noise=self._noise,
+                    noise_rows=self._noise_rows,
+                    settings=self._packed,
+                )
+            )
+        return self._record
+
+    def reset(
+        self,
+        robots: Sequence[int] | np.ndarray,
+        choices: Sequence[Scenario | int],
+        bank: ScenarioBank | None = None,
+        generators: Sequence[np.random.Generator] = (),
+    ) -> None:
+        """Start episodes.
+
+        Args:
+            robots: indices of the robots.
+            choices: for each robot a scenario, or the index of a scenario in the bank.
+            bank: the bank that the indices refer to.
+            generators: random generators of the noise, one for each of these robots; empty without noise.
+
+        Raises:
+            ValueError: a scenario does not fit the observation. No episode is started then.
+
+        """
+        indices = np.asarray(robots, dtype=np.int64)
+        fields = [_get_field(choice, bank) for choice in choices]
+        for field in fields:
+            self._check_fits(field)
+        longest = max(map(len, fields))
+        if longest > self.fields.shape[1]:
+            # Rows at multiples of a large power of two would map to the same cache sets, so a row has an odd number of
+            # cache lines.
+            wider = np.zeros((len(self.fields), 16 * math.ceil(longest / 16) + 8))
+            wider[:, : self.fields.shape[1]] = self.fields
+            self.fields, self._record = wider, None
+        for i, choice, field in zip(indices.tolist(), choices, fields, strict=True):
+            self.fields[i, : len(field)] = field
+            self._lengths[i] = len(field)
+            if isinstance(choice, Scenario):
+                self.tasks[i] = choice.task
+            else:
+                self.tasks[i] = _require(bank).tasks[choice]
+            if self.settings.reward == "shaped":
+                self._guides[i] = self._guide(choice, bank, self.tasks[i])
+            self._contacts.pop(i, None)
+        stepping.start_episodes(indices, self._arrays)
+        if self._disturbed:
+            for i, generator in zip(indices.tolist(), generators, strict=True):
+                self._generators[i] = generator
+                self._draw_noise(i)
+
+    def check(self, choice: Scenario | int | None, bank: ScenarioBank | None) -> None:
+        """Check that a scenario fits the observation.
+
+        Args:
+            choice: a scenario, or the index of a scenario in the bank; None checks all scenarios of the bank.
+            bank: the bank, or None.
+
+        Raises:
+            ValueError: a polygon has more vertices than the map.
+
+        """
+        if choice is not None:
+            self._check_fits(_get_field(choice, bank))
+        elif bank is not None:
+            for index in range(len(bank)):
+                self._check_fits(bank.field(index))
+
+    def _check_fits(self, field: np.ndarray) -> None:
+        if not self._maps:
+            return
+        vertices = max_vertices(field)
+        if vertices > self.settings.map_vertices:
+            raise ValueError(
+                f"map_vertices: expected at least {vertices}, the number of vertices of a polygon in the scenario, "
+                f"got {self.settings.map_vertices}"
+            )
+
+    def _guide(self, choice: Scenario | int, bank: ScenarioBank | None, task: np.ndarray) -> np.ndarray:
+        """Return the guide points of the reference path, see `SimulationState`; without a reference, only the goal."""
+        guides = np.zeros((N_GUIDE_POINTS, 3))
+        guides[:, :2] = task[GOAL : GOAL + 2]
+        if not isinstance(choice, Scenario):
+            path = _require(bank).states(choice)[:, :2].astype(float)
+            length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+            selected = np.linspace(0, len(path) - 1, N_GUIDE_POINTS).round().astype(int)
+            guides[:, :2], guides[:, 2] = path[selected], length[-1] - length[selected]
+        return guides
+
+    def _draw_noise(self, i: int) -> None:
+        generator = self._generators[i]
+        assert generator is not None  # set by `reset`
+        self._noise[i] = generator.standard_normal(self._noise.shape[1:])
+
+    def step(self, actions: np.ndarray, active: np.ndarray | None = None) -> None:
+        """Simulate one control period.
+
+        Args:
+            actions (count, 2): float64.
+            active (count,): bool, the robots to simulate; None for all. The state of the others is unchanged.
+
+        Raises:
+            ValueError: an action is not finite; the state is unchanged then.
+
+        """
+        active = self._all_active if active is None else active
+        state = self.state
+        if self._disturbed:
+            self._noise_rows[:] = state[:, STEPS] % NOISE_ROWS
+        invalid = stepping.command(actions, active, self._arrays)
+        if invalid >= 0:
+            robot = "" if len(state) == 1 else f" for robot {invalid}"
+            raise ValueError(f"action: expected two finite numbers, got {actions[invalid].tolist()}{robot}")
+        if self._motors:
+            for substep in range(self._substeps):
+                stepping.drive_motors(self._arrays, substep, self._substeps)
+                self._free.advance()
+                stepping.read_velocities(self._arrays, self._substeps)
+        else:
+            stepping.drive_arcs(self._arrays)
+            self._free.advance()
+        if not self.settings.terminate_on_collision:
+            for i in np.flatnonzero(state[:, REMAINING] > 0).tolist():
+                self._drive_in_contact(i)
+        stepping.end_periods(active, self._arrays)
+        if self._disturbed:
+            # The observation at the end of a period uses the noise row of the next period.
+            for i in np.flatnonzero(active & (state[:, STEPS] % NOISE_ROWS == 0)).tolist():
+                self._draw_noise(i)
+
+    def _drive_in_contact(self, i: int) -> None:
+        """Simulate the rest of a period after a contact."""
+        row, body = self.state[i], self._free.rows[i]
+        duration = float(row[REMAINING])
+        field = self.field(i)
+        motor = self.settings.motor
+        if i not in self._contacts:
+            self._contacts[i] = ContactWorld(field, motor.mass, motor.moment, motor.friction)
+        substeps = math.ceil(duration / MAX_CONTACT_STEP)
+        step = duration / substeps
+        speed, turn_rate = float(row[SPEED]), float(row[TURN_RATE])
+        velocity = row[VX : SPIN + 1].copy()
+        if self._motors:
+
+            def control(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
+                fx, fy, torque = stepping.wheel_forces(vx, vy, heading, spin, speed, turn_rate, step, self._packed)
+                return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
+        else:
+
+            def control(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
+                along = speed * sinc(turn_rate * step / 2)
+                middle = heading + turn_rate * step / 2
+                return along * math.cos(middle), along * math.sin(middle), turn_rate
+
+            velocity[:] = control(0.0, 0.0, float(body[2]), 0.0)
+        lowest, speeds, turn_rates, proximity = self._contacts[i].drive(body, velocity, control, duration, substeps)
+        if self._motors:
+            row[VX : SPIN + 1] = velocity
+        row[EFFORT] += stepping.effort(self.tasks, i, speeds, turn_rates)
+        row[PROXIMITY] += proximity
+        row[POSE_CLEARANCE] = clearance(body[0], body[1], field)[0]
+        row[CLEARANCE] = min(row[CLEARANCE], lowest)
+
+    def field(self, i: int) -> np.ndarray:
+        """Return the packed obstacle field of a robot's scenario."""
+        return self.fields[i, : self._lengths[i]]
+
+    def observe(self, out: np.ndarray, robots: np.ndarray | None = None) -> None:
+        """Write flat observations to `out` (count, size), float32: of all robots, or of those given by index."""
+        if self._disturbed:
+            self._noise_rows[:] = self.state[:, STEPS] % NOISE_ROWS
+        self.layout.fill(self._all_robots if robots is None else robots, self._arrays, out)
+
+    def at_goal(self, i: int) -> bool:
+        """Return whether the pose of a robot equals its goal, within the tolerances."""
+        return bool(stepping.at_goal(i, SimulationState(*self._arrays)))
+
+    def at_horizon(self, i: int) -> bool:
+        """Return whether the episode of a robot has reached the horizon."""
+        return bool(self.state[i, STEPS] >= self.state[i, LAST_STEP])
+
+    def ranges(self, i: int) -> np.ndarray:
+        """Return the lidar ranges of a robot without noise (m); empty without a lidar."""
+        return self.layout.scan(self._free.rows[i], self.field(i))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Contact worlds have no memory between periods, so they can be created again.
+        return {**self.__dict__, "_contacts": {}, "_record": None}
+
+
+def _require(bank: ScenarioBank | None) -> ScenarioBank:
+    assert bank is not None  # an index always refers to a bank
+    return bank
+
+
+def _get_field(choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray:
+    return choice.field if isinstance(choice, Scenario) else _require(bank).field(choice)
+
+
+def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
+    """Return the kernels of a step, so that those not in the cache are compiled together."""
+    moving = (stepping.drive_motors, stepping.read_velocities) if settings.motors else (stepping.drive_arcs,)
+    return stepping.start_episodes, stepping.command, *moving, stepping.end_periods, observe_robots

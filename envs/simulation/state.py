@@ -1,0 +1,88 @@
+"""The episodes of many robots as arrays: the columns of the state, and the record that the kernels take."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import types
+
+from leapnav.envs.kernels import record_type
+from leapnav.envs.kernels.types import CUBE, INTEGERS, MATRIX, VECTOR
+
+# Columns of the state.
+(
+    STEPS,  # control periods completed
+    LAST_STEP,  # control periods in the episode
+    TIME,  # s
+    COST,  # J so far
+    POSE_CLEARANCE,  # clearance of the pose, m
+    CLEARANCE,  # smallest clearance during the period, m
+    COLLIDED,  # whether there was a contact in the episode
+    IN_CONTACT,  # whether there was a contact in the period
+    REMAINING,  # time of the period after the first contact, s
+    SUCCESS,
+    TERMINATED,
+    SPEED,  # commanded speed (m/s) and turn rate (rad/s), with actuation noise
+    TURN_RATE,
+    DURATION,  # of the period, s
+    VX,  # velocity (m/s, m/s, rad/s) of a robot with motors
+    VY,
+    SPIN,
+    EFFORT,  # parts of the reward of the period, as costs
+    PROXIMITY,
+    COLLISION,
+    MISS,
+    SHAPING,
+    REWARD,
+    POTENTIAL,  # of the current state, for the shaped reward
+    COLUMNS,
+) = range(25)
+
+# What the infos contain: numbers, flags, and the parts of the reward (as costs).
+INFOS = {"cost": COST, "clearance": CLEARANCE, "time": TIME}
+FLAGS = {"collision": COLLIDED, "is_success": SUCCESS}
+PARTS = {"effort": EFFORT, "proximity": PROXIMITY, "collision": COLLISION, "miss": MISS}
+
+N_GUIDE_POINTS = 17  # points along the reference path, for the potential
+
+
+class SimulationState(NamedTuple):
+    """The episodes of `count` robots.
+
+    Attributes:
+        bodies (count, 6 or 9): see `FreeBodies`.
+        state (count, COLUMNS): see the constants of this module.
+        tasks (count, TASK_COLUMNS): see `leapnav.envs.scenarios.scenario`.
+        fields (count, L): packed obstacle fields; the end of a row is unused.
+        guides (count, N_GUIDE_POINTS, 3): points (m) of the reference path, and the path length (m) from
+            each to the goal.
+        noise (count, rows, columns): standard normal numbers.
+        noise_rows (count,): the row of `noise` that each robot uses.
+        settings (PACKED,): see `leapnav.envs.settings`.
+
+    """
+
+    bodies: np.ndarray
+    state: np.ndarray
+    tasks: np.ndarray
+    fields: np.ndarray
+    guides: np.ndarray
+    noise: np.ndarray
+    noise_rows: np.ndarray
+    settings: np.ndarray
+
+
+SIMULATION_STATE = record_type(
+    SimulationState,
+    bodies=MATRIX,
+    state=MATRIX,
+    tasks=MATRIX,
+    fields=MATRIX,
+    guides=CUBE,
+    noise=CUBE,
+    noise_rows=INTEGERS,
+    settings=VECTOR,
+)
+# The same as a plain tuple, which is how Python passes it: Numba unpickles the class of a named one at every call.
+PACKED_STATE = types.Tuple(SIMULATION_STATE.types)

@@ -1,0 +1,1 @@
+"""Utilities shared by all packages: files, JSON, validation."""

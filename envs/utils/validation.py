@@ -1,0 +1,74 @@
+"""Validation of arguments. Each error message names the argument, what was expected, and the value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, TypeGuard
+
+import numpy as np
+
+
+def check_positive(name: str, value: Any) -> None:
+    """Raise ValueError unless the value is a finite number > 0."""
+    if not (is_finite_number(value) and value > 0):
+        raise ValueError(f"{name}: expected a positive number, got {value!r}")
+
+
+def check_not_negative(name: str, value: Any) -> None:
+    """Raise ValueError unless the value is a finite number >= 0."""
+    if not (is_finite_number(value) and value >= 0):
+        raise ValueError(f"{name}: expected a number >= 0, got {value!r}")
+
+
+def check_at_least(name: str, value: Any, minimum: float, *, unit: str = "") -> None:
+    """Raise ValueError unless the value is a finite number >= `minimum`; the message states the minimum's `unit`."""
+    if not (is_finite_number(value) and value >= minimum):
+        raise ValueError(f"{name}: expected at least {minimum}{unit and f' {unit}'}, got {value!r}")
+
+
+def check_fraction(name: str, value: Any, *, zero: bool = True, one: bool = True) -> None:
+    """Raise ValueError unless the value is a number in [0, 1]; `zero=False` and `one=False` exclude an end."""
+    if not (is_finite_number(value) and 0 <= value <= 1 and (zero or value > 0) and (one or value < 1)):
+        raise ValueError(f"{name}: expected a number in {'[' if zero else '('}0, 1{']' if one else ')'}, got {value!r}")
+
+
+def check_integer(name: str, value: Any, minimum: int, maximum: int | None = None) -> int:
+    """Return the value as an int.
+
+    Raises:
+        ValueError: it is not an integer from `minimum` to `maximum`.
+
+    """
+    if not is_integer(value) or value < minimum or (maximum is not None and value > maximum):
+        expected = f">= {minimum}" if maximum is None else f"from {minimum} to {maximum}"
+        raise ValueError(f"{name}: expected an integer {expected}, got {value!r}")
+    return int(value)
+
+
+def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
+    """Raise ValueError unless the value is one of the choices."""
+    known = tuple(choices)
+    if value not in known:
+        raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raise ValueError unless the value is a boolean of Python or NumPy."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name}: expected True or False, got {value!r}")
+
+
+def is_integer(value: Any) -> TypeGuard[int]:
+    """Return whether a value is an integer of Python or NumPy; booleans are not."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a real number of Python or NumPy, finite or not; booleans are not."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def is_finite_number(value: Any) -> bool:
+    """Return whether a value is a finite real number of Python or NumPy; booleans are not."""
+    return is_number(value) and math.isfinite(value)

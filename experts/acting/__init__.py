@@ -1,0 +1,1 @@
+"""Optimal feedback: the expert policy and the re-solution from any state."""

@@ -1,0 +1,227 @@
+"""Optimal feedback: re-solution of a scenario from any state, warm-started from the previous solution."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
+from leapnav.envs.shapes.clearance import clearances
+from leapnav.experts.acting.gains import Gains
+from leapnav.experts.acting.tracking import FLOW_ACCURACY, advance, control_at, follow, follow_all
+from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.numerics.step_halving import step_halving
+from leapnav.experts.optimum import find_optimum
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.solvers.newton import CONVERGED, MARGIN
+from leapnav.experts.solvers.nodes import start_nodes
+
+# Maximum time (s) between nodes, tried in this order. Fewer nodes are faster, but the flow close to an obstacle can be
+# too sensitive for long segments.
+SEGMENT_DURATIONS = (0.5, 0.25, 0.125)
+TOLERANCE = 1e-6  # residual of the boundary and continuity conditions; the controls have a similar error
+SEARCH_PAUSE = 0.5  # s after an unsuccessful search before the next one
+MIN_STEP = 1 / 16  # smallest step of the continuation in the state, as a fraction of the distance
+LARGE_DEVIATION = 0.05  # m or rad; after a larger deviation the clearance of the new path is checked
+CLEARANCE_SAMPLING = 0.05  # s between the points of this check
+GAIN_SAMPLING = 0.05  # s between the points of the gains
+GAIN_HOLD = 0.25  # s before the horizon from which the gains are constant, because they grow without bound
+
+
+class _Solution(NamedTuple):
+    """Times (K + 1,) in the episode, nodes (K + 1, 6) of states and costates, and costs (K,) of the segments."""
+
+    times: np.ndarray
+    nodes: np.ndarray
+    costs: np.ndarray
+
+
+class Feedback:
+    """Optimal control of one scenario from any state and time.
+
+    The solution from the last state is stored. From the next state, which is usually close, one or two Newton steps on
+    states and costates at the remaining nodes converge. If they fail, the state is approached in smaller steps; if this
+    fails too, or leads through an obstacle, a new search is made.
+
+    Args:
+        scenario: the scenario.
+        path: its optimum or an approximation of it, with costates.
+        quick: use quick searches, see `find_optimum`.
+
+    Attributes:
+        searches: number of searches so far.
+
+    Raises:
+        ValueError: no optimum was found.
+
+    """
+
+    def __init__(self, scenario: Scenario, path: Trajectory, *, quick: bool = False) -> None:
+        self.scenario, self._quick = scenario, quick
+        self.searches = 0
+        self._next_search = 0.0  # s; earliest time of the next search
+        problem = OptimalControlProblem.from_scenario(scenario)
+        if not self._adopt(problem, path, 0.0) and not self._search(np.array(scenario.start), 0.0):
+            raise ValueError(f"scenario {scenario.name!r}: no optimum was found")
+
+    def _adopt(self, problem: OptimalControlProblem, path: Trajectory, start_time: float) -> bool:
+        """Solve a problem that starts at `start_time`, and store the solution; False without one."""
+        problem = problem.with_winding_of(path.states)
+        previous, self._arrays = getattr(self, "_arrays", problem.arrays), problem.arrays
+        for duration in SEGMENT_DURATIONS:
+            segments = max(1, math.ceil(problem.horizon / duration - 1e-9))
+            times, nodes = start_nodes(problem, path, segments)
+            found, _, _ = self._newton(times + start_time, nodes, problem.arrays.start, start_time, TOLERANCE)
+            if found is not None:
+                self._stored = found
+                return True
+        self._arrays = previous
+        return False
+
+    def update(self, state: np.ndarray, time: float) -> bool:
+        """Re-solve from a state at a time, and store the solution.
+
+        Args:
+            state: x, y (m), heading (rad), shape (3,).
+            time: s since the start of the episode.
+
+        Returns:
+            Whether there is a solution; without one, the previous solution remains stored.
+
+        """
+        found = self._resolve(np.array(state, dtype=float), time, TOLERANCE)
+        if found is not None:
+            self._stored = found
+        return found is not None
+
+    def value(self, state: np.ndarray, time: float, tol: float = 1e-9) -> tuple[float, np.ndarray]:
+        """Return the cost-to-go and its gradient, the costate (3,); the stored solution is unchanged.
+
+        Args:
+            state: x, y (m), heading (rad), shape (3,).
+            time: s since the start of the episode.
+            tol: residual of the boundary and continuity conditions.
+
+        Raises:
+            ValueError: no solution was found.
+
+        """
+        stored = self._arrays, self._stored, self._next_search
+        try:
+            found = self._resolve(np.array(state, dtype=float), time, tol)
+        finally:
+            self._arrays, self._stored, self._next_search = stored
+        if found is None:
+            raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
+        return float(found.costs.sum()), found.nodes[0, 3:].copy()
+
+    @property
+    def stored(self) -> tuple[float, np.ndarray]:
+        """Cost-to-go and costate (3,) at the state and time of the stored solution."""
+        return float(self._stored.costs.sum()), self._stored.nodes[0, 3:].copy()
+
+    @property
+    def final_costate(self) -> np.ndarray:
+        """Costate (3,) at the horizon."""
+        return self._stored.nodes[-1, 3:].copy()
+
+    def control(self, time: float) -> np.ndarray:
+        """Return speed (m/s) and turn rate (rad/s) of the stored solution at a time."""
+        arrays, (times, nodes, _) = self._arrays, self._stored
+        return control_at(arrays.flow, arrays.control, times, nodes, time, len(arrays.data) // 3)
+
+    def gains(self) -> Gains:
+        """Compute neighbouring-extremal gains along the stored solution."""
+        arrays = self._arrays
+        start, end = float(self._stored.times[0]), float(self._stored.times[-1])
+        times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_SAMPLING - 1e-9) + 1))
+        extremal = np.array([follow(arrays.flow, *self._stored[:2], time) for time in times])
+        n = 3
+        transitions = np.empty((len(times) - 1, 2 * n, 2 * n))
+        for k, transition in enumerate(transitions):
+            transition[:] = np.eye(2 * n)
+            duration = times[k + 1] - times[k]
+            propagate(arrays.flow, extremal[k].copy(), transition, duration, FLOW_ACCURACY, 0.0, False)
+        slopes = np.zeros((len(times), n, n))
+        free = arrays.free
+        for k in range(len(times) - 2, -1, -1):
+            A, B = transitions[k, :n, :n], transitions[k, :n, n:]
+            C, D = transitions[k, n:, :n], transitions[k, n:, n:]
+            if k == len(times) - 2:  # the final condition of each component: on the state, or on the costate if free
+                left, right = np.where(free[:, None], D, B), np.where(free[:, None], C, A)
+                slopes[k] = -np.linalg.solve(left, right)
+            else:
+                slopes[k] = np.linalg.solve(D - slopes[k + 1] @ B, slopes[k + 1] @ A - C)
+        last = max(0, int(np.searchsorted(times, end - GAIN_HOLD, side="right")) - 1)
+        slopes[last:] = slopes[last]
+        return Gains(times, extremal, slopes, arrays.control, arrays.data)
+
+    def _resolve(self, state: np.ndarray, time: float, tol: float) -> _Solution | None:
+        """The solution from a state and time, None without one."""
+        if self._stored.times[-1] - time <= 0.0:
+            return None
+        found, times, nodes = self._newton(*self._stored[:2], state, time, tol)
+        check_clearance = np.abs(state - nodes[0, :3]).max() > LARGE_DEVIATION
+        if found is None:
+            found, check_clearance = self._approach(times, nodes, state, tol), True
+        if found is not None and check_clearance and clearances(self._sample(found), self.scenario.field).min() <= 0.0:
+            found = None
+        if found is not None or not self._search(state, time):
+            return found
+        return self._stored if tol >= TOLERANCE else self._newton(*self._stored[:2], state, time, tol)[0]
+
+    def _newton(
+        self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, time: float, tol: float
+    ) -> tuple[_Solution | None, np.ndarray, np.ndarray]:
+        """Solve from a state at a time by Newton's method, with the remaining nodes as the initial guess.
+
+        Returns the solution, None without convergence, and the times and values of the remaining nodes.
+        """
+        arrays = self._arrays
+        code, times, nodes, costs, remaining = advance(arrays.flow, times, nodes, state, time, arrays.end, MARGIN * tol)
+        return (_Solution(times, nodes, costs) if code == CONVERGED else None), times, remaining
+
+    def _approach(self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, tol: float) -> _Solution | None:
+        """Solve by continuation in the state, with steps that are halved when they fail."""
+        start = nodes[0, :3]
+
+        def advance_to(fraction: float, previous: np.ndarray) -> np.ndarray | None:
+            nonlocal found
+            found, _, _ = self._newton(times, previous, start + fraction * (state - start), times[0], tol)
+            return None if found is None else found.nodes
+
+        found: _Solution | None = None
+        reached = step_halving(advance_to, nodes, first_step=0.5, min_step=MIN_STEP)
+        return None if reached is None else found
+
+    def _sample(self, solution: _Solution) -> np.ndarray:
+        """States (K, 3) of a solution, evenly spaced in time."""
+        arrays, (times, nodes, _) = self._arrays, solution
+        count = math.ceil((times[-1] - times[0]) / CLEARANCE_SAMPLING) + 1
+        moments = np.linspace(times[0], times[-1], count)
+        return follow_all(arrays.flow, times, nodes, moments)
+
+    def _remaining_scenario(self, state: np.ndarray, time: float) -> Scenario | None:
+        """The rest of the episode as a scenario, None in collision or without time left."""
+        update = {"start": tuple(state.tolist()), "horizon": float(self.scenario.horizon - time)}
+        try:
+            return self.scenario.model_copy(update=update)
+        except ScenarioError:
+            return None
+
+    def _search(self, state: np.ndarray, time: float) -> bool:
+        """Search for the optimum from a state and time, and store it; False without one."""
+        if time < self._next_search:
+            return False
+        self.searches += 1
+        scenario = self._remaining_scenario(state, time)
+        if scenario is None:
+            return False
+        optimum = find_optimum(scenario, thorough=not self._quick)
+        path = Trajectory(optimum.times, optimum.states, optimum.costates)
+        if optimum.success and self._adopt(optimum.problem, path, time):
+            return True
+        self._next_search = time + SEARCH_PAUSE
+        return False

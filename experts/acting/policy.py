@@ -1,0 +1,270 @@
+"""The expert as a policy, with the interface of Stable-Baselines3."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.unwrapping import unwrap
+from leapnav.envs.utils.validation import check_choice
+from leapnav.experts.acting.feedback import Feedback
+from leapnav.experts.acting.gains import Gains
+from leapnav.experts.optimum import find_optimum
+from leapnav.experts.problem.extremal import Extremal
+from leapnav.experts.problem.problem import Trajectory
+
+FEEDBACKS = ("resolve", "gains", "none")
+MIN_THREADED_ROBOTS = 8  # with fewer robots, threads cost more time than they save
+
+
+class NoOptimumError(RuntimeError):
+    """The expert has no certified optimum of a scenario. The message contains the scenario and the solver's status.
+
+    Attributes:
+        scenario: the scenario.
+
+    """
+
+    def __init__(self, message: str, scenario: Scenario) -> None:
+        super().__init__(message)
+        self.scenario = scenario
+
+
+def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) -> np.ndarray:
+    """The optimum as actions (K, 2) in [-1, 1], one per control period of the environment.
+
+    Each action is the optimal control in the middle of its period. The environment integrates held controls exactly,
+    so the error of the resulting path is of second order in the control period.
+    """
+    count = max(1, math.ceil(scenario.horizon / control_period - 1e-6))
+    starts = control_period * np.arange(count)
+    middles = (starts + np.minimum(starts + control_period, scenario.horizon)) / 2
+    limits = scenario.robot.max_speed, scenario.robot.max_turn_rate
+    return (extremal.evaluate(middles)[1] / limits).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Situation:
+    """Scenario, pose and time of one robot."""
+
+    scenario: Scenario
+    index: int | None
+    bank: ScenarioBank | None
+    pose: np.ndarray
+    time: float
+    period: float
+
+
+@dataclass
+class _Robot:
+    """The solution of one robot's episode."""
+
+    scenario: Scenario
+    time: float
+    limits: np.ndarray
+    feedback: Feedback
+    gains: Gains | None
+    label: tuple[float, np.ndarray] = (math.nan, np.full(3, math.nan))  # cost-to-go and costate of the last action
+
+
+class ExpertPolicy:
+    """Optimal policy for all robots of an environment, from any state.
+
+    Args:
+        env: the environment that the actions are for: `NavigateEnv` or `NavigateVectorEnv`, wrapped or not, or a
+            Stable-Baselines3 `VecEnv` of them. Scenarios, poses and times are read from it; the observations given to
+            `predict` are ignored.
+        references: known optima of scenarios, with costates. The optima of a bank are read from the bank; all others
+            are computed at the first step of an episode.
+        feedback: "resolve": at each step the optimal control from the current state and time, re-solved from the
+            solution of the previous step, or found by a new search if that fails. "gains": neighbouring-extremal gains
+            along the optimum from the start, 100 times cheaper and accurate close to that optimum. "none": the optimum
+            from the start, without feedback.
+        quick: examine only the most promising candidates in a search, see `find_optimum`. Suitable for DAgger, which
+            needs many optima and tolerates a few missing ones.
+        workers: number of threads for several robots; None uses one per core.
+
+    Raises:
+        TypeError: the environment is not one of leapnav's.
+        ValueError: `feedback` is unknown.
+
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        references: Mapping[Scenario, Trajectory] | None = None,
+        *,
+        feedback: Literal["resolve", "gains", "none"] = "resolve",
+        quick: bool = False,
+        workers: int | None = None,
+    ) -> None:
+        check_choice("feedback", feedback, FEEDBACKS)
+        self._quick = quick
+        self._envs = unwrap(env)
+        self._references = dict(references or {})
+        self._feedback = feedback
+        self._workers = workers or os.cpu_count() or 1
+        self._robots: list[_Robot | None] = [None] * sum(getattr(inner, "num_envs", 1) for inner in self._envs)
+
+    def drives(self, env: Any) -> bool:
+        """Whether the policy belongs to an environment."""
+        return all(one is other for one, other in zip(self._envs, unwrap(env), strict=False))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Keyword arguments of an equal expert for another environment."""
+        return {"feedback": self._feedback, "quick": self._quick}
+
+    @property
+    def searches(self) -> int:
+        """Number of new searches in the robots' current episodes."""
+        return sum(robot.feedback.searches for robot in self._robots if robot is not None)
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions for the environment's current step, and `state` unchanged.
+
+        Actions have shape (2,), or (N, 2) for batched observations.
+
+        Raises:
+            NoOptimumError: a scenario has no certified optimum.
+
+        """
+        actions = np.array(self._each(self._act, self._situations()), dtype=np.float32)
+        batched = np.ndim(next(iter(observation.values())) if isinstance(observation, Mapping) else observation) > 1
+        return (actions if batched else cast(np.ndarray, actions[0])), state
+
+    def value(self, state: Any = None, time: Any = None) -> Any:
+        """Return the cost-to-go J* from the robots' states, or from other states in their episodes.
+
+        It is the cost of the local optimum that continues the robot's current one. After a small disturbance this is
+        still the best optimum, after a large one it may not be.
+
+        Args:
+            state: x, y (m), heading (rad), shape (3,), or (N, 3) for several robots; None: the current states.
+            time: s since the start of the episode, a number or (N,); None: the current times.
+
+        Returns:
+            A float, or shape (N,) for several robots.
+
+        Raises:
+            ValueError: no optimum was found from a state.
+            NoOptimumError: a scenario has no certified optimum.
+
+        """
+        values = [value for value, _ in self._ask(state, time)]
+        return np.array(values) if len(values) > 1 else values[0]
+
+    def costate(self, state: Any = None, time: Any = None) -> np.ndarray:
+        """Return the gradient of `value` with respect to the state, (3,) or (N, 3); arguments and errors as there."""
+        costates = [costate for _, costate in self._ask(state, time)]
+        return np.array(costates) if len(costates) > 1 else costates[0]
+
+    def labels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cost-to-go (N,) and costate (N, 3) that the last `predict` computed.
+
+        They are accurate to 1e-6, and NaN if the goal could not be reached. All are NaN unless the feedback is
+        "resolve".
+        """
+        found = [(math.nan, np.full(3, math.nan)) if robot is None else robot.label for robot in self._robots]
+        return np.array([cost for cost, _ in found]), np.array([costate for _, costate in found])
+
+    def _ask(self, state: Any, time: Any) -> list[tuple[float, np.ndarray]]:
+        situations = self._situations()
+        count = len(situations)
+        if state is not None:
+            states = np.asarray(state, dtype=float)
+            if states.shape not in ((count, 3), (3,)) or not np.isfinite(states).all():
+                raise ValueError(f"state: expected finite numbers of shape {(count, 3)}, got {state!r}")
+            situations = [
+                replace(s, pose=p) for s, p in zip(situations, np.broadcast_to(states, (count, 3)), strict=True)
+            ]
+        times = [s.time for s in situations] if time is None else np.broadcast_to(time, (count,)).tolist()
+        for situation, t in zip(situations, times, strict=True):
+            if not 0.0 <= t < situation.scenario.horizon:
+                raise ValueError(f"time: expected a number from 0 to {situation.scenario.horizon:g}, got {t!r}")
+
+        def ask(i: int, situation: _Situation) -> tuple[float, np.ndarray]:
+            return self._robot(i, situation).feedback.value(situation.pose, times[i])
+
+        return self._each(ask, situations)
+
+    def _act(self, i: int, situation: _Situation) -> np.ndarray:
+        left = situation.scenario.horizon - situation.time
+        if left <= 0.0:  # the episode has ended
+            return np.zeros(2)
+        robot = self._robot(i, situation)
+        ahead = min(situation.period, left) / 2
+        if robot.gains is not None:
+            control = robot.gains.control(situation.pose, situation.time, ahead)
+        else:
+            if self._feedback == "resolve":
+                solved = robot.feedback.update(situation.pose, situation.time)
+                robot.label = robot.feedback.stored if solved else (math.nan, np.full(3, math.nan))
+            control = robot.feedback.control(situation.time + ahead)
+        return control / robot.limits
+
+    def _robot(self, i: int, situation: _Situation) -> _Robot:
+        """The solution of a robot's episode; a new episode is looked up or solved."""
+        robot = self._robots[i]
+        if robot is not None and robot.scenario is situation.scenario and situation.time >= robot.time:
+            robot.time = situation.time
+            return robot
+        scenario = situation.scenario
+        path = self._references.get(scenario)
+        if path is None and situation.bank is not None and situation.index is not None:
+            reference = situation.bank.reference(situation.index)
+            path = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
+        if path is None:
+            optimum = find_optimum(scenario, thorough=not self._quick)
+            if not optimum.success:
+                message = f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}"
+                raise NoOptimumError(message, scenario)
+            path = Trajectory(optimum.times, optimum.states, optimum.costates)
+        try:
+            feedback = Feedback(scenario, path, quick=self._quick)
+        except ValueError as error:
+            raise NoOptimumError(str(error), scenario) from None
+        limits = np.array([scenario.robot.max_speed, scenario.robot.max_turn_rate])
+        gains = feedback.gains() if self._feedback == "gains" else None
+        robot = _Robot(scenario, situation.time, limits, feedback, gains)
+        self._robots[i] = robot
+        return robot
+
+    def _situations(self) -> list[_Situation]:
+        """The situations of all robots."""
+        found: list[_Situation] = []
+        for env in self._envs:
+            period, bank = env.control_period, env.bank
+            if isinstance(env, NavigateEnv):
+                found.append(_Situation(env.scenario, env.index, bank, np.array(env.pose), env.time, period))
+            else:
+                rows = zip(env.scenarios, env.indices, env.poses, env.times.tolist(), strict=True)
+                found += [_Situation(scenario, i, bank, pose, time, period) for scenario, i, pose, time in rows]
+        return found
+
+    def _each(self, function: Callable[[int, _Situation], Any], situations: list[_Situation]) -> list[Any]:
+        """Call a function for all robots, in threads; the kernels release the global interpreter lock."""
+        numbered = list(enumerate(situations))
+        if len(numbered) < MIN_THREADED_ROBOTS or self._workers == 1:
+            return [function(i, situation) for i, situation in numbered]
+        size = math.ceil(len(numbered) / self._workers)
+        parts = [numbered[first : first + size] for first in range(0, len(numbered), size)]
+        with ThreadPoolExecutor(self._workers) as pool:
+            values = pool.map(lambda part: [function(i, situation) for i, situation in part], parts)
+            return [value for part in values for value in part]

@@ -1,0 +1,151 @@
+"""Continuation: solution of a sequence of problems, each from the solution of the preceding one.
+
+The step control is that of `leapnav.experts.numerics.step_halving`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.field import blend_fields
+from leapnav.experts.numerics.step_halving import step_halving
+from leapnav.experts.problem.extremal import Extremal, SolveError
+from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
+from leapnav.experts.solve import Method, solve
+
+
+def continuation(
+    problems: Iterable[OptimalControlProblem | Scenario],
+    method: Method = "multiple_shooting",
+    guess: Extremal | None = None,
+    tol: float = 1e-9,
+    *,
+    smallest_step: float = 1 / 64,
+    raise_on_failure: bool = False,
+) -> list[Extremal]:
+    """Solve a sequence of problems, each with the extremal of the preceding one as the initial guess.
+
+    If a step fails, intermediate problems are inserted: start, goal, horizon, weights, bounds, parameters and obstacles
+    are interpolated linearly between two successive problems. The step is halved after a failure and doubled after a
+    success.
+
+    Args:
+        problems: problems or scenarios with the same system, state cost, free goal components and kinds of obstacles.
+        method: see `solve`.
+        guess: extremal of a problem similar to the first; None solves the first problem without a guess.
+        tol: see `solve`.
+        smallest_step: minimum step as a fraction of the change between two successive problems, in (0, 1]; the
+            continuation fails if a smaller one is needed.
+        raise_on_failure: raise an exception instead of returning a list that ends with a failure.
+
+    Returns:
+        An extremal for each problem, in their order; the list ends with the first failure.
+
+    Raises:
+        ValueError: two successive problems cannot be blended, or an argument is invalid.
+        SolveError: failure with `raise_on_failure`; the attribute `extremal` is the failed result.
+
+    """
+    if not 0.0 < smallest_step <= 1.0:
+        raise ValueError(f"smallest_step: expected a number in (0, 1], got {smallest_step!r}")
+    found: list[Extremal] = []
+    for index, problem in enumerate(problems):
+        if found:
+            extremal = _continue(found[-1], as_problem(problem), method, tol, smallest_step)
+        else:
+            extremal = solve(problem, method=method, guess=guess, tol=tol)
+        found.append(extremal)
+        if not extremal.success:
+            if raise_on_failure:
+                raise SolveError(extremal, f"problem {index}")
+            break
+    return found
+
+
+def _continue(
+    start: Extremal, target: OptimalControlProblem, method: Method, tol: float, smallest_step: float
+) -> Extremal:
+    """The extremal of the target, by continuation from the extremal `start`."""
+    origin = start.problem
+    target = _unwind(target, start)
+    blend(origin, target, 0.5)  # raises an error before any computation if the problems cannot be blended
+    failed: Extremal | None = None
+
+    def advance(fraction: float, guess: Extremal) -> Extremal | None:
+        nonlocal failed
+        problem = target if fraction == 1.0 else blend(origin, target, fraction)
+        extremal = solve(problem, method=method, guess=guess, tol=tol)
+        if extremal.success:
+            return extremal
+        if fraction == 1.0:
+            failed = failed or extremal
+        return None
+
+    found = step_halving(advance, start, min_step=smallest_step)
+    if found is not None:
+        return found
+    # The failure of the target, not of an intermediate problem.
+    assert failed is not None
+    return failed
+
+
+def _unwind(target: OptimalControlProblem, start: Extremal) -> OptimalControlProblem:
+    """The target with the angles of its start and goal at the windings closest to those of an extremal."""
+    target_start = list(target.start)
+    for symbol in target.system.angles:
+        i = target.system.state.index(symbol)
+        target_start[i] -= 2 * math.pi * round((target_start[i] - float(start.states[0, i])) / (2 * math.pi))
+    return replace(target, start=tuple(target_start)).with_winding_of(start.states)
+
+
+def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction: float) -> OptimalControlProblem:
+    """Interpolate linearly between two problems.
+
+    Args:
+        first: the problem at the fraction 0.
+        second: the problem at the fraction 1.
+        fraction: in [0, 1].
+
+    Raises:
+        ValueError: the problems differ in more than numerical values.
+
+    """
+    if first.system != second.system or first.state_cost != second.state_cost:
+        raise ValueError("problems: two successive problems differ in their system or state cost")
+    if [g is None for g in first.goal] != [g is None for g in second.goal]:
+        raise ValueError(
+            f"problems: two successive problems differ in the free goal components: {first.goal!r}, {second.goal!r}"
+        )
+    if (first.control_bounds is None) != (second.control_bounds is None) or (first.field is None) != (
+        second.field is None
+    ):
+        raise ValueError("problems: only one of two successive problems has control bounds or obstacles")
+
+    def between(a: float, b: float) -> float:
+        return a if a == b else (1.0 - fraction) * a + fraction * b  # equal bounds may be infinite
+
+    bounds = None
+    if first.control_bounds is not None and second.control_bounds is not None:
+        pairs = zip(first.control_bounds, second.control_bounds, strict=True)
+        bounds = tuple((between(a[0], b[0]), between(a[1], b[1])) for a, b in pairs)
+    goal = tuple(
+        None if a is None or b is None else between(a, b) for a, b in zip(first.goal, second.goal, strict=True)
+    )
+    field: np.ndarray | None = None
+    if first.field is not None and second.field is not None:
+        field = blend_fields(first.field, second.field, fraction)
+    return replace(
+        first,
+        start=tuple(map(between, first.start, second.start)),
+        goal=goal,
+        horizon=between(first.horizon, second.horizon),
+        control_weight=tuple(map(between, first.control_weight, second.control_weight)),
+        control_bounds=bounds,
+        field=field,
+        parameters=tuple(map(between, first.parameters, second.parameters)),
+    )

@@ -1,0 +1,1 @@
+"""Scenario banks, demonstrations and rollouts made by the expert."""

@@ -1,0 +1,184 @@
+"""Building of scenario banks: random scenarios with certified optima, in parallel and resumable."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from enum import Enum
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from joblib import Parallel
+from tqdm.auto import tqdm
+
+import leapnav
+from leapnav.envs.scenarios.bank import VERSION, BankEntry, BankError, ScenarioBank, point_times, write_bank
+from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
+from leapnav.envs.utils.validation import check_at_least, check_choice
+from leapnav.experts.data.store import Arrays, ResumableStore, discard
+from leapnav.experts.optimum import Optimum, find_optimum
+from leapnav.experts.problem.extremal import Status
+
+# Batches of one task: an interruption loses only the scenarios that are being solved. Joblib declares a string.
+ONE = cast(str, 1)
+
+
+class Rejection(Enum):
+    """Why a scenario is not admitted to a bank. The values are part of the bank files."""
+
+    NO_OPTIMUM = "no certified optimum"
+    COLLISION = "a cheaper extremal touches"
+    UNRESOLVED = "a cheaper solution was not certified"
+
+
+def judge(optimum: Optimum) -> Rejection | None:
+    """The reason why an optimum is no safe reference, None if it is safe.
+
+    A safe reference is certified, hence without collision and without a conjugate point, and the search found no
+    cheaper solution that lacks a certificate. If a cheaper extremal cuts slightly into an obstacle, the true optimum
+    may be a path in contact with that obstacle.
+    """
+    if not optimum.success:
+        return Rejection.NO_OPTIMUM
+    if any(doubt.status is Status.COLLISION for doubt in optimum.doubts):
+        return Rejection.COLLISION
+    return Rejection.UNRESOLVED if optimum.doubts else None
+
+
+def build_bank(
+    family: str,
+    count: int,
+    out: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    progress: bool = True,
+) -> ScenarioBank:
+    """Draw random scenarios, find their optima, and write the admitted ones to a bank.
+
+    The result of each finished scenario is stored in the directory `<out>.build`. A build resumes after any
+    interruption, including SIGKILL, when it is called again with the same arguments. The bank does not depend on
+    interruptions or on the number of workers, to the last bit.
+
+    Args:
+        family: family of the scenarios.
+        count: number of scenarios in the bank.
+        out: file of the bank. A complete bank is returned unchanged.
+        seed: seed of the bank; draw k uses a generator with the seed (seed, k).
+        workers: number of processes.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: an argument is invalid.
+        BankError: `out` is another bank, or its build directory belongs to another build, is damaged or is in use.
+        OSError: `out` cannot be written.
+
+    """
+    check_choice("family", family, FAMILIES)
+    check_at_least("count", count, 1)
+    check_at_least("workers", workers, 1)
+    check_at_least("seed", seed, 0)
+    target = Path(out)
+    if target.is_dir():
+        raise IsADirectoryError(f"{target}: is a directory")
+    if target.exists():
+        return _complete(target, family, count, seed)
+    if not target.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{target.parent}: no such directory")
+    settings = {"version": VERSION, "software": leapnav.__version__, "family": family, "seed": seed}
+    pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="4 * n_jobs")
+    with ResumableStore(_build_directory(target), "bank", settings, BankError) as store:
+        reasons = _solve(store, pool, family, count, seed, progress)
+        entries = [_entry(number, store.read(number)) for number, reason in reasons.items() if not reason]
+        write_bank(
+            target,
+            entries,
+            family=family,
+            seed=seed,
+            drawn=len(reasons),
+            rejected=Counter(reason for reason in reasons.values() if reason),
+            software=leapnav.__version__,
+        )
+    discard(store.directory)
+    return ScenarioBank(target)
+
+
+def draw(number: int, family: str, seed: int) -> Arrays:
+    """One random scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
+
+    Args:
+        number: index of the draw.
+        family: family of the scenario.
+        seed: seed of the bank.
+
+    """
+    scenario = sample_scenario(family, np.random.default_rng([seed, number]))
+    scenario = scenario.model_copy(update={"name": f"{family}-{seed}-{number}"})
+    optimum = find_optimum(scenario)
+    rejection = judge(optimum)
+    if rejection is not None:
+        return {"rejected": np.array(rejection.value)}
+    certificate = optimum.certificate
+    assert certificate is not None
+    states, controls, costates = (values.astype("<f4") for values in optimum.evaluate(point_times(scenario.horizon)))
+    return {
+        "rejected": np.array(""),
+        "scenario": np.frombuffer(scenario.to_json().encode(), dtype="u1"),
+        "cost": np.array(optimum.cost),
+        "second_cost": np.array(optimum.alternatives[0].cost if optimum.alternatives else math.nan),
+        "certificate": np.array(
+            [certificate.residual, certificate.defect, certificate.hamiltonian_drift, certificate.clearance]
+        ),
+        "states": states,
+        "controls": controls,
+        "costates": costates,
+    }
+
+
+def _solve(store: ResumableStore, pool: Parallel, family: str, count: int, seed: int, progress: bool) -> dict[int, str]:
+    """Complete the draws until `count` scenarios are admitted; return each draw's reason of rejection, in order."""
+    reasons: dict[int, str] = {}
+    n_admitted = 0
+    with tqdm(total=count, desc=f"Building {family}", unit="scenario", disable=not progress) as bar:
+        while n_admitted < count:
+            # As many draws as scenarios are missing, so that the bank holds the first `count` admitted scenarios.
+            numbers = range(len(reasons), len(reasons) + count - n_admitted)
+            for number, arrays in store.complete(numbers, partial(draw, family=family, seed=seed), pool, bar):
+                reasons[number] = str(arrays["rejected"])
+                bar.update(not reasons[number])
+            n_admitted = sum(not reason for reason in reasons.values())
+    return dict(sorted(reasons.items()))
+
+
+def _entry(number: int, arrays: Arrays) -> BankEntry:
+    residual, defect, drift, clearance = arrays["certificate"].tolist()
+    second_cost = float(arrays["second_cost"])
+    return BankEntry(
+        scenario=arrays["scenario"].tobytes().decode(),
+        draw=number,
+        cost=float(arrays["cost"]),
+        second_cost=None if math.isnan(second_cost) else second_cost,
+        certificate=(residual, defect, drift, clearance),
+        states=arrays["states"],
+        controls=arrays["controls"],
+        costates=arrays["costates"],
+    )
+
+
+def _complete(target: Path, family: str, count: int, seed: int) -> ScenarioBank:
+    """The bank at `target`, if it is the requested one."""
+    bank = ScenarioBank(target)
+    expected: dict[str, Any] = {"family": family, "seed": seed, "count": count, "software": leapnav.__version__}
+    found = {"family": bank.family, "seed": bank.seed, "count": len(bank), "software": bank.software}
+    for name, value in expected.items():
+        if found[name] != value:
+            raise BankError(f"{target}: exists, with {name} {found[name]!r} instead of {value!r}; choose another name")
+    discard(_build_directory(target))  # left by a build that was interrupted after it had written the bank
+    return bank
+
+
+def _build_directory(target: Path) -> Path:
+    return target.with_name(f"{target.name}.build")

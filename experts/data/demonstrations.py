@@ -1,0 +1,363 @@
+"""Demonstrations: optima executed in the environment, and the Minari datasets that store them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import minari
+import numpy as np
+from minari.data_collector import EpisodeBuffer
+
+import leapnav
+from leapnav.envs.episodes import play_episode
+from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenarios.families import MAX_HORIZON
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.experts.acting.feedback import Feedback
+from leapnav.experts.acting.policy import plan_actions
+from leapnav.experts.problem.extremal import Extremal
+from leapnav.experts.problem.problem import Trajectory
+from leapnav.experts.solve import solve
+
+ENVIRONMENT = "leapnav/Navigate-v0"
+CONTROL_PERIOD = 0.05  # s, the default of the environment; demonstrations use it
+# A recovery starts from a perturbed state of the optimum.
+PERTURBATION = np.array([0.15, 0.15, 0.3])  # standard deviations (m, m, rad)
+PERTURBATION_DECAY = 0.5  # s; time constant with which the initial guess returns to the optimum
+MIN_RECOVERY_TIME = 1.0  # s between the perturbation and the horizon; with less time the robot could not recover
+MIN_RECOVERY_CLEARANCE = 0.02  # m
+# A recovery that costs more than this factor times the remaining cost of the optimum, plus this summand, follows
+# another local optimum and is dropped.
+MAX_RECOVERY_COST = (2.0, 1.0)
+# Step limit of a dataset's environment. No episode reaches it, but d3rlpy requires a limit.
+MAX_STEPS = math.ceil(MAX_HORIZON / CONTROL_PERIOD) + 1
+N_SCORED = 100  # scenarios from which the score of random actions is computed
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One episode of the expert in the environment, K steps.
+
+    Attributes:
+        scenario: the scenario of the episode.
+        observations: (K + 1, d).
+        actions: (K, 2), of the expert.
+        executed: (K, 2), the executed actions; with noise they differ from the expert's.
+        rewards: (K,).
+        states: (K + 1, 3), x, y (m), heading (rad), as simulated.
+        costates: (K + 1, 3), of the optimum.
+        cost_to_go: (K + 1,), of the optimum; the first entry is the reference cost J*.
+        running_cost: (K,), cost of each environment step.
+        is_success: whether the episode ended in success.
+        seed: seed of the scenario, None if it has none.
+
+    """
+
+    scenario: Scenario
+    observations: np.ndarray
+    actions: np.ndarray
+    executed: np.ndarray
+    rewards: np.ndarray
+    states: np.ndarray
+    costates: np.ndarray
+    cost_to_go: np.ndarray
+    running_cost: np.ndarray
+    is_success: bool
+    seed: int | None = None
+
+    @property
+    def path(self) -> Trajectory:
+        """States and costates at the ends of the control periods."""
+        times = np.minimum(CONTROL_PERIOD * np.arange(len(self.states)), self.scenario.horizon)
+        return Trajectory(times, self.states, self.costates)
+
+    @property
+    def reference_cost(self) -> float:
+        """Cost J* of the scenario's optimum."""
+        return float(self.cost_to_go[0])
+
+
+def demonstrate(env: gym.Env, scenario: Scenario, extremal: Extremal) -> Demonstration:
+    """Execute an optimum in the environment, without feedback."""
+    inner = env.unwrapped
+    assert isinstance(inner, NavigateEnv)
+    actions = plan_actions(extremal, scenario, inner.control_period)
+    driven = _drive(env, scenario, lambda step: (actions[step], actions[step]))
+    times = np.minimum(inner.control_period * np.arange(len(driven["states"])), scenario.horizon)
+    costates, cost_to_go = extremal.evaluate(times)[2], np.asarray(extremal.cost_to_go(times))
+    return Demonstration(scenario=scenario, costates=costates, cost_to_go=cost_to_go, **driven)
+
+
+def demonstrate_disturbed(
+    env: gym.Env, scenario: Scenario, extremal: Extremal, noise: float, rng: np.random.Generator
+) -> Demonstration:
+    """Execute an optimum with feedback and with noise on the actions, and record the expert's own actions.
+
+    Where the goal cannot be reached from the disturbed state, costate and cost-to-go are NaN, and the expert continues
+    with the previous solution.
+
+    Args:
+        env: an environment of `leapnav/Navigate-v0`.
+        scenario: the scenario of the episode.
+        extremal: its optimum.
+        noise: standard deviation of the noise that is added to the actions, which are in [-1, 1].
+        rng: generator of the noise.
+
+    """
+    inner = env.unwrapped
+    assert isinstance(inner, NavigateEnv)
+    feedback = Feedback(scenario, Trajectory(extremal.times, extremal.states, extremal.costates))
+    limits = scenario.robot.max_speed, scenario.robot.max_turn_rate
+    costates, costs = [], []
+
+    def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
+        state, now = np.array(inner.pose), inner.time
+        if feedback.update(state, now):
+            cost, costate = feedback.value(state, now)
+        else:
+            cost, costate = np.nan, np.full(3, np.nan)
+        costs.append(cost)
+        costates.append(costate)
+        ahead = min(inner.control_period, scenario.horizon - inner.time) / 2
+        action = np.clip(feedback.control(inner.time + ahead) / limits, -1.0, 1.0).astype(np.float32)
+        executed = np.clip(action + noise * rng.standard_normal(2), -1.0, 1.0).astype(np.float32)
+        return action, executed
+
+    driven = _drive(env, scenario, decide)
+    costs.append(0.0)
+    costates.append(feedback.final_costate)
+    return Demonstration(scenario=scenario, costates=np.array(costates), cost_to_go=np.array(costs), **driven)
+
+
+def _drive(env: gym.Env, scenario: Scenario, decide: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
+    """Play one episode; `decide(step)` returns the action to record and the action to execute."""
+    actions: list[np.ndarray] = []
+
+    def act(observation: Any, info: dict[str, Any]) -> np.ndarray:
+        action, executed = decide(len(actions))
+        actions.append(action)
+        return executed
+
+    observation, info, steps = play_episode(env, act, options={"scenario": scenario})
+    transitions = list(steps)
+    return {
+        "observations": np.stack([observation, *(step.observation for step in transitions)]),
+        "actions": np.stack(actions),
+        "executed": np.stack([step.action for step in transitions]),
+        "rewards": np.array([step.reward for step in transitions]),
+        "states": np.array([info["pose"], *(step.info["pose"] for step in transitions)]),
+        "running_cost": np.diff([0.0, *(step.info["cost"] for step in transitions)]),
+        "is_success": bool(transitions[-1].info["is_success"]),
+    }
+
+
+def recovery(
+    scenario: Scenario, extremal: Extremal, rng: np.random.Generator, name: str
+) -> tuple[Scenario, Extremal] | None:
+    """Solve the rest of a scenario from a perturbed state of its optimum.
+
+    Args:
+        scenario: the scenario.
+        extremal: its optimum.
+        rng: generator of the time and the size of the perturbation.
+        name: name of the new scenario.
+
+    Returns:
+        The new scenario and its extremal; None if there is no suitable one.
+
+    """
+    time = rng.uniform(0.0, max(scenario.horizon - MIN_RECOVERY_TIME, 0.0))
+    perturbation = rng.normal(size=3) * PERTURBATION
+    state = extremal.evaluate(time)[0] + perturbation
+    if clearance(state[0], state[1], scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
+        return None
+    rest = Scenario(
+        name=name,
+        arena=scenario.arena,
+        robot=scenario.robot,
+        start=tuple(state.tolist()),
+        goal=scenario.goal,
+        horizon=float(scenario.horizon - time),
+        obstacles=scenario.obstacles,
+        cost=scenario.cost,
+    )
+    times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])
+    states, _, costates = extremal.evaluate(times + time)
+    times[-1] = rest.horizon
+    states += perturbation * np.exp(-times / PERTURBATION_DECAY)[:, None]
+    solution = solve(rest, "multiple_shooting", guess=Trajectory(times, states, costates))
+    factor, summand = MAX_RECOVERY_COST
+    if not solution.success or solution.cost > factor * float(extremal.cost_to_go(time)) + summand:
+        return None
+    return rest, solution
+
+
+def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: str) -> None:
+    """Write a Minari dataset with state, costate and cost-to-go of every step.
+
+    The scenario of an episode is its `options["scenario"]`, so `env.reset(options=...)` with the options that Minari
+    stores starts the same episode again.
+
+    Args:
+        demonstrations: consumed one by one; they need not fit into memory together.
+        root: root directory of Minari datasets.
+        family: family of the scenarios.
+
+    """
+    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=MAX_STEPS)
+    scenarios: list[Scenario] = []
+    returns: list[float] = []
+
+    def episodes() -> Iterator[EpisodeBuffer]:
+        for number, demonstration in enumerate(demonstrations):
+            returns.append(-demonstration.reference_cost)
+            if number < N_SCORED:
+                scenarios.append(demonstration.scenario)
+            yield _episode(number, demonstration)
+
+    with _minari_root(str(root)):
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id(family),
+            cast(list[EpisodeBuffer], episodes()),  # Minari declares a list, but any iterable works
+            env=env,
+            eval_env=env,
+            algorithm_name="leapnav.experts.find_optimum",
+            author="leapnav",
+            author_email="",
+            code_permalink="",
+            description="Certified optima driven in the environment. Infos: state (x, y, heading), control (speed, "
+            "turn rate), executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's scenario is "
+            "options['scenario'] as JSON. Reference scores: random actions and the optimum.",
+            requirements=[f"leapnav=={leapnav.__version__}"],
+        )
+        scores = {"ref_min_score": _random_score(env, scenarios), "ref_max_score": float(np.mean(returns))}
+        dataset.storage.update_metadata(scores)
+
+
+def _random_score(env: gym.Env, scenarios: Sequence[Scenario]) -> float:
+    """Mean return of uniformly random actions."""
+    rng = np.random.default_rng(0)
+    total = 0.0
+    for scenario in scenarios:
+        _, _, steps = play_episode(
+            env, lambda *_: rng.uniform(-1.0, 1.0, 2).astype(np.float32), options={"scenario": scenario}
+        )
+        for step in steps:
+            total += step.reward
+    return total / len(scenarios)
+
+
+def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
+    steps = len(demonstration.actions)
+    terminations = np.zeros(steps, dtype=bool)
+    terminations[-1] = True
+    robot = demonstration.scenario.robot
+    controls = demonstration.actions * np.array([robot.max_speed, robot.max_turn_rate])
+    return EpisodeBuffer(
+        id=number,
+        seed=demonstration.seed,
+        options={"scenario": demonstration.scenario.to_json()},
+        # Minari declares lists, but arrays work as well.
+        observations=cast(list[Any], demonstration.observations),
+        actions=cast(list[Any], demonstration.actions),
+        rewards=demonstration.rewards.tolist(),
+        terminations=terminations.tolist(),
+        truncations=[False] * steps,
+        # Infos have one entry more than the actions: the last control is repeated, the first running cost is zero.
+        infos={
+            "state": demonstration.states,
+            "control": np.concatenate([controls, controls[-1:]]),
+            "executed_action": np.concatenate([demonstration.executed, demonstration.executed[-1:]]),
+            "costate": demonstration.costates,
+            "cost_to_go": demonstration.cost_to_go,
+            "running_cost": np.concatenate([[0.0], demonstration.running_cost]),
+            "reference_cost": np.full(steps + 1, demonstration.reference_cost),
+        },
+    )
+
+
+def dataset_id(family: str) -> str:
+    """The Minari dataset id of a family's demonstrations."""
+    return f"leapnav/{family}/expert-v0"
+
+
+@contextmanager
+def _minari_root(directory: str) -> Iterator[None]:
+    """Set Minari's root directory, for which only an environment variable exists."""
+    name = "MINARI_DATASETS_PATH"
+    before = os.environ.get(name)
+    os.environ[name] = directory
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+def open_dataset(folder: str | os.PathLike[str]) -> minari.MinariDataset:
+    """Open the only Minari dataset below a directory.
+
+    Raises:
+        FileNotFoundError: there is no dataset, or more than one.
+
+    """
+    found = sorted(path.parent for path in Path(folder).glob("**/data/metadata.json"))
+    if len(found) != 1:
+        raise FileNotFoundError(f"{os.fspath(folder)}: expected one Minari dataset, found {len(found)}")
+    return minari.MinariDataset(found[0])
+
+
+def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:
+    """Load all demonstrations of a dataset written by `rollout` into memory.
+
+    Raises:
+        FileNotFoundError, ValueError: see `iterate_demonstrations`.
+
+    """
+    return list(iterate_demonstrations(folder))
+
+
+def iterate_demonstrations(folder: str | os.PathLike[str]) -> Iterator[Demonstration]:
+    """Yield the demonstrations of a dataset written by `rollout`.
+
+    Raises:
+        FileNotFoundError: see `open_dataset`.
+        ValueError: the dataset was not written by `rollout`; the message names a missing entry.
+
+    """
+    dataset = open_dataset(folder)
+    for episode, metadata in zip(
+        dataset.iterate_episodes(), dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True
+    ):
+        infos = episode.infos or {}
+        missing = sorted({"state", "executed_action", "costate", "cost_to_go", "running_cost"} - set(infos))
+        text = (metadata.get("options") or {}).get("scenario")
+        if missing or text is None:
+            raise ValueError(
+                f"{os.fspath(folder)}: episode {episode.id} has no {missing[0] if missing else 'scenario'}"
+            )
+        yield (
+            Demonstration(
+                scenario=Scenario.from_json(str(text)),
+                observations=episode.observations,
+                actions=episode.actions,
+                executed=infos["executed_action"][:-1],
+                rewards=np.asarray(episode.rewards),
+                states=infos["state"],
+                costates=infos["costate"],
+                cost_to_go=infos["cost_to_go"],
+                running_cost=infos["running_cost"][1:],
+                is_success=True,  # `rollout` writes successful episodes only
+                seed=metadata.get("seed"),
+            )
+        )

@@ -1,0 +1,1 @@
+"""Numerical methods: integration with sensitivities, small linear systems, and continuation."""

@@ -1,0 +1,72 @@
+"""Types of the extremal flow, and the records that the kernels take with it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import float64, types
+
+from leapnav.envs.kernels import record_type
+from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.types import CONSTANT, FLAGS, MATRIX, NOTHING, VECTOR
+
+# flow(z, data, field, S, dz, dS) -> running cost: fills dz = z' and dS = S' for z = (q, lam) and S (2n, columns).
+# With an explicit function type the kernels are compiled once for all systems.
+FLOW_SIGNATURE = float64(VECTOR, CONSTANT, CONSTANT, MATRIX, VECTOR, MATRIX)
+# control(z, data, u): fills the control u (m,) of the minimum principle.
+CONTROL_SIGNATURE = NOTHING(VECTOR, CONSTANT, VECTOR)
+FLOW_FUNCTION = types.FunctionType(FLOW_SIGNATURE)
+CONTROL_FUNCTION = types.FunctionType(CONTROL_SIGNATURE)
+
+
+class ExtremalFlow(NamedTuple):
+    """The extremal flow of a problem with its constants.
+
+    Attributes:
+        function: the compiled flow, of type FLOW_SIGNATURE.
+        data: control weights (m,), lower and upper control bounds (2m,), parameters of the system.
+        field: packed obstacle field; empty without obstacles.
+
+    """
+
+    function: FunctionPointer
+    data: np.ndarray
+    field: np.ndarray
+
+
+class EndCondition(NamedTuple):
+    """The conditions at the final time: q_i = goal_i, or lambda_i = 0 where the component is free.
+
+    Attributes:
+        goal: (n,), ignored where a component is free.
+        free: (n,), bool.
+
+    """
+
+    goal: np.ndarray
+    free: np.ndarray
+
+
+class NewtonOptions(NamedTuple):
+    """Options of the Newton kernels.
+
+    Attributes:
+        tolerance: largest residual.
+        accuracy: tolerance of the integrator close to the solution.
+        max_iterations: largest number of Newton steps.
+        predict: whether the residual of the last iterate may be predicted from quadratic convergence.
+
+    """
+
+    tolerance: float
+    accuracy: float
+    max_iterations: int
+    predict: bool = True
+
+
+FLOW = record_type(ExtremalFlow, function=FLOW_FUNCTION, data=CONSTANT, field=CONSTANT)
+END_CONDITION = record_type(EndCondition, goal=VECTOR, free=FLAGS)
+NEWTON_OPTIONS = record_type(
+    NewtonOptions, tolerance=float64, accuracy=float64, max_iterations=types.int64, predict=types.boolean
+)

@@ -1,0 +1,169 @@
+"""Conjugate and focal points along an extremal (Jacobi's condition).
+
+A conjugate point is a zero of det dq(t)/dlambda(0). A determinant that only changes its sign is found during the
+re-integration; a zero of even order, which is typical of symmetric problems, is a local minimum of |det| at which the
+matrix loses rank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+
+from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.problem.extremal import Extremal
+from leapnav.experts.problem.frames import SENSITIVITY_ACCURACY, carry_back, orthonormalise, pull_back
+
+# A local minimum of |det| may be a zero of even order if it is below this fraction of the largest value before it ...
+MAX_DIP = 0.3
+# ... and if the parabola through it and its neighbours has its minimum below this fraction of it.
+MAX_PARABOLA_MINIMUM = 0.7
+ZERO_SINGULAR_VALUE = 1e-5  # of an orthonormal frame; smaller values count as zero
+
+
+def conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float | None:
+    """Return the time (s) in step k at which det dq(t)/dlambda(0) changes its sign, or None.
+
+    Args:
+        extremal: the extremal.
+        k: index of the integration step.
+        sensitivity: (2n, n), an orthonormal basis of the span of dz/dlambda(0) at the start of the step.
+
+    Returns:
+        The time; None if it is the horizon itself, which does not contradict a minimum.
+
+    """
+    arrays = extremal.problem.arrays
+
+    def determinant(duration: float) -> float:
+        z = np.concatenate([extremal.states[k], extremal.costates[k]])
+        S = sensitivity.copy()
+        if duration > 0.0:
+            propagate(arrays.flow, z, S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+        return orthonormalise(S)
+
+    step = float(extremal.times[k + 1] - extremal.times[k])
+    time = float(extremal.times[k]) + _zero(determinant, step)
+    return time if time < extremal.problem.horizon * (1 - 1e-9) else None
+
+
+def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> float | None:
+    """Return the first time (s) at which det dq(t)/dlambda(0) vanishes without a change of sign, or None.
+
+    Args:
+        extremal: the extremal.
+        determinants: (N,), the determinant at the integrator's steps.
+
+    """
+    if not _dips(extremal.times, determinants, check_parabola=True):
+        return None
+    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    z = np.concatenate([extremal.states, extremal.costates], axis=1)
+    S = np.concatenate([np.zeros((n, n)), np.eye(n)])
+    frames = [S.copy()]
+
+    def advance(k: int, S: np.ndarray, time: float) -> np.ndarray:
+        S, duration = S.copy(), time - float(extremal.times[k])
+        if duration > 0.0:
+            propagate(arrays.flow, z[k].copy(), S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+            orthonormalise(S)
+        return S
+
+    for k in range(len(z) - 1):
+        frames.append(advance(k, frames[k], float(extremal.times[k + 1])))
+
+    def frame(time: float) -> np.ndarray:
+        k = min(int(np.searchsorted(extremal.times, time, side="right")) - 1, len(frames) - 1)
+        return advance(k, frames[k], time)
+
+    return _first_rank_loss(extremal.times, determinants, frame, check_parabola=True)
+
+
+def _dips(times: np.ndarray, determinants: np.ndarray, check_parabola: bool) -> list[int]:
+    """Return the indices at which |determinant| has a low local minimum.
+
+    With `check_parabola` the parabola through each minimum and its neighbours must come close to zero as well.
+    """
+    size = np.abs(determinants)
+    before = np.maximum.accumulate(size)[1:-1]
+    is_minimum = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < MAX_DIP * before)
+    found = []
+    for i in np.flatnonzero(is_minimum) + 1:
+        a, b, c = np.polyfit(times[i - 1 : i + 2] - times[i], size[i - 1 : i + 2], 2)
+        if not check_parabola or a <= 0.0 or c - b * b / (4.0 * a) < MAX_PARABOLA_MINIMUM * size[i]:
+            found.append(int(i))
+    return found
+
+
+def _first_rank_loss(
+    times: np.ndarray, determinants: np.ndarray, frame: Callable[[float], np.ndarray], check_parabola: bool
+) -> float | None:
+    """Return the first time, in the order of `times`, at which the upper block of the frame loses rank, or None."""
+    for i in _dips(times, determinants, check_parabola):
+        low, high = sorted((float(times[i - 1]), float(times[i + 1])))
+        found = minimize_scalar(
+            lambda t: _smallest_singular_value(frame(t)),
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": 1e-9 * (high - low)},
+        )
+        if found.fun < ZERO_SINGULAR_VALUE:
+            return float(found.x)
+    return None
+
+
+def _smallest_singular_value(frame: np.ndarray) -> float:
+    """Return the smallest singular value of the upper block of a frame (2n, n)."""
+    return float(np.linalg.svd(frame[: frame.shape[1]], compute_uv=False)[-1])
+
+
+def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
+    """Return the last focal point (s) of an extremal with free final components, or None.
+
+    The variations (dq, dlambda) of the extremals that meet the end conditions form a Lagrangian subspace: at the
+    horizon dq_i = 0 where q_i is fixed, and dlambda_i = 0 where it is free. This subspace is carried backwards in time.
+    At a focal point its projection on dq loses rank. An extremal with a focal point before its horizon is not a local
+    minimum.
+
+    Args:
+        extremal: the extremal.
+        free: (n,), bool, which final components are free.
+
+    """
+    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    times, count = extremal.times[::-1], len(extremal.times)
+    frames, determinants = np.empty((count, 2 * n, n)), np.zeros(count)
+    frames[0] = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
+    z = np.concatenate([extremal.states, extremal.costates], axis=1)
+    step = carry_back(arrays.flow, extremal.times, z, frames, determinants)
+
+    def back(k: int, time: float) -> tuple[np.ndarray, float]:
+        """Return the orthonormal frame at a time within the step before times[k], and its determinant."""
+        duration, basis = float(times[k]) - time, frames[k].copy()
+        if duration > 0.0:
+            z, S = extremal.interpolate(np.array([time]))[0], np.eye(2 * n)
+            propagate(arrays.flow, z, S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+            pull_back(S, basis)
+        return basis, orthonormalise(basis)
+
+    crossing = None
+    if step >= 0:
+        determinants = determinants[: step + 2]
+        start = float(times[step])
+        crossing = start - _zero(lambda d: back(step, start - d)[1], start - float(times[step + 1]))
+
+    def frame(time: float) -> np.ndarray:
+        return back(max(int(np.searchsorted(-times, -time, side="left")) - 1, 0), time)[0]
+
+    even = _first_rank_loss(times, determinants, frame, check_parabola=False)
+    return max((t for t in (even, crossing) if t is not None), default=None)
+
+
+def _zero(function: Callable[[float], float], step: float) -> float:
+    """Return the sign change of `function` on [0, step]; 0 if rounding hides the sign at the start."""
+    if function(0.0) * function(step) >= 0.0:
+        return 0.0
+    return cast(float, brentq(function, 0.0, step, xtol=1e-12))

@@ -1,0 +1,274 @@
+"""Extremals, that is solutions of the minimum principle's boundary value problem, and their certificates."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import warnings
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, ClassVar
+
+import numpy as np
+
+from leapnav.envs.utils.json_utils import encode, plain
+from leapnav.experts.problem.problem import OptimalControlProblem
+
+
+class Status(Enum):
+    """The outcome of a solve. The value is a text that suggests what to try next."""
+
+    SUCCESS = "certified: a local minimum, to the tolerance"
+    NO_PATH = "no path from start to goal was found. Check that the passages between the obstacles are wide enough."
+    HORIZON_TOO_SHORT = "the goal is out of reach at the robot's limits. Try a longer horizon or higher limits."
+    STALLED = "Newton's method stopped making progress. Try method='leapfrog', a better guess, or find_optimum."
+    DIVERGED = "the extremal flow diverged from the guess. Try a guess closer to the solution, or method='leapfrog'."
+    SINGULAR = "the Newton matrix is singular: the solution is not isolated. Move the start or the goal slightly."
+    MAX_ITERATIONS = "the iteration limit was reached. Try increasing max_iterations, or method='leapfrog'."
+    NOT_CERTIFIED = "the solver converged but re-integration did not confirm it. Try a smaller tol."
+    COLLISION = "the extremal passes through an obstacle. Try find_optimum, or another guess."
+    CONJUGATE_POINT = "the extremal is no local minimum (conjugate point before the horizon). Try another guess."
+    SUBPROBLEM = "a Leapfrog sub-problem did not converge, so the sweeps stopped. Try more segments or polish=True."
+
+
+class SolveError(RuntimeError):
+    """Raised when a solve ends without success.
+
+    The message is the status, with what to try next.
+
+    Attributes:
+        extremal: the failed result.
+        name: name of the scenario, if there is one.
+
+    """
+
+    def __init__(self, extremal: Extremal, name: str = "") -> None:
+        super().__init__(f"{name}{': ' if name else ''}{extremal.status.name}: {extremal.status.value}")
+        self.extremal, self.name = extremal, name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SolveError, (self.extremal, self.name)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Evidence that a path is a local minimum, from re-integration that is independent of the solver.
+
+    Attributes:
+        residual: largest violation of the boundary conditions, transversality conditions included.
+        defect: largest difference between a node and the extremal flow from the node before it, integrated at 1e-12.
+        hamiltonian_drift: largest minus smallest Hamiltonian. The Hamiltonian is constant along an extremal.
+        conjugate_point: time (s) of a conjugate point before the horizon, at which dq(t)/dlambda(0) loses rank; with
+            free final components, of a focal point. None if there is none: the extremal is a local minimum.
+        clearance: smallest clearance (m) to an obstacle or a wall along the interpolated path; None without obstacles.
+        TOLERANCE: largest residual and defect of a certified extremal.
+
+    """
+
+    residual: float
+    defect: float
+    hamiltonian_drift: float
+    conjugate_point: float | None
+    clearance: float | None
+
+    # Rounding errors leave about this much of a Newton solution at tolerance 1e-9 over a long horizon.
+    TOLERANCE: ClassVar[float] = 1e-8
+
+    def status(self) -> Status:
+        """Return the status that the certificate proves."""
+        if not (self.residual <= self.TOLERANCE and self.defect <= self.TOLERANCE):
+            return Status.NOT_CERTIFIED
+        if self.clearance is not None and not self.clearance > 0:
+            return Status.COLLISION
+        return Status.SUCCESS if self.conjugate_point is None else Status.CONJUGATE_POINT
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration:
+    """One iteration of a solver.
+
+    Attributes:
+        phase: "sweep" (Leapfrog), "reduce" (a Leapfrog sweep that removes nodes), "newton" or "collocation".
+        segments: number of segments of the horizon.
+        cost: J of the iterate.
+        residual: largest violation of the boundary and continuity conditions. For a Leapfrog sweep only the states
+            count, because the costates are discontinuous at the nodes until it converges.
+        rejected: indices of the nodes whose move Leapfrog rejected.
+        times: (segments + 1,), times (s) of the nodes of a Leapfrog sweep; None for other phases.
+        nodes: (segments + 1, 2n), its nodes, connected by extremal arcs; None for other phases.
+
+    """
+
+    phase: str
+    segments: int
+    cost: float
+    residual: float
+    rejected: tuple[int, ...] = ()
+    times: np.ndarray | None = None
+    nodes: np.ndarray | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the iteration as a dictionary that JSON can represent, without the path."""
+        return plain(
+            {
+                "phase": self.phase,
+                "segments": self.segments,
+                "cost": self.cost,
+                "residual": self.residual,
+                "rejected": len(self.rejected),
+            }
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Extremal:
+    """An extremal of an optimal control problem: the result of `solve` and `find_optimum`.
+
+    The arrays hold the solution at the N steps of the integrator that certified it; `evaluate` interpolates between
+    them. They are empty if the solve failed without a path.
+
+    Attributes:
+        problem: the problem that was solved.
+        status: outcome of the solve; its value suggests what to try next.
+        cost: J of the path, certified or not; infinite without a path.
+        times: (N,), s.
+        states: (N, n).
+        controls: (N, m).
+        costates: (N, n).
+        accumulated: (N,), cost from time 0 to each time.
+        hamiltonian: (N,), constant along an extremal.
+        terms: (N - 1, 7, 2n + 1), coefficients of the integrator's interpolant of (state, costate, cost).
+        history: iterations of the solver.
+        certificate: evidence from re-integration; None without a path.
+        n_nodes: number of nodes of the solver.
+        n_evaluations: number of evaluations of the extremal flow by the solver.
+
+    """
+
+    problem: OptimalControlProblem
+    status: Status
+    cost: float
+    times: np.ndarray
+    states: np.ndarray
+    controls: np.ndarray
+    costates: np.ndarray
+    accumulated: np.ndarray
+    hamiltonian: np.ndarray
+    terms: np.ndarray
+    history: tuple[Iteration, ...] = ()
+    certificate: Certificate | None = None
+    n_nodes: int = 0
+    n_evaluations: int = 0
+
+    def __repr__(self) -> str:
+        return f"Extremal({self.status.name}, cost={self.cost:.9g}, {len(self.times)} points, {self.certificate})"
+
+    @property
+    def success(self) -> bool:
+        """Whether the certificate proves a local minimum, collision-free if there are obstacles."""
+        return self.status is Status.SUCCESS
+
+    def evaluate(self, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return states, controls and costates at given times.
+
+        States and costates come from the integrator's interpolant of order 7, and the controls follow from the minimum
+        principle.
+
+        Args:
+            t: time (s), scalar or (K,); clipped to [0, horizon].
+
+        Returns:
+            (states, controls, costates), of shapes (n,), (m,), (n,) for a scalar, or (K, n), (K, m), (K, n).
+
+        Raises:
+            ValueError: there is no path, because the solve failed.
+
+        """
+        values = self.interpolate(np.atleast_1d(np.asarray(t, dtype=float)))
+        n = self.problem.system.n
+        arrays = self.problem.arrays
+        controls = np.empty((len(values), self.problem.system.m))
+        for row, value in zip(controls, values, strict=True):
+            arrays.control(value, arrays.data, row)
+        result = values[:, :n], controls, values[:, n:]
+        return result if np.ndim(t) else (result[0][0], result[1][0], result[2][0])
+
+    def interpolate(self, times: np.ndarray) -> np.ndarray:
+        """Return states and costates (K, 2n) at times (K,).
+
+        Raises:
+            ValueError: there is no path, because the solve failed.
+
+        """
+        if len(self.times) == 0:
+            raise ValueError(f"there is no path: {self.status.value}")
+        return np.ascontiguousarray(self._interpolate(times)[:, :-1])
+
+    def _interpolate(self, times: np.ndarray) -> np.ndarray:
+        """Return states, costates and accumulated cost (K, 2n + 1) at times (K,)."""
+        times = np.clip(times, 0.0, self.problem.horizon)
+        k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        s = ((times - self.times[k]) / (self.times[k + 1] - self.times[k]))[:, None]
+        value = np.zeros((len(times), self.terms.shape[2]))
+        for j in range(self.terms.shape[1] - 1, -1, -1):
+            value = (value + self.terms[k, j]) * (s if j % 2 == 0 else 1.0 - s)
+        return value + np.concatenate([self.states, self.costates, self.accumulated[:, None]], axis=1)[k]
+
+    def cost_to_go(self, t: Any) -> Any:
+        """Return the cost from time t (s), scalar or (K,), to the horizon.
+
+        Raises:
+            ValueError: there is no path, because the solve failed.
+
+        """
+        if len(self.times) == 0:
+            raise ValueError(f"there is no path: {self.status.value}")
+        values = self.cost - self._interpolate(np.atleast_1d(np.asarray(t, dtype=float)))[:, -1]
+        return values if np.ndim(t) else float(values[0])
+
+    def plot(self, path: str | os.PathLike[str] | None = None, title: str | None = None) -> Any:
+        """Plot the extremal. Deprecated: use `leapnav.experts.plot_extremal`."""
+        _warn_deprecated("Extremal.plot", "leapnav.experts.plot_extremal(extremal, path)")
+        # Imported by name at run time, so that the solvers do not depend on the plots.
+        return importlib.import_module("leapnav.experts.plotting").plot_extremal(self, path, title=title)
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes of the solver. Deprecated: use `n_nodes`."""
+        _warn_deprecated("Extremal.nodes", "Extremal.n_nodes")
+        return self.n_nodes
+
+    @property
+    def work(self) -> int:
+        """Number of evaluations of the extremal flow. Deprecated: use `n_evaluations`."""
+        _warn_deprecated("Extremal.work", "Extremal.n_evaluations")
+        return self.n_evaluations
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as a dictionary that JSON can represent, as `leapnav solve --json` writes it.
+
+        Numbers that are not finite become None.
+        """
+        return plain(
+            {
+                "status": self.status.name,
+                "advice": self.status.value,
+                "success": self.success,
+                "cost": self.cost,
+                "certificate": self.certificate,
+                "times": self.times.tolist(),
+                "states": self.states.tolist(),
+                "controls": self.controls.tolist(),
+                "costates": self.costates.tolist(),
+                "history": [row.to_dict() for row in self.history],
+            }
+        )
+
+    def to_json(self) -> str:
+        """Return `to_dict` as JSON text."""
+        return encode(self.to_dict())
+
+
+def _warn_deprecated(name: str, replacement: str) -> None:
+    text = f"{name} is now {replacement}; the old name is removed in the next version"
+    warnings.warn(text, DeprecationWarning, stacklevel=3)

@@ -1,0 +1,269 @@
+"""Optimal control problems and initial guesses of their solution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, cast
+
+import numpy as np
+import sympy as sp
+
+from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
+from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
+from leapnav.experts.problem.generated_flow import compile_flow
+from leapnav.experts.problem.system import ControlAffineSystem, as_expression, unicycle
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A path in time, used as an initial guess of a solution.
+
+    The states need not satisfy the dynamics.
+
+    Attributes:
+        times: (N,), increasing, from 0 to the horizon (s).
+        states: (N, n).
+        costates: (N, n); None lets the solver estimate them from the motion.
+
+    """
+
+    times: np.ndarray
+    states: np.ndarray
+    costates: np.ndarray | None = None
+
+    def resample(self, times: np.ndarray) -> Trajectory:
+        """Return the path at other times (K,), by linear interpolation."""
+        columns = [self.states] if self.costates is None else [self.states, self.costates]
+        values = [np.stack([np.interp(times, self.times, c) for c in array.T], axis=1) for array in columns]
+        return Trajectory(times, *values)
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalControlProblem:
+    """An optimal control problem with a fixed horizon, for a control-affine system.
+
+    Minimise the integral of 1/2 u'Ru + Phi(q) over [0, T], subject to q' = a(q) + sum_j u_j b_j(q), q(0) = start and
+    q(T) = goal.
+
+    Args:
+        system: the dynamics, with n states and m controls.
+        start: q(0), n numbers.
+        goal: q(T), n numbers or None. None leaves a component free; its costate vanishes at T.
+        horizon: T > 0 (s).
+        control_weight: diagonal of R, m positive numbers.
+        state_cost: Phi, a SymPy expression in the system's state and parameters.
+        control_bounds: m pairs (minimum, maximum); None for unbounded controls.
+        field: packed obstacle field (`Scenario.field`) whose proximity cost is added to Phi at the system's position.
+        parameters: values of the system's parameters, in the order of their declaration.
+
+    Raises:
+        ValueError: an argument has a wrong length or an invalid value.
+
+    """
+
+    system: ControlAffineSystem
+    start: Sequence[float]
+    goal: Sequence[float | None]
+    horizon: float
+    control_weight: Sequence[float]
+    state_cost: Any = 0
+    control_bounds: Sequence[tuple[float, float]] | None = None
+    field: np.ndarray | None = None
+    parameters: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        n, m = self.system.n, self.system.m
+        for name, values, length in (
+            ("start", self.start, n),
+            ("goal", self.goal, n),
+            ("control_weight", self.control_weight, m),
+            ("parameters", self.parameters, len(self.system.parameters)),
+        ):
+            if len(values) != length:
+                raise ValueError(f"{name}: expected {length} numbers, got {len(values)}: {values!r}")
+            if not all((v is None and name == "goal") or _is_finite(v) for v in values):
+                raise ValueError(f"{name}: expected finite numbers, got {values!r}")
+        if not all(w > 0 for w in self.control_weight):
+            raise ValueError(f"control_weight: expected positive numbers, got {self.control_weight!r}")
+        if not (_is_finite(self.horizon) and self.horizon > 0):
+            raise ValueError(f"horizon: expected a positive number, got {self.horizon!r}")
+        if self.control_bounds is not None:
+            if len(self.control_bounds) != m:
+                raise ValueError(f"control_bounds: expected {m} pairs, got {len(self.control_bounds)}")
+            for low, high in self.control_bounds:
+                if not (_is_number(low) and _is_number(high) and low < high):
+                    raise ValueError(f"control_bounds: expected lowest < highest, got ({low!r}, {high!r})")
+        # SymPy and NumPy numbers are accepted, but compiled functions need Python floats.
+        for name in ("start", "goal", "control_weight", "parameters"):
+            values = tuple(None if v is None else float(v) for v in getattr(self, name))
+            object.__setattr__(self, name, values)
+        object.__setattr__(self, "horizon", float(self.horizon))
+        if self.control_bounds is not None:
+            bounds = tuple((float(low), float(high)) for low, high in self.control_bounds)
+            object.__setattr__(self, "control_bounds", bounds)
+        unknown = as_expression("state_cost", self.state_cost).free_symbols - {
+            *self.system.state,
+            *self.system.parameters,
+        }
+        if unknown:
+            raise ValueError(
+                f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}"
+            )
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario) -> OptimalControlProblem:
+        """Return the problem of a scenario, with the robot's limits as control bounds."""
+        robot, cost = scenario.robot, scenario.cost
+        return cls(
+            system=_UNICYCLE,
+            start=scenario.start,
+            goal=scenario.goal,
+            horizon=scenario.horizon,
+            control_weight=(cost.speed_weight, cost.turn_weight),
+            control_bounds=((-robot.max_speed, robot.max_speed), (-robot.max_turn_rate, robot.max_turn_rate)),
+            field=scenario.field,
+        )
+
+    def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:
+        """Return the problem with each goal angle shifted by a multiple of 2 pi to where the path (N, n) ends."""
+        goal = list(self.goal)
+        for symbol in self.system.angles:
+            i = self.system.state.index(symbol)
+            value = goal[i]
+            if value is not None:
+                # Rounded, because the path need not end exactly at the goal.
+                goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
+        return replace(self, goal=tuple(goal))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions cannot be pickled; the receiving process creates its own.
+        return {name: value for name, value in self.__dict__.items() if name != "arrays"}
+
+    @cached_property
+    def arrays(self) -> ProblemArrays:
+        """The problem in the form that the kernels take."""
+        m = self.system.m
+        flow, control = compile_flow(self.system, sp.sympify(self.state_cost), self.field is not None)
+        bounds = np.array(
+            self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
+        )
+        goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
+        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *self.parameters])
+        field = _constant([]) if self.field is None else self.field
+        return ProblemArrays(
+            flow=ExtremalFlow(flow, data, field),
+            control=control,
+            start=np.array(self.start, dtype=float),
+            end=EndCondition(goal, np.array([g is None for g in self.goal])),
+        )
+
+    def estimate_costates(self, path: Trajectory) -> np.ndarray:
+        """Estimate costates (N, n) along a path without costates, consistent with the minimum principle.
+
+        The control that follows the path in the least-squares sense gives the switching functions p = -R u. The result
+        is the costate of least norm with these switching functions.
+        """
+        drift, fields = self.dynamics(path.states)
+        costates = np.empty_like(drift)
+        rates = np.gradient(path.states, path.times, axis=0)
+        minimum_norm_costates(drift, fields, rates, np.array(self.control_weight, dtype=float), costates)
+        return costates
+
+    def dynamics(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the drift a(q) (N, n) and the control vector fields B(q) (N, n, m) at states (N, n)."""
+        arrays, n, m = self.arrays, self.system.n, self.system.m
+        drift, fields = np.empty((len(states), n)), np.empty((len(states), n, m))
+        sample_dynamics(arrays.flow, arrays.control, np.ascontiguousarray(states), drift, fields)
+        return drift, fields
+
+    def straight_line(self, points: int = 33) -> Trajectory:
+        """Return the straight line from start to goal; free components keep their initial value."""
+        start = np.array(self.start, dtype=float)
+        goal = np.array([s if g is None else g for s, g in zip(self.start, self.goal, strict=True)], dtype=float)
+        fraction = np.linspace(0.0, 1.0, points)[:, None]
+        return Trajectory(np.linspace(0.0, self.horizon, points), start + fraction * (goal - start))
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemArrays:
+    """An optimal control problem in the form that the kernels take.
+
+    Attributes:
+        flow: compiled extremal flow with its constants.
+        control: compiled control law, see `CONTROL_SIGNATURE`.
+        start: (n,), q(0).
+        end: conditions at the horizon.
+
+    """
+
+    flow: ExtremalFlow
+    control: FunctionPointer
+    start: np.ndarray
+    end: EndCondition
+
+    @property
+    def goal(self) -> np.ndarray:
+        """q(T), (n,); 0 where a component is free."""
+        return self.end.goal
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which components of q(T) are free, (n,), bool."""
+        return self.end.free
+
+    @property
+    def data(self) -> np.ndarray:
+        """Control weights (m,), lower and upper control bounds (2m,), and parameters."""
+        return self.flow.data
+
+    @property
+    def field(self) -> np.ndarray:
+        """The packed obstacle field, or an empty array."""
+        return self.flow.field
+
+    def rates(self, z: np.ndarray) -> np.ndarray:
+        """Return the derivative (2n,) of z = (q, lambda) along the extremal flow."""
+        none, dz = np.empty((len(z), 0)), np.empty(len(z))
+        self.flow.function(z, self.data, self.field, none, dz, none)
+        return dz
+
+    def running_cost(self, z: np.ndarray) -> float:
+        """Return the running cost at z = (q, lambda)."""
+        none, dz = np.empty((len(z), 0)), np.empty(len(z))
+        return self.flow.function(z, self.data, self.field, none, dz, none)
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a real number of Python, NumPy or SymPy that a double can represent."""
+    try:
+        return not isinstance(value, str) and not math.isnan(float(value))
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def _is_finite(value: Any) -> bool:
+    return _is_number(value) and math.isfinite(float(value))
+
+
+def _constant(values: Sequence[float] | list[float]) -> np.ndarray:
+    """Return a read-only array, as the kernels expect for constants."""
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+_UNICYCLE = unicycle()
+
+
+def as_problem(task: OptimalControlProblem | Scenario) -> OptimalControlProblem:
+    """Return the problem of a scenario, or the problem itself."""
+    if isinstance(task, Scenario):
+        return OptimalControlProblem.from_scenario(task)
+    if isinstance(task, OptimalControlProblem):
+        return task
+    raise TypeError(f"expected a Scenario or an OptimalControlProblem, got {type(cast(object, task)).__name__}")

@@ -1,0 +1,168 @@
+"""Control-affine systems, declared in SymPy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import sympy as sp
+
+
+@dataclass(frozen=True)
+class ControlAffineSystem:
+    """A control-affine system q' = a(q) + sum_j u_j b_j(q), declared with SymPy symbols.
+
+    The extremal flow and its sensitivities are derived from the declaration, compiled at first use and cached on disk.
+    Instances are immutable and hashable.
+
+    Args:
+        state: the n state symbols.
+        drift: a(q), n expressions or numbers.
+        fields: b_j(q), for each of the m controls a sequence of n expressions or numbers.
+        angles: state symbols that are angles; their goal is met modulo 2 pi.
+        position: the two state symbols that are the position in the plane, for systems that move among obstacles.
+        parameters: symbols in `drift`, `fields` and the state cost whose values belong to the problem
+            (`OptimalControlProblem.parameters`). A new value needs no compilation.
+
+    Attributes:
+        n: number of states.
+        m: number of controls.
+
+    Raises:
+        ValueError: lengths disagree, or an expression has an unknown symbol or no finite value.
+
+    Example:
+        The Grushin plane:
+
+        >>> x1, x2 = sympy.symbols("x1 x2")
+        >>> grushin = ControlAffineSystem(state=(x1, x2), drift=(0, 0), fields=((1, 0), (0, x1)))
+
+    """
+
+    state: tuple[sp.Symbol, ...]
+    drift: tuple[sp.Expr, ...]
+    fields: tuple[tuple[sp.Expr, ...], ...]
+    angles: tuple[sp.Symbol, ...] = field(default=())
+    position: tuple[sp.Symbol, sp.Symbol] | None = None
+    parameters: tuple[sp.Symbol, ...] = field(default=())
+
+    def __init__(
+        self,
+        state: Sequence[sp.Symbol],
+        drift: Sequence[Any],
+        fields: Sequence[Sequence[Any]],
+        angles: Sequence[sp.Symbol] = (),
+        position: Sequence[sp.Symbol] | None = None,
+        parameters: Sequence[sp.Symbol] = (),
+    ) -> None:
+        n = len(state)
+        if n == 0 or len(set(state)) < n or not all(isinstance(s, sp.Symbol) for s in state):
+            raise ValueError(f"state: expected distinct SymPy symbols, got {state!r}")
+        if len(set(parameters)) < len(parameters) or not all(isinstance(s, sp.Symbol) for s in parameters):
+            raise ValueError(f"parameters: expected distinct SymPy symbols, got {parameters!r}")
+        if set(parameters) & set(state):
+            raise ValueError(f"parameters: {sorted(map(str, set(parameters) & set(state)))[0]!r} is a state")
+        if len(drift) != n:
+            raise ValueError(f"drift: expected {n} expressions, one per state, got {len(drift)}")
+        if len(fields) == 0:
+            raise ValueError("fields: expected at least one control vector field, got none")
+        for j, column in enumerate(fields):
+            if len(column) != n:
+                raise ValueError(f"fields[{j}]: expected {n} expressions, one per state, got {len(column)}")
+        values = {
+            "state": tuple(state),
+            "drift": tuple(as_expression("drift", e) for e in drift),
+            "fields": tuple(tuple(as_expression(f"fields[{j}]", e) for e in c) for j, c in enumerate(fields)),
+            "angles": tuple(angles),
+            "position": None if position is None else tuple(position),
+            "parameters": tuple(parameters),
+        }
+        for where, expressions in [
+            ("drift", values["drift"]),
+            *((f"fields[{j}]", c) for j, c in enumerate(values["fields"])),
+        ]:
+            unknown = set().union(*(e.free_symbols for e in expressions)) - {*state, *parameters}
+            if unknown:
+                raise ValueError(
+                    f"{where}: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {tuple(state)}, "
+                    f"the parameters are {tuple(parameters)}"
+                )
+        for where, chosen in (("angles", values["angles"]), ("position", values["position"] or ())):
+            if not set(chosen) <= set(state):
+                raise ValueError(f"{where}: {chosen} is not among the state symbols {tuple(state)}")
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.state)
+
+    @property
+    def m(self) -> int:
+        """Number of controls."""
+        return len(self.fields)
+
+
+def as_expression(where: str, value: Any) -> sp.Expr:
+    """Convert a value to a SymPy expression.
+
+    Args:
+        where: name of the argument, for the error message.
+        value: an expression, a number or text.
+
+    Raises:
+        ValueError: the value is no expression, or it contains NaN or infinity.
+
+    """
+    try:
+        expression = sp.sympify(value)
+    except (sp.SympifyError, TypeError, AttributeError, SyntaxError):
+        expression = None
+    if not isinstance(expression, sp.Expr) or expression.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise ValueError(f"{where}: expected an expression, got {value!r}")
+    return expression
+
+
+def unicycle() -> ControlAffineSystem:
+    """Return the unicycle: q = (x, y, theta), u = (v, omega) in m/s and rad/s."""
+    x, y, theta = sp.symbols("x y theta")
+    return ControlAffineSystem(
+        state=(x, y, theta),
+        drift=(0, 0, 0),
+        fields=((sp.cos(theta), sp.sin(theta), 0), (0, 0, 1)),
+        angles=(theta,),
+        position=(x, y),
+    )
+
+
+def differential_drive() -> ControlAffineSystem:
+    """Return the differential drive: q = (x, y, theta), u = (left, right), the wheel speeds in m/s.
+
+    Its parameter `track` is the distance (m) between the wheels.
+    """
+    x, y, theta, track = sp.symbols("x y theta track")
+    return ControlAffineSystem(
+        state=(x, y, theta),
+        drift=(0, 0, 0),
+        fields=(
+            (sp.cos(theta) / 2, sp.sin(theta) / 2, -1 / track),
+            (sp.cos(theta) / 2, sp.sin(theta) / 2, 1 / track),
+        ),
+        angles=(theta,),
+        position=(x, y),
+        parameters=(track,),
+    )
+
+
+def unicycle_with_inertia() -> ControlAffineSystem:
+    """Return the unicycle with inertia: q = (x, y, theta, v, omega), u = (dv/dt, domega/dt) in m/s^2 and rad/s^2."""
+    x, y, theta, v, omega = sp.symbols("x y theta v omega")
+    return ControlAffineSystem(
+        state=(x, y, theta, v, omega),
+        drift=(v * sp.cos(theta), v * sp.sin(theta), omega, 0, 0),
+        fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
+        angles=(theta,),
+        position=(x, y),
+    )

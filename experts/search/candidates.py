@@ -1,0 +1,225 @@
+"""Candidate paths of a scenario: shortest paths over (x, y, heading) in the Jacobi metric of the problem.
+
+On an extremal of the driftless robot H = -E is constant, so |u|_R = sqrt(2 (E + Phi)), and the optimum is a shortest
+path for ds = sqrt(2 (E + Phi)) sqrt(r_v ds_xy^2 + r_w dtheta^2) (Maupertuis' principle). E follows from the horizon,
+T = integral of ds / (2 (E + Phi)). The search therefore covers reversing, cusps, windings of the heading and the
+allocation of time. Costs of shortest paths in the plane, for which rotation is free, are lower bounds of the costs on
+the lattice, and guide an A* search from the goal; the costs of that guide a search from the start. A path through an
+edge that both trees have in common is locally shortest. The cheapest distinct paths of this kind are the candidates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.shortest_paths import (
+    HEADINGS,
+    Limits,
+    Metric,
+    Nodes,
+    energy_of,
+    mark,
+    meeting_nodes,
+    path_through,
+    plane_costs,
+    tree,
+)
+
+REACH = 1.3  # largest cost of a candidate relative to the cheapest, apart from the cost of 1 m
+TURNING_FACTOR = 1.2  # initial estimate of the length of a path relative to the shortest path in the plane
+MAX_LOG_ENERGY_ERROR = 0.5  # error of log E above which E is corrected; the order of candidates hardly depends on E
+MIN_ENERGY = 1e-4
+MIN_TURN_LENGTH = 0.3  # smallest cost of 1 rad, as a distance in cells
+MIN_ENERGY_FRACTION = 0.3  # smallest E of a path, relative to its E for a small Phi
+LATTICE_ERROR = 1.07  # relative length error of lattice paths, see `suffices`; at most 1.067 in 200 scenarios
+# Nodes within this distance (cells, heading steps) of a candidate belong to it.
+DUPLICATE_CELLS, DUPLICATE_HEADINGS = 2, 3
+# The same for `distinct_from`, which yields paths that differ by more.
+DISTINCT_CELLS, DISTINCT_HEADINGS = 4, HEADINGS // 2
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A path of poses, which need not be feasible.
+
+    Attributes:
+        times: (N,), s.
+        poses: (N, 3), x, y (m) and unwrapped heading (rad).
+        cost: length in the metric of the lattice.
+        nodes: (N - 2,), nodes of the lattice.
+
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    cost: float
+    nodes: np.ndarray
+
+
+class Tree(NamedTuple):
+    """A tree of shortest paths.
+
+    Attributes:
+        cost: cost of each node from the root.
+        parent: predecessor of each node; -1 if it has none.
+
+    """
+
+    cost: np.ndarray
+    parent: np.ndarray
+
+
+class CandidateSearch:
+    """Search of a lattice for candidate paths.
+
+    Args:
+        lattice: the lattice.
+        reach: largest cost of a candidate relative to the cheapest, see REACH.
+
+    Attributes:
+        lattice: the lattice.
+        energy: E of the metric; 0 if there is no path.
+
+    """
+
+    def __init__(self, lattice: Lattice, reach: float = REACH) -> None:
+        self.lattice, self._reach = lattice, reach
+        self._from_start = self._to_goal = Tree(np.empty(0), np.empty(0, dtype=np.int32))
+        self._meetings = np.empty(0, dtype=np.int64)
+        self.energy = self._first_energy()
+        if self.energy == 0.0:
+            return
+        self._grow()
+        if len(self._meetings) == 0:
+            return
+        nodes = path_through(self._meetings[0], self._from_start.parent, self._to_goal.parent)
+        lengths, phi = lattice.metric_lengths(lattice.poses(nodes))
+        horizon = lattice.scenario.horizon
+        # Phi is large in a passage that is narrower than the robot, so the horizon alone may give E = 0, for which the
+        # metric is degenerate.
+        energy = max(
+            energy_of(lengths, phi, horizon), MIN_ENERGY_FRACTION * 0.5 * (float(lengths.sum()) / horizon) ** 2
+        )
+        if abs(math.log(energy / self.energy)) > MAX_LOG_ENERGY_ERROR:
+            self.energy = energy
+            self._grow()
+
+    @property
+    def slack(self) -> float:
+        """Cost of 1 m where Phi is zero; it admits manoeuvres, which are long compared with a short distance."""
+        return math.sqrt(2 * self.energy * self.lattice.scenario.cost.speed_weight)
+
+    def candidates(self) -> Iterator[Candidate]:
+        """Yield distinct paths in order of cost; none if the goal cannot be reached."""
+        return self._distinct((), DUPLICATE_CELLS, DUPLICATE_HEADINGS)
+
+    def distinct_from(self, taken: Iterable[Candidate]) -> Iterator[Candidate]:
+        """Yield paths that are somewhere at least 0.8 m (4 cells of 0.2 m) away from those `taken` and from each other.
+
+        Most of them pass obstacles on other sides, and cost more.
+        """
+        return self._distinct(taken, DISTINCT_CELLS, DISTINCT_HEADINGS)
+
+    def random_candidates(self, count: int, rng: np.random.Generator) -> Iterator[Candidate]:
+        """Yield shortest paths through random nodes; none if the goal cannot be reached."""
+        if self.energy == 0.0:
+            return
+        through = self._from_start.cost + self._to_goal.cost
+        for node in rng.choice(np.flatnonzero(np.isfinite(through)), count):
+            yield self._candidate(int(node))
+
+    def suffices(self, cost: float, first: float, last: float) -> bool:
+        """Return whether further candidates are unlikely to lead to a cheaper extremal.
+
+        For any E, a path of length D in the metric has J >= D - E T, with equality for an extremal of that E. Lattice
+        paths are slightly longer than the extremals close to them, at most by the factor LATTICE_ERROR in hundreds of
+        scenarios, and rarely shorter. So no more candidates are needed if the first one is about as short as the best
+        extremal, or if the last one is too long to be close to a cheaper extremal.
+
+        Args:
+            cost: J of the best extremal.
+            first: cost of the first candidate.
+            last: cost of the last candidate.
+
+        """
+        length = cost + self.energy * self.lattice.scenario.horizon
+        return first >= length / LATTICE_ERROR or last >= length * LATTICE_ERROR
+
+    def _distinct(self, taken: Iterable[Candidate], cells: int, headings: int) -> Iterator[Candidate]:
+        """Yield paths through nodes that are farther than the given distance from all paths before."""
+        marked = np.zeros(self.lattice.columns * self.lattice.lines * HEADINGS, dtype=bool)
+        for candidate in taken:
+            mark(marked, candidate.nodes, self.lattice.lines, cells, headings)
+        for node in self._meetings:
+            if not marked[node]:
+                candidate = self._candidate(int(node))
+                mark(marked, candidate.nodes, self.lattice.lines, cells, headings)
+                yield candidate
+
+    def _first_energy(self) -> float:
+        """Estimate E from the shortest path in the plane; 0 if there is none."""
+        scenario = self.lattice.scenario
+        weight, horizon = scenario.cost.speed_weight, scenario.horizon
+        start, goal = scenario.start, scenario.goal
+        energy = max(0.5 * weight * (math.dist(start[:2], goal[:2]) / horizon) ** 2, MIN_ENERGY)
+        for _ in range(3):
+            metric = self._metric(energy)
+            cost = _plane_costs(metric, self.lattice.nodes_around(*start, metric.speed))
+            targets = self.lattice.nodes_around(*goal, metric.speed).nodes // HEADINGS
+            shortest = float(cost[targets].min()) if len(targets) else math.inf
+            if not math.isfinite(shortest):
+                return 0.0
+            # Assumes that Phi is small compared with E, which holds once E is larger than that of the straight line.
+            length = TURNING_FACTOR * shortest / math.sqrt(2.0 * energy)
+            before, energy = energy, max(0.5 * (length / horizon) ** 2, MIN_ENERGY)
+            if abs(math.log(energy / before)) < MAX_LOG_ENERGY_ERROR:
+                break
+        return energy
+
+    def _metric(self, energy: float) -> Metric:
+        """Return the metric for a given E."""
+        cost, cell = self.lattice.scenario.cost, self.lattice.cell
+        # If rotation had almost no cost, all headings of a cell would be equivalent, and the search would not end.
+        turn_weight = max(cost.turn_weight, cost.speed_weight * (MIN_TURN_LENGTH * cell) ** 2)
+        return Metric(np.sqrt(2.0 * (energy + self.lattice.phi)), cell, cost.speed_weight, turn_weight)
+
+    def _grow(self) -> None:
+        """Compute the trees from the start and from the goal, and the nodes at which they meet, in order of cost."""
+        scenario, metric = self.lattice.scenario, self._metric(self.energy)
+        seeds = self.lattice.nodes_around(*scenario.start, metric.speed)
+        ends = self.lattice.nodes_around(*scenario.goal, metric.speed)
+        bound = _plane_costs(metric, seeds)
+        limits = Limits(self._reach, self.slack, math.inf)
+        cost_behind, behind, limit = tree(metric, ends, seeds, bound, False, limits)
+        cost_ahead, ahead, _ = tree(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
+        self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
+        self._meetings = meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit)
+
+    def _candidate(self, node: int) -> Candidate:
+        """Return the path through a node."""
+        nodes = path_through(node, self._from_start.parent, self._to_goal.parent)
+        poses, horizon = self.lattice.poses(nodes), self.lattice.scenario.horizon
+        lengths, phi = self.lattice.metric_lengths(poses)
+        # The time of a path of length zero (the goal is the start) is distributed evenly.
+        lengths = np.maximum(lengths, 1e-9)
+        durations = lengths / np.sqrt(2 * (energy_of(lengths, phi, horizon) + phi))
+        times = np.concatenate([[0.0], np.cumsum(durations)])
+        cost = float(self._from_start.cost[node] + self._to_goal.cost[node])
+        return Candidate(times * (horizon / times[-1]), poses, cost, nodes)
+
+
+def best_candidate(lattice: Lattice) -> Candidate | None:
+    """Return the cheapest path of a lattice, or None if the goal cannot be reached."""
+    return next(CandidateSearch(lattice).candidates(), None)
+
+
+def _plane_costs(metric: Metric, seeds: Nodes) -> np.ndarray:
+    """Return the costs of the cells from those of the seeds if rotation were free."""
+    cells = np.unique(seeds.nodes // HEADINGS)
+    return plane_costs(metric, Nodes(cells, np.zeros(len(cells))))

@@ -1,0 +1,197 @@
+"""The lattice of the candidate search: a grid of cells and headings over a scenario, with its proximity cost.
+
+The paths on it are found by `leapnav.experts.search.candidates`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import label
+
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.sampling import PointGrid, sample_grid
+from leapnav.experts.search.shortest_paths import ANGLES, BORDER, HEADINGS, Nodes
+
+# Smallest and largest cell (m), and number of cells from start to goal: small enough for manoeuvres over a short
+# distance. The obstacles are sampled at half of this resolution.
+MIN_CELL, MAX_CELL, CELLS_PER_DISTANCE = 0.05, 0.2, 20
+# Smallest spacing (m) and largest number of points per side of the grid that decides whether a path exists.
+MIN_SPACING, MAX_POINTS = 0.02, 600
+MAX_CELLS = 250  # per side; larger arenas have larger cells
+# Largest depth in an obstacle (robot radii) of a lattice point: a passage that just admits the robot may lie between
+# two points, but no wall is thinner than the robot.
+TOLERATED_DEPTH = 0.4
+RELEVANT_DISTANCE = 12.0  # proximity scales, beyond which the proximity cost of an obstacle is negligible
+SEED_ANGLE = math.radians(30)  # largest difference between the heading of a pose and that of a node next to it
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place at which a path was in collision.
+
+    Attributes:
+        x, y: position (m).
+        clearance: clearance (m) of the path there; negative.
+        wide: whether a larger area around the place is to be avoided.
+
+    """
+
+    x: float
+    y: float
+    clearance: float
+    wide: bool = False
+
+
+class Lattice:
+    """The lattice of one scenario.
+
+    Args:
+        scenario: the scenario.
+        refinement: factor by which the cells are smaller than usual.
+        margin: smallest clearance (m) of a lattice point; None tolerates a small depth, see TOLERATED_DEPTH.
+        whole: whether to cover all of a large arena, with large cells.
+
+    Attributes:
+        scenario: the scenario.
+        cell: side of a cell (m).
+        origin: position (m) of cell (0, 0).
+        columns: number of cells in x.
+        lines: number of cells in y.
+        phi: (2 columns - 1, 2 lines - 1), proximity cost on the half-cell grid, infinite where the robot cannot be.
+        cropped: whether the lattice covers only a part of the arena.
+
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        refinement: int = 1,
+        margin: float | None = None,
+        whole: bool = False,
+    ) -> None:
+        self.scenario = scenario
+        depth = -TOLERATED_DEPTH * scenario.robot.radius if margin is None else margin
+        x_min, y_min, x_max, y_max = scenario.arena
+        distance = math.dist(scenario.start[:2], scenario.goal[:2])
+        cell = min(max(distance / CELLS_PER_DISTANCE, MIN_CELL), MAX_CELL) / refinement
+        x, y, _ = scenario.start
+        if not whole:  # limits the search to the surroundings of start and goal, so that the cells stay small
+            half = max(cell * MAX_CELLS / 2, 0.75 * distance)
+            middle = (x + scenario.goal[0]) / 2, (y + scenario.goal[1]) / 2
+            x_min, x_max = max(x_min, middle[0] - half), min(x_max, middle[0] + half)
+            y_min, y_max = max(y_min, middle[1] - half), min(y_max, middle[1] + half)
+        self.cropped = (x_min, y_min, x_max, y_max) != tuple(scenario.arena)
+        self.cell = max(cell, (x_max - x_min) / MAX_CELLS, (y_max - y_min) / MAX_CELLS)
+        # The start is a lattice point.
+        left, below = int((x - x_min) / self.cell) + BORDER, int((y - y_min) / self.cell) + BORDER
+        right, above = int((x_max - x) / self.cell) + BORDER, int((y_max - y) / self.cell) + BORDER
+        self.origin = (x - left * self.cell, y - below * self.cell)
+        self.columns, self.lines = left + right + 1, below + above + 1
+        band = max(RELEVANT_DISTANCE * scenario.cost.proximity_scale, 2.0 * depth, 0.1)
+        grid = PointGrid(*self.origin, self.cell / 2, 2 * self.columns - 1, 2 * self.lines - 1)
+        phi, clearance = sample_grid(scenario.field, grid, band)
+        phi[clearance < depth] = np.inf
+        for side in (np.s_[: 2 * BORDER], np.s_[-2 * BORDER :]):
+            phi[side] = phi[:, side] = np.inf
+        self.phi = phi
+
+    def without(self, places: Sequence[Place]) -> Lattice:
+        """Return the lattice with some places closed, in a radius that blocks a passage narrower than the robot."""
+        if not places:
+            return self
+        lattice = copy(self)
+        lattice.phi = self.phi.copy()
+        spacing = self.cell / 2
+        ends = np.array([self.scenario.start[:2], self.scenario.goal[:2]])
+        x, y = (self.origin[axis] + spacing * np.arange(count) for axis, count in enumerate(self.phi.shape))
+        for place in places:
+            radius = TOLERATED_DEPTH * self.scenario.robot.radius + spacing
+            if place.wide:  # the centre line of a passage next to it is farther away than this
+                radius = max(radius, 2.0 * self.scenario.robot.radius)
+            if np.hypot(*(ends - (place.x, place.y)).T).min() <= radius + 2 * self.cell:
+                continue  # every path passes the start and the goal
+            columns, lines = np.abs(x - place.x) <= radius, np.abs(y - place.y) <= radius
+            is_close = np.hypot(x[columns, None] - place.x, y[lines] - place.y) <= radius
+            closed = np.ix_(columns, lines)
+            lattice.phi[closed] = np.where(is_close, np.inf, lattice.phi[closed])
+        return lattice
+
+    def metric_lengths(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return length in the metric of the weights, and Phi at the midpoint, of each step of a path (N, 3)."""
+        cost = self.scenario.cost
+        step = np.diff(poses, axis=0)
+        lengths = np.sqrt(cost.speed_weight * (step[:, 0] ** 2 + step[:, 1] ** 2) + cost.turn_weight * step[:, 2] ** 2)
+        at = np.rint((poses[1:, :2] + poses[:-1, :2] - 2 * np.array(self.origin)) / self.cell).astype(int)
+        phi = self.phi[at[:, 0], at[:, 1]]
+        return lengths, np.where(np.isfinite(phi), phi, 0.0)
+
+    def nodes_around(self, x: float, y: float, heading: float | None, speed: np.ndarray) -> Nodes:
+        """Return the nodes around a pose, with the costs to reach them from it.
+
+        Args:
+            x: position (m).
+            y: position (m).
+            heading: heading (rad); None for all headings.
+            speed: sqrt(2 (E + Phi)) on the half-cell grid.
+
+        """
+        cost = self.scenario.cost
+        fi, fj = (x - self.origin[0]) / self.cell, (y - self.origin[1]) / self.cell
+        nodes, costs = [], []
+        turns = np.zeros(HEADINGS) if heading is None else np.abs((ANGLES - heading + np.pi) % (2 * np.pi) - np.pi)
+        headings = np.flatnonzero(turns <= SEED_ANGLE)
+        for i in range(math.floor(fi), math.floor(fi) + 2):
+            for j in range(math.floor(fj), math.floor(fj) + 2):
+                if not (0 <= i < self.columns and 0 <= j < self.lines and np.isfinite(speed[2 * i, 2 * j])):
+                    continue
+                shift = self.cell * math.hypot(i - fi, j - fj)
+                nodes.append((i * self.lines + j) * HEADINGS + headings)
+                lengths = np.sqrt(cost.speed_weight * shift**2 + cost.turn_weight * turns[headings] ** 2)
+                costs.append(lengths * speed[2 * i, 2 * j])
+        if not nodes:
+            return Nodes(np.empty(0, dtype=np.int64), np.empty(0))
+        return Nodes(np.concatenate(nodes), np.concatenate(costs))
+
+    def poses(self, path: np.ndarray) -> np.ndarray:
+        """Return the poses (N + 2, 3) from start to goal along nodes (N,)."""
+        start, goal = self.scenario.start, self.scenario.goal
+        poses = np.empty((len(path) + 2, 3))
+        poses[0] = start
+        poses[1:-1, 0] = self.origin[0] + self.cell * (path // (self.lines * HEADINGS))
+        poses[1:-1, 1] = self.origin[1] + self.cell * (path // HEADINGS % self.lines)
+        poses[1:-1, 2] = ANGLES[path % HEADINGS]
+        poses[-1] = (goal[0], goal[1], poses[-2, 2] if goal[2] is None else goal[2])
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        return poses
+
+
+def is_connected(scenario: Scenario) -> bool:
+    """Return whether a collision-free path from start to goal exists, at the resolution of a fine grid.
+
+    The robot is a disc that can rotate in place, so only the position of its centre matters.
+    """
+    x_min, y_min, x_max, y_max = scenario.arena
+    spacing = max(MIN_SPACING, (x_max - x_min) / MAX_POINTS, (y_max - y_min) / MAX_POINTS)
+    connected = False
+    for x, y, _ in (scenario.start, scenario.goal):
+        # The grid is aligned with the start and then with the goal, because the point closest to a pose that is not on
+        # the grid may be inside an obstacle.
+        left, below = int((x - x_min) / spacing), int((y - y_min) / spacing)
+        columns, lines = left + int((x_max - x) / spacing) + 1, below + int((y_max - y) / spacing) + 1
+        origin = x - left * spacing, y - below * spacing
+        free = sample_grid(scenario.field, PointGrid(*origin, spacing, columns, lines), spacing)[1] > 0
+        other = scenario.goal if (x, y) == scenario.start[:2] else scenario.start
+        at = min(max(round((other[0] - origin[0]) / spacing), 0), columns - 1)
+        up = min(max(round((other[1] - origin[1]) / spacing), 0), lines - 1)
+        # A pose very close to a wall may have no free neighbour on the grid.
+        for i, j in ((left, below), (at, up)):
+            free[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = True
+        regions = np.empty(free.shape, dtype=np.int32)
+        label(free, structure=np.ones((3, 3)), output=regions)
+        connected = connected or bool(regions[left, below] == regions[at, up])
+    return connected

@@ -1,0 +1,59 @@
+"""Classification of paths: sides of the obstacles, driving modes and winding of the heading."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from leapnav.envs.shapes.field import obstacle_centres
+
+Side = Literal["left", "right"]
+Mode = Literal["forward", "backward"]
+
+MIN_MODE_DISTANCE = 0.02  # m; shorter sections in one driving mode are ignored
+
+
+def path_sides(positions: np.ndarray, field: np.ndarray) -> tuple[Side, ...]:
+    """Return the side of a path on which each obstacle lies, in the order of the scenario.
+
+    The bearing of the path from the centre of an obstacle changes by a positive angle if the obstacle lies to the left.
+    For paths with the same ends this angle differs by multiples of 2 pi, so paths with the same sides are homotopic
+    unless one of them encircles an obstacle.
+
+    Args:
+        positions: x, y (m) of a densely sampled path, (N, 2).
+        field: packed obstacles (`Scenario.field`).
+
+    """
+    offsets = positions[:, None] - obstacle_centres(field)
+    bearing = np.unwrap(np.arctan2(offsets[..., 1], offsets[..., 0]), axis=0)
+    return tuple("left" if swept > 0 else "right" for swept in bearing[-1] - bearing[0])
+
+
+def driving_modes(times: np.ndarray, speeds: np.ndarray) -> tuple[Mode, ...]:
+    """Return the sequence of driving modes of a path, without sections of a few centimetres.
+
+    It is empty if the robot only rotates in place.
+
+    Args:
+        times: s, (N,).
+        speeds: signed speed (m/s), (N,).
+
+    """
+    steps = np.diff(times) * (speeds[1:] + speeds[:-1]) / 2
+    modes: list[Mode] = []
+    distance = 0.0  # signed, since the last change of direction
+    for step in steps:
+        distance = step if distance * step < 0 else distance + step
+        mode: Mode = "forward" if distance > 0 else "backward"
+        if abs(distance) >= MIN_MODE_DISTANCE and modes[-1:] != [mode]:
+            modes.append(mode)
+    return tuple(modes)
+
+
+def heading_winding(headings: np.ndarray) -> int:
+    """Return the full turns of the heading beyond the smaller angle between its ends; positive: counter-clockwise."""
+    turn = float(headings[-1] - headings[0])
+    return round((turn - math.remainder(turn, 2 * math.pi)) / (2 * math.pi))

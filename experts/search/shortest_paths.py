@@ -1,0 +1,347 @@
+"""Shortest paths on the lattice (kernels): the graph, trees of shortest paths, and the paths through given nodes.
+
+A node is a cell (i, j) with one of 16 headings; its index is (i * lines + j) * HEADINGS + heading. `speed` is
+sqrt(2 (E + Phi)) on the half-cell grid, infinite where the robot cannot be. The cost of an edge is its length in the
+metric of the weights times the mean speed along it, by Simpson's rule. The BORDER outermost cells are never free, so no
+move leaves the grid.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import boolean, float64, int64
+
+from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.types import FLAGS, INDICES, INTEGERS, LINKS, MATRIX, NOTHING, VECTOR, tuple_of
+
+# 16 headings whose directions are exact lattice vectors, so a straight move stays exactly on its line.
+_QUADRANT = np.array([(1, 0), (2, 1), (1, 1), (1, 2)], dtype=np.int64)
+_QUARTER_TURN = np.array([(0, 1), (-1, 0)], dtype=np.int64)
+DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
+ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
+HEADINGS = len(ANGLES)
+BORDER = 2  # cells, the length of the longest move
+
+
+def _moves() -> np.ndarray:
+    """Return the moves from each heading, (HEADINGS, 12, 3): rows of cells in x, cells in y, heading steps.
+
+    Forward and backward: straight, or with one heading step to either side, along the old or the new heading. Each of
+    these two is the reverse of the other, so the graph is symmetric. Then one heading step in place to either side.
+    """
+    table = []
+    for heading in range(HEADINGS):
+        rows = []
+        for mode in (1, -1):
+            rows.append((*(mode * DIRECTIONS[heading]), 0))
+            for change in (1, -1):
+                rows.append((*(mode * DIRECTIONS[heading]), change))
+                rows.append((*(mode * DIRECTIONS[(heading + change) % HEADINGS]), change))
+        table.append([*rows, (0, 0, 1), (0, 0, -1)])
+    return np.array(table, dtype=np.int64)
+
+
+MOVES = _moves()
+MOVES.flags.writeable = False
+# Number of buckets of the circular bucket queue, and number of buckets that cover the cost of the shortest path.
+BUCKETS, BUCKETS_PER_COST = 4096, 2000
+MAX_BUCKET_INDEX = 1e15  # before the conversion to an integer: costs deep in an obstacle may reach 1e40
+
+
+@kernel(int64(INDICES, LINKS, int64))
+def _dequeue(bucket, links, node):
+    """Remove a node from its bucket; return 1, or 0 if it is in none."""
+    index = links[node, 2]
+    if index < 0:
+        return 0
+    before, after = links[node, 0], links[node, 1]
+    if before >= 0:
+        links[before, 1] = after
+    else:
+        bucket[index] = after
+    if after >= 0:
+        links[after, 0] = before
+    links[node, 2] = -1
+    return 1
+
+
+@kernel(int64(INDICES, LINKS, int64, int64))
+def _enqueue(bucket, links, node, index):
+    """Move a node into a bucket; return the number of nodes by which the queue grew, 0 or 1.
+
+    The rows of `links` (nodes, 3) are the previous and the next node in the bucket's list, and the bucket; -1 for none.
+    """
+    grown = 1 - _dequeue(bucket, links, node)
+    head = bucket[index]
+    links[node, 0], links[node, 1], links[node, 2] = -1, head, index
+    if head >= 0:
+        links[head, 0] = node
+    bucket[index] = node
+    return grown
+
+
+class Metric(NamedTuple):
+    """The metric of the lattice.
+
+    Attributes:
+        speed: sqrt(2 (E + Phi)) on the half-cell grid, infinite where the robot cannot be.
+        cell: side of a cell (m).
+        speed_weight: weight of squared distances.
+        turn_weight: weight of squared changes of the heading.
+
+    """
+
+    speed: np.ndarray
+    cell: float
+    speed_weight: float
+    turn_weight: float
+
+
+class Nodes(NamedTuple):
+    """Nodes around the start or the goal.
+
+    Attributes:
+        nodes: (N,), indices.
+        costs: (N,), costs between the pose and the nodes.
+
+    """
+
+    nodes: np.ndarray
+    costs: np.ndarray
+
+
+class Limits(NamedTuple):
+    """Limits of the cost of the paths that `tree` finds.
+
+    Attributes:
+        reach: largest cost relative to the cost of the shortest path.
+        slack: cost added to that.
+        limit: largest cost; infinite if the cost of the shortest path is unknown.
+
+    """
+
+    reach: float
+    slack: float
+    limit: float
+
+
+METRIC = record_type(Metric, speed=MATRIX, cell=float64, speed_weight=float64, turn_weight=float64)
+NODES = record_type(Nodes, nodes=INTEGERS, costs=VECTOR)
+LIMITS = record_type(Limits, reach=float64, slack=float64, limit=float64)
+
+
+@kernel(VECTOR(METRIC, NODES))
+def plane_costs(metric, seeds):
+    """Return the cost from the seeds (cells) to every cell if rotation were free, a lower bound on the lattice.
+
+    This is a label-correcting search with a bucket queue; it gives the same costs as Dijkstra's algorithm.
+    """
+    speed = metric.speed
+    lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
+    size = (speed.shape[0] + 1) // 2 * lines
+    flat = speed.ravel()
+    cost = np.full(size, np.inf)
+    ahead, middle, length = np.empty(HEADINGS, np.int64), np.empty(HEADINGS, np.int64), np.empty(HEADINGS)
+    for k in range(HEADINGS):
+        dx, dy = DIRECTIONS[k, 0], DIRECTIONS[k, 1]
+        ahead[k], middle[k] = dx * lines + dy, dx * stride + dy
+        length[k] = math.sqrt(metric.speed_weight * (dx * dx + dy * dy)) * metric.cell / 6.0
+    min_speed = np.inf
+    for k in range(len(flat)):
+        min_speed = min(min_speed, flat[k])
+    width = 3.0 * min_speed * length[0]  # half of the cheapest edge
+    bucket = np.full(BUCKETS, -1, dtype=np.int32)
+    links = np.full((size, 3), -1, dtype=np.int32)
+    current, waiting = 0, 0
+    for k in range(len(seeds.nodes)):
+        node = seeds.nodes[k]
+        if seeds.costs[k] < cost[node]:
+            cost[node] = seeds.costs[k]
+            waiting += _enqueue(bucket, links, node, int(min(seeds.costs[k] / width, BUCKETS - 1.0)))
+    while waiting > 0:
+        node = bucket[current % BUCKETS]
+        if node < 0:
+            current += 1
+            continue
+        waiting -= _dequeue(bucket, links, node)
+        here = 2 * (node // lines) * stride + 2 * (node % lines)
+        for k in range(HEADINGS):
+            following = node + ahead[k]
+            edge = flat[here] + 4.0 * flat[here + middle[k]] + flat[here + 2 * middle[k]]
+            total = cost[node] + length[k] * edge
+            if total < cost[following]:
+                cost[following] = total
+                index = min(max(int(min(total / width, MAX_BUCKET_INDEX)), current), current + BUCKETS - 1)
+                waiting += _enqueue(bucket, links, following, index % BUCKETS)
+    return cost
+
+
+@kernel(tuple_of(VECTOR, INDICES, float64)(METRIC, NODES, NODES, VECTOR, boolean, LIMITS))
+def tree(metric, seeds, targets, rest, exact, limits):
+    """Compute the tree of shortest paths from the seeds by A* search with the lower bounds `rest`.
+
+    `rest` is a lower bound of the remaining cost to the targets, per cell, or per node if `exact`. Nodes are omitted if
+    the paths through them cost more than the limit. Once the cost of the best target is known, the limit is `reach`
+    times that cost plus `slack`.
+
+    Returns the cost of each node, its predecessor (-1 for none), and the limit.
+    """
+    speed, cell, speed_weight, turn_weight = metric.speed, metric.cell, metric.speed_weight, metric.turn_weight
+    reach, slack, limit = limits.reach, limits.slack, limits.limit
+    lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
+    flat = speed.ravel()
+    size = (speed.shape[0] + 1) // 2 * lines * HEADINGS
+    cost = np.full(size, np.inf)
+    parent = np.full(size, -1, dtype=np.int32)
+    arrival = np.full(size, np.inf)
+    for k in range(len(targets.nodes)):
+        arrival[targets.nodes[k]] = min(arrival[targets.nodes[k]], targets.costs[k])
+    count = MOVES.shape[1]
+    ahead, cells = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count), np.int64)
+    middle, length = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count))
+    for k in range(HEADINGS):
+        for move in range(count):
+            dx, dy, change = MOVES[k, move]
+            other = (k + change) % HEADINGS
+            turn = abs(ANGLES[other] - ANGLES[k])
+            turn = min(turn, 2.0 * math.pi - turn)
+            cells[k, move] = dx * lines + dy
+            ahead[k, move] = (dx * lines + dy) * HEADINGS + other - k
+            middle[k, move] = dx * stride + dy
+            square = speed_weight * (dx * dx + dy * dy) * cell * cell + turn_weight * turn * turn
+            length[k, move] = math.sqrt(square) / 6.0
+    first = np.inf
+    for k in range(len(seeds.nodes)):
+        node = seeds.nodes[k]
+        first = min(first, seeds.costs[k] + (rest[node] if exact else rest[node // HEADINGS]))
+    if first == np.inf:
+        return cost, parent, limit
+    # The order within a bucket is arbitrary: a node whose cost decreases later is queued again.
+    width = max(first, slack) / BUCKETS_PER_COST
+    bucket = np.full(BUCKETS, -1, dtype=np.int32)
+    links = np.full((size, 3), -1, dtype=np.int32)
+    current, waiting = 0, 0
+    for k in range(len(seeds.nodes)):
+        node = seeds.nodes[k]
+        bound = seeds.costs[k] + (rest[node] if exact else rest[node // HEADINGS])
+        # `rest` is infinite for a seed without a path to the targets, and so is the limit while it is unknown.
+        if seeds.costs[k] < cost[node] and bound <= limit and bound < np.inf:
+            cost[node] = seeds.costs[k]
+            waiting += _enqueue(bucket, links, node, int(min((bound - first) / width, BUCKETS - 1.0)))
+    best = np.inf
+    while waiting > 0:
+        node = bucket[current % BUCKETS]
+        if node < 0:
+            current += 1
+            continue
+        waiting -= _dequeue(bucket, links, node)
+        key = cost[node]
+        k = node % HEADINGS
+        position = node // HEADINGS
+        if key + (rest[node] if exact else rest[position]) > limit:
+            continue
+        if key + arrival[node] < best:
+            best = key + arrival[node]
+            limit = min(limit, reach * best + slack)
+        here = 2 * (position // lines) * stride + 2 * (position % lines)
+        for move in range(count):
+            following = node + ahead[k, move]
+            between = middle[k, move]
+            total = key + length[k, move] * (flat[here] + 4.0 * flat[here + between] + flat[here + 2 * between])
+            if total < cost[following]:
+                bound = total + (rest[following] if exact else rest[position + cells[k, move]])
+                if bound <= limit and bound < np.inf:
+                    cost[following] = total
+                    parent[following] = node
+                    # A node beyond the last bucket is put into the last bucket: it may be visited early, and is queued
+                    # again if its cost decreases later.
+                    index = min(
+                        max(int(min((bound - first) / width, MAX_BUCKET_INDEX)), current), current + BUCKETS - 1
+                    )
+                    waiting += _enqueue(bucket, links, following, index % BUCKETS)
+    return cost, parent, limit
+
+
+def meeting_nodes(
+    ahead: np.ndarray, behind: np.ndarray, cost_ahead: np.ndarray, cost_behind: np.ndarray, limit: float
+) -> np.ndarray:
+    """Return the nodes at which both trees share an edge, in order of the cost of the path through them, up to `limit`.
+
+    Only there the path through a node is locally shortest; through all other nodes it is a detour. (These nodes are the
+    plateaus of alternative routes: I. Abraham et al., Alternative Routes in Road Networks, J. Exp. Algorithmics, 2013.)
+    """
+    found, through = _shared_edges(ahead, behind, cost_ahead, cost_behind, limit)
+    return found[np.argsort(through, kind="quicksort")]
+
+
+@kernel(tuple_of(INTEGERS, VECTOR)(INDICES, INDICES, VECTOR, VECTOR, float64))
+def _shared_edges(ahead, behind, cost_ahead, cost_behind, limit):
+    """Return the nodes of `meeting_nodes`, unordered, and the costs of the paths through them."""
+    found = np.empty(len(ahead), dtype=np.int64)
+    through = np.empty(len(ahead))
+    count = 0
+    for node in range(len(ahead)):
+        total = cost_ahead[node] + cost_behind[node]
+        if total <= limit and (behind[node] < 0 or ahead[behind[node]] == node):
+            found[count], through[count] = node, total
+            count += 1
+    return found[:count], through[:count]
+
+
+@kernel(INTEGERS(int64, INDICES, INDICES))
+def path_through(node, ahead, behind):
+    """Return the nodes of the path through a node, from a seed of the tree `ahead` to a seed of the tree `behind`."""
+    before, after = 0, 0
+    at = node
+    while ahead[at] >= 0:
+        at = ahead[at]
+        before += 1
+    at = node
+    while behind[at] >= 0:
+        at = behind[at]
+        after += 1
+    path = np.empty(before + 1 + after, dtype=np.int64)
+    at = node
+    for k in range(before, -1, -1):
+        path[k] = at
+        at = ahead[at]
+    at = node
+    for k in range(before, before + after + 1):
+        path[k] = at
+        at = behind[at]
+    return path
+
+
+@kernel(NOTHING(FLAGS, INTEGERS, int64, int64, int64))
+def mark(marked, path, lines, cells, headings):
+    """Mark the nodes within `cells` in x and y and `headings` heading steps of a path."""
+    columns = len(marked) // (lines * HEADINGS)
+    for node in path:
+        i, j, k = node // (lines * HEADINGS), node // HEADINGS % lines, node % HEADINGS
+        for a in range(max(0, i - cells), min(columns, i + cells + 1)):
+            for b in range(max(0, j - cells), min(lines, j + cells + 1)):
+                for c in range(k - headings, k + headings + 1):
+                    marked[(a * lines + b) * HEADINGS + c % HEADINGS] = True
+
+
+@kernel(float64(VECTOR, VECTOR, float64))
+def energy_of(lengths, phi, horizon):
+    """Return E for which a path of given lengths and Phi takes the time `horizon`, by bisection on log E."""
+    low, high = math.log(1e-6), math.log(1e4)
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        energy = math.exp(middle)
+        duration = 0.0
+        for k in range(len(lengths)):
+            duration += lengths[k] / math.sqrt(2.0 * (energy + phi[k]))
+        if duration > horizon:
+            low = middle
+        else:
+            high = middle
+    return math.exp(0.5 * (low + high))
+
+
+LATTICE_KERNELS = (plane_costs, tree, _shared_edges, path_through, mark, energy_of)

@@ -1,0 +1,179 @@
+"""Solution of one optimal control problem by one method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from typing import Any, Literal
+
+import numpy as np
+
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.validation import check_at_least, check_choice, check_integer, check_positive
+from leapnav.experts.problem.certificate import failure
+from leapnav.experts.problem.extremal import Extremal, SolveError, Status
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
+from leapnav.experts.search.candidates import best_candidate
+from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.solvers.collocation import collocation
+from leapnav.experts.solvers.initial_paths import initial_paths
+from leapnav.experts.solvers.leapfrog import leapfrog
+from leapnav.experts.solvers.multiple_shooting import multiple_shooting
+from leapnav.experts.solvers.nodes import MIN_SEGMENTS, SolverOptions
+from leapnav.experts.solvers.single_shooting import single_shooting
+
+Method = Literal["single_shooting", "multiple_shooting", "leapfrog", "collocation"]
+METHODS: dict[str, Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal]] = {
+    "single_shooting": single_shooting,
+    "multiple_shooting": multiple_shooting,
+    "leapfrog": leapfrog,
+    "collocation": collocation,
+}
+# Without a guess, at most this number of initial paths is solved, until one costs more than the best by this fraction.
+MAX_INITIAL_PATHS, SIMILAR_COST = 4, 0.05
+POINTS_PER_SEGMENT = 8  # at which an extremal is sampled if it is the initial guess
+
+
+def solve(
+    problem: OptimalControlProblem | Scenario,
+    method: Method = "leapfrog",
+    guess: Trajectory | Extremal | None = None,
+    tol: float = 1e-9,
+    max_iterations: int = 60,
+    segments: int | None = None,
+    *,
+    polish: bool = True,
+    update: Literal["mean_time", "half_cost"] = "mean_time",
+    order: Literal["sequential", "red_black"] = "sequential",
+    raise_on_failure: bool = False,
+) -> Extremal:
+    """Solve the boundary value problem of the minimum principle for one certified extremal.
+
+    The result is an extremal close to the guess, not necessarily the global optimum; see `find_optimum`.
+
+    Args:
+        problem: an optimal control problem, or a scenario.
+        method: "leapfrog", "multiple_shooting", "single_shooting" or "collocation".
+        guess: a path, whose costates are estimated from its motion if it has none, or an extremal, possibly of a
+            problem with another horizon, goal or obstacle. None: for a scenario the best path of the lattice search;
+            for a problem the cheapest of several local minima over piecewise constant controls, including neighbouring
+            windings of the goal angles.
+        tol: largest residual of the boundary and continuity conditions. The certificate requires 1e-8 in any case.
+        max_iterations: maximum number of Newton steps.
+        segments: number of shooting segments, of Leapfrog segments or of intervals of the first collocation mesh. None
+            derives it from the guess, and lets multiple shooting subdivide segments where necessary.
+        polish: finish Leapfrog and collocation with multiple-shooting Newton steps, which is much faster. False:
+            Leapfrog removes nodes until one sub-problem spans the whole problem, and collocation iterates to `tol`.
+        update: where Leapfrog places a node on the extremal of its sub-problem: at the mean time of the neighbouring
+            nodes, or at half the cost.
+        order: order of the nodes in a Leapfrog sweep. "red_black" updates the nodes with odd index, which are
+            independent of each other, and then those with even index.
+        raise_on_failure: raise an exception instead of returning a failure.
+
+    Returns:
+        An `Extremal` whose status is based on its certificate.
+
+    Raises:
+        ValueError, TypeError: an argument is invalid; the message names it.
+        SolveError: no success with `raise_on_failure`; the attribute `extremal` is the failed result.
+
+    """
+    options = _options(method, tol, max_iterations, segments, polish, update, order)
+    ocp = as_problem(problem)
+    if guess is not None:
+        ocp, path, options = _from_guess(ocp, guess, options)
+        extremal = METHODS[method](ocp, path, options)
+    elif isinstance(problem, Scenario):
+        candidate = best_candidate(Lattice(problem))
+        if candidate is None:
+            extremal = failure(ocp, Status.NO_PATH)
+        else:
+            path = Trajectory(candidate.times, candidate.poses)
+            extremal = METHODS[method](ocp.with_winding_of(path.states), path, options)
+    else:
+        extremal = _without_guess(METHODS[method], ocp, options)
+    if raise_on_failure and not extremal.success:
+        raise SolveError(extremal, problem.name if isinstance(problem, Scenario) else "")
+    return extremal
+
+
+def _without_guess(
+    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    problem: OptimalControlProblem,
+    options: SolverOptions,
+) -> Extremal:
+    """The cheapest success from the best initial paths, or from the straight line if all others fail."""
+    best: Extremal | None = None
+    failed: list[Extremal] = []
+    for wound, path in islice(initial_paths(problem), MAX_INITIAL_PATHS):
+        extremal = solver(wound, path, options)
+        if not extremal.success:
+            failed.append(extremal)
+        elif best is None or extremal.cost < best.cost:
+            best = extremal
+        elif extremal.cost > best.cost + SIMILAR_COST * abs(best.cost):
+            break
+    if best is not None:
+        return best
+    line = problem.straight_line()
+    failed.append(solver(problem.with_winding_of(line.states), line, options))
+    if failed[-1].success:
+        return failed[-1]
+    # A failure that converged is more informative.
+    converged = [extremal for extremal in failed if extremal.status in (Status.CONJUGATE_POINT, Status.COLLISION)]
+    return (converged or failed)[0]
+
+
+def _from_guess(
+    problem: OptimalControlProblem, guess: Trajectory | Extremal, options: SolverOptions
+) -> tuple[OptimalControlProblem, Trajectory, SolverOptions]:
+    """Problem with the winding of the guess, initial path, and options."""
+    if isinstance(guess, Extremal):
+        if len(guess.times) == 0:
+            raise ValueError(f"guess: the extremal has no path: {guess.status.value}")
+        n, expected = guess.states.shape[1], problem.system.n
+        if n != expected:
+            raise ValueError(f"guess: the extremal has {n} states, the problem {expected}")
+        if options.segments is None and guess.n_nodes > 2:
+            options = replace(options, segments=guess.n_nodes - 1)
+        points = POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1
+        values = guess.interpolate(np.linspace(0.0, guess.times[-1], points))
+        # If the horizons differ, time is scaled.
+        path = Trajectory(np.linspace(0.0, problem.horizon, points), values[:, :n], values[:, n:])
+    elif isinstance(guess, Trajectory):
+        path = _check_path(guess, problem)
+    else:
+        raise TypeError(f"guess: expected a Trajectory or an Extremal, got {type(guess).__name__}")
+    return problem.with_winding_of(path.states), path, options
+
+
+def _options(
+    method: str, tol: float, max_iterations: int, segments: int | None, polish: bool, update: Any, order: Any
+) -> SolverOptions:
+    check_choice("method", method, METHODS)
+    check_positive("tol", tol)
+    check_at_least("max_iterations", max_iterations, 1)
+    if segments is not None:
+        segments = check_integer("segments", segments, 1)
+    check_choice("update", update, ("mean_time", "half_cost"))
+    check_choice("order", order, ("sequential", "red_black"))
+    return SolverOptions(tol, max_iterations, segments, polish, update, order)
+
+
+def _check_path(guess: Trajectory, problem: OptimalControlProblem) -> Trajectory:
+    """The guess as arrays of floats."""
+    n = problem.system.n
+    costates = None if guess.costates is None else np.asarray(guess.costates, dtype=float)
+    path = Trajectory(np.asarray(guess.times, dtype=float), np.asarray(guess.states, dtype=float), costates)
+    times = path.times
+    if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
+        raise ValueError("guess: its times must be an increasing array of at least two")
+    if abs(times[0]) > 1e-6 * problem.horizon or abs(times[-1] - problem.horizon) > 1e-6 * problem.horizon:
+        raise ValueError(f"guess: its times must run from 0 to {problem.horizon:g}, not {times[0]:g} to {times[-1]:g}")
+    for name, array in (("states", path.states), ("costates", path.costates)):
+        if array is not None and array.shape != (len(times), n):
+            raise ValueError(f"guess: its {name} must have shape {(len(times), n)}, got {array.shape}")
+        if array is not None and not np.isfinite(array).all():
+            raise ValueError(f"guess: its {name} are not finite")
+    return path

@@ -1,0 +1,1 @@
+"""Solvers of the boundary value problem of the minimum principle, one file per method."""

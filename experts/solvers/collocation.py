@@ -1,0 +1,108 @@
+"""Collocation with `scipy.integrate.solve_bvp`: three-stage Lobatto IIIA with residual control.
+
+J. Kierzenka and L. F. Shampine, A BVP solver based on residual control and the MATLAB PSE, ACM TOMS 27 (2001). It is
+called with the compiled flow, its analytic Jacobian, and costates that are consistent with the minimum principle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import int64
+from scipy.integrate import solve_bvp
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CUBE, MATRIX
+from leapnav.experts.numerics.flow import FLOW
+from leapnav.experts.problem.certificate import certify
+from leapnav.experts.problem.extremal import Extremal, Iteration, Status
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.solvers.multiple_shooting import confirm, polish
+from leapnav.experts.solvers.newton import set_identity
+from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
+
+# Tolerance if Newton's method follows. The error of the cubics decreases with the fourth power of the step only, so a
+# tight tolerance would need a fine mesh.
+COARSE_TOLERANCE = 1e-4
+MAX_NODES = 5_000
+MAX_POLISHED_SEGMENTS = 128
+# Exit codes of solve_bvp.
+STATUS = {0: Status.SUCCESS, 1: Status.MAX_ITERATIONS, 2: Status.SINGULAR, 3: Status.STALLED}
+
+
+def collocation(problem: OptimalControlProblem, path: Trajectory, options: SolverOptions) -> Extremal:
+    """Solve by collocation to `tol`, or with `polish` to a coarse tolerance followed by Newton's method."""
+    arrays, n = problem.arrays, problem.system.n
+    times, nodes = start_nodes(problem, path, options.segments or default_segments(path))
+    at_start = np.zeros((2 * n, 2 * n))
+    at_end = np.zeros((2 * n, 2 * n))
+    at_start[:n, :n] = np.eye(n)
+    end = np.arange(n) + np.where(arrays.free, n, 0)  # the costate of a free component vanishes
+    at_end[np.arange(n, 2 * n), end] = 1.0
+    goal = np.where(arrays.free, 0.0, arrays.goal)
+    evaluations = 0
+
+    def rates(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        out = np.empty((z.shape[1], 2 * n))
+        evaluations += _rates(arrays.flow, np.ascontiguousarray(z.T), out)
+        return out.T
+
+    def jacobians(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        out = np.empty((z.shape[1], 2 * n, 2 * n))
+        evaluations += _jacobians(arrays.flow, np.ascontiguousarray(z.T), out)
+        return out.transpose(1, 2, 0)
+
+    def ends(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        return np.concatenate([first[:n] - arrays.start, last[end] - goal])
+
+    tolerance = max(options.tol, COARSE_TOLERANCE) if options.polish else options.tol
+    with np.errstate(all="ignore"):  # solve_bvp detects diverging Newton steps itself
+        found = solve_bvp(
+            rates,
+            ends,
+            times,
+            nodes.T,
+            fun_jac=jacobians,
+            bc_jac=lambda *_: (at_start, at_end),
+            tol=tolerance,
+            max_nodes=MAX_NODES,
+        )
+    nodes = np.ascontiguousarray(found.y.T)
+    status = STATUS.get(found.status, Status.STALLED)
+    if not np.isfinite(nodes).all():
+        return certify(problem, times, start_nodes(problem, path, times)[1], Status.DIVERGED, (), evaluations)
+    residual = float(np.max(found.rms_residuals, initial=0.0))
+    history = (Iteration("collocation", len(found.x) - 1, _cost(problem, found.x, nodes), residual),)
+    if status is not Status.SUCCESS or not options.polish:
+        return certify(problem, found.x, nodes, status, history, evaluations)
+    # Every k-th node of the mesh, which solve_bvp refined where the path needs it.
+    every = -(-(len(found.x) - 1) // MAX_POLISHED_SEGMENTS)
+    chosen = np.unique(np.append(np.arange(0, len(found.x), every), len(found.x) - 1))
+    times, nodes = found.x[chosen], nodes[chosen]
+    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations)
+    return confirm(problem, times, nodes, status, (*history, *rows), evaluations + count, options)
+
+
+def _cost(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> float:
+    """Return J by the trapezoidal rule on the mesh, which is accurate enough for the history."""
+    return float(np.trapezoid([problem.arrays.running_cost(z) for z in nodes], times))
+
+
+@kernel(int64(FLOW, MATRIX, MATRIX))
+def _rates(flow, Z, out):
+    """Fill the derivatives (N, 2n) of the flow at Z (N, 2n); return the number of evaluations."""
+    none, d_none = np.empty((Z.shape[1], 0)), np.empty((Z.shape[1], 0))
+    for k in range(len(Z)):
+        flow.function(Z[k], flow.data, flow.field, none, out[k], d_none)
+    return len(Z)
+
+
+@kernel(int64(FLOW, MATRIX, CUBE))
+def _jacobians(flow, Z, out):
+    """Fill the Jacobians (N, 2n, 2n) of the flow at Z (N, 2n); return the number of evaluations."""
+    dz, identity = np.empty(Z.shape[1]), np.empty((Z.shape[1], Z.shape[1]))
+    set_identity(identity, 0)
+    for k in range(len(Z)):
+        flow.function(Z[k], flow.data, flow.field, identity, dz, out[k])
+    return len(Z)

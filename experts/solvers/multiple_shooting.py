@@ -1,0 +1,113 @@
+"""Multiple shooting: Newton's method on states and costates at all nodes, with a banded solver."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from leapnav.experts.numerics.flow import NewtonOptions
+from leapnav.experts.problem.certificate import certify
+from leapnav.experts.problem.extremal import Extremal, Iteration, Status
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.solvers.newton import MARGIN, segment_growth, solve_nodes
+from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
+from leapnav.experts.solvers.outcome import KERNEL_STATUS
+
+ACCURACY = 0.1  # tolerance of the integrator relative to the tolerance of Newton's method
+# Largest growth of the sensitivities over a segment; beyond it Newton's method loses half of its digits.
+MAX_GROWTH = 1e4
+MAX_PIECES = 8  # pieces into which a segment is divided
+PIECES_DIVERGED = 4  # pieces of a segment over which the flow diverged
+MAX_REFINEMENTS, MAX_SEGMENTS = 6, 20_000
+
+
+def multiple_shooting(problem: OptimalControlProblem, path: Trajectory, options: SolverOptions) -> Extremal:
+    """Solve by Newton's method on states and costates at all nodes.
+
+    If it fails, the segments over which the flow is too sensitive are divided, or all segments if there are none, and
+    Newton's method starts again from the same path.
+    """
+    times, nodes = start_nodes(problem, path, options.segments or default_segments(path))
+    status, history, evaluations = polish(problem, times, nodes, options.tol, options.max_iterations)
+    for _ in range(MAX_REFINEMENTS):
+        if status is Status.SUCCESS or options.segments is not None:
+            break
+        times, count = _refine(problem, path, times)
+        evaluations += count
+        if len(times) > MAX_SEGMENTS:
+            break
+        times, nodes = start_nodes(problem, path, times)
+        status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations)
+        history += rows
+        evaluations += count
+    return confirm(problem, times, nodes, status, history, evaluations, options)
+
+
+def confirm(
+    problem: OptimalControlProblem,
+    times: np.ndarray,
+    nodes: np.ndarray,
+    status: Status,
+    history: tuple[Iteration, ...],
+    evaluations: int,
+    options: SolverOptions,
+) -> Extremal:
+    """Certify nodes; if the certificate does not confirm a predicted residual, continue Newton's method."""
+    extremal = certify(problem, times, nodes, status, history, evaluations)
+    if extremal.status is not Status.NOT_CERTIFIED:
+        return extremal
+    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations, predict=False)
+    return certify(problem, times, nodes, status, history + rows, evaluations + count)
+
+
+def polish(
+    problem: OptimalControlProblem,
+    times: np.ndarray,
+    nodes: np.ndarray,
+    tol: float,
+    max_iterations: int,
+    predict: bool = True,
+) -> tuple[Status, tuple[Iteration, ...], int]:
+    """Apply Newton's method of multiple shooting to nodes, in place.
+
+    Args:
+        problem: the problem.
+        times: (segments + 1,), s.
+        nodes: (segments + 1, 2n), changed in place.
+        tol: largest residual.
+        max_iterations: largest index of Newton steps.
+        predict: whether the evaluation of the last iterate may be skipped if quadratic convergence predicts its
+            residual.
+
+    Returns:
+        Status, one `Iteration` per iterate, and the index of evaluations of the flow.
+
+    """
+    arrays = problem.arrays
+    costs = np.empty(len(times) - 1)
+    log = np.zeros((max_iterations + 1, 3))
+    newton = NewtonOptions(MARGIN * tol, MARGIN * tol * ACCURACY, max_iterations, predict)
+    code, iterations, _, evaluations = solve_nodes(
+        arrays.flow, times, nodes, arrays.start, arrays.end, newton, costs, log
+    )
+    rows = tuple(Iteration("newton", len(costs), row[1], row[0]) for row in log[: iterations + 1].tolist())
+    return KERNEL_STATUS[code], rows, evaluations
+
+
+def _refine(problem: OptimalControlProblem, path: Trajectory, times: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the times of more nodes, and the evaluations of the flow.
+
+    Segments over which the flow from the path's nodes is too sensitive are divided, or all segments in two if there are
+    none.
+    """
+    times, nodes = start_nodes(problem, path, times)
+    growth = np.empty(len(times) - 1)
+    evaluations = segment_growth(problem.arrays.flow, times, nodes, growth)
+    # The growth is exponential in time, so the index of pieces is proportional to its logarithm.
+    with np.errstate(divide="ignore"):
+        needed = np.ceil(np.log(growth) / np.log(MAX_GROWTH))
+    pieces = np.where(np.isfinite(growth), needed, PIECES_DIVERGED).clip(1, MAX_PIECES).astype(int)
+    if pieces.max() == 1:
+        pieces[:] = 2
+    first = np.repeat(times[:-1], pieces)
+    index = np.concatenate([np.arange(count) for count in pieces])
+    return np.append(first + index * np.repeat(np.diff(times) / pieces, pieces), times[-1]), evaluations

@@ -1,0 +1,64 @@
+"""Options of the solvers, and their initial nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+
+MIN_SEGMENTS, MAX_SEGMENTS = 8, 128  # by default
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Options of a solver.
+
+    Attributes:
+        tol: largest residual of the boundary and continuity conditions.
+        max_iterations: largest number of Newton steps.
+        segments: number of shooting segments; None chooses it from the guess.
+        polish: whether Leapfrog and collocation end with multiple-shooting Newton steps.
+        update: where Leapfrog moves a node on the extremal of its sub-problem, at the mean time or at half the cost.
+        order: order of the nodes in a Leapfrog sweep; "red_black" moves the odd nodes before the resampled nodes.
+
+    """
+
+    tol: float = 1e-9
+    max_iterations: int = 60
+    segments: int | None = None
+    polish: bool = True
+    update: Literal["mean_time", "half_cost"] = "mean_time"
+    order: Literal["sequential", "red_black"] = "sequential"
+
+
+def start_nodes(
+    problem: OptimalControlProblem, path: Trajectory, segments: int | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return initial nodes on a path, with both boundary conditions met exactly.
+
+    Args:
+        problem: the problem.
+        path: the path; its costates are estimated if it has none.
+        segments: number of segments of equal duration, or the times (segments + 1,) of the nodes.
+
+    Returns:
+        Times (segments + 1,) and nodes (segments + 1, 2n).
+
+    """
+    times = np.linspace(0.0, problem.horizon, segments + 1) if isinstance(segments, int) else segments
+    resampled = path.resample(times)
+    costates = resampled.costates if resampled.costates is not None else problem.estimate_costates(resampled)
+    arrays = problem.arrays
+    nodes = np.concatenate([resampled.states, costates], axis=1)
+    n = problem.system.n
+    nodes[0, :n] = arrays.start
+    nodes[-1, :n] = np.where(arrays.free, nodes[-1, :n], arrays.goal)
+    return times, nodes
+
+
+def default_segments(path: Trajectory) -> int:
+    """Return the larger of one segment per 0.5 s and one per two points of a lattice path (0.4 to 0.7 m)."""
+    return int(np.clip(max(len(path.times) / 2, path.times[-1] / 0.5), MIN_SEGMENTS, MAX_SEGMENTS))

@@ -1,0 +1,1 @@
+"""The commands of `leapnav`, one module per command."""

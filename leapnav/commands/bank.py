@@ -1,0 +1,169 @@
+"""`leapnav bank build` and `leapnav bank show`: scenario banks."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from leapnav.outputs import FAILED, check_outputs, write_json
+
+if TYPE_CHECKING:
+    from leapnav.envs.scenarios.bank import ScenarioBank
+
+# Fraction of the reference cost. Smaller differences between two searches are not reported.
+MIN_IMPROVEMENT = 1e-3
+
+
+@dataclass(frozen=True)
+class Build:
+    """Sample scenarios, find their optima, and write those with an unambiguous certificate to a bank.
+
+    The same command resumes an interrupted build.
+    """
+
+    out: Path
+    """Output file of the bank."""
+    family: str = "clutter"
+    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
+    count: int = 1000
+    """Number of scenarios in the bank."""
+    seed: int = 0
+    """Seed of the bank; the shipped banks have 0 (training) and 1 (test)."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes; the bank does not depend on it."""
+    json: Path | None = None
+    """JSON file of the numbers of sampled and of rejected scenarios; "-" for standard output."""
+
+    def run(self) -> int:
+        """Build the bank."""
+        check_outputs(self.json)
+        from leapnav.experts.data.banks import build_bank
+
+        bank = build_bank(self.family, self.count, self.out, seed=self.seed, workers=self.workers)
+        rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
+        print(f"wrote {self.out}: {len(bank)} of {bank.drawn} sampled scenarios{f' ({rejected})' if rejected else ''}")
+        summary = {"scenarios": len(bank), "drawn": bank.drawn, "rejected": dict(bank.rejected)}
+        write_json({"bank": str(self.out), **summary}, self.json)
+        return 0
+
+
+@dataclass(frozen=True)
+class Show:
+    """Print a summary of a bank, draw scenarios with their optima, and optionally search all of them again.
+
+    Exit code 1: --verify found a lower cost.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Bank file, or the name of a shipped bank, for example rooms-test."""
+    plot: Path | None = None
+    """Picture of the scenarios (.png, .pdf or .svg); by default the bank's name with .png in the current directory."""
+    count: int = 24
+    """Number of scenarios in the picture, evenly spaced in the bank; 0 for no picture."""
+    verify: bool = False
+    """Search every scenario again with about 100 times the effort (seconds each) and report lower costs."""
+    json: Path | None = None
+    """JSON file of name, cost, horizon (s) and clearance (m) of every scenario, and of the results of --verify; "-" for
+    standard output."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes of --verify."""
+
+    def run(self) -> int:
+        """Print the summary, draw the picture and, with `verify`, search again."""
+        from leapnav.envs.scenarios.bank import BANK_DIRECTORY, ScenarioBank
+        from leapnav.envs.utils.validation import check_at_least
+        from leapnav.experts.plotting import plot_bank
+
+        shipped = BANK_DIRECTORY / f"{self.file}.bank"
+        bank = ScenarioBank(shipped if not self.file.exists() and shipped.exists() else self.file)
+        plot = self.plot or Path(bank.path.with_suffix(".png").name)
+        check_at_least("count", self.count, 0)
+        check_outputs(self.json, plot)
+        _print_summary(bank)
+        if self.count > 0:
+            plot_bank(bank, plot, self.count)
+            print(f"wrote {plot}")
+        rows = [
+            {"name": scenario.name, "cost": float(cost), "horizon": scenario.horizon, "clearance": float(clearance)}
+            for scenario, cost, clearance in zip(bank, bank.costs, bank.certificates[:, 3], strict=True)
+        ]
+        code = self._verify(bank, rows) if self.verify else 0
+        write_json(rows, self.json)
+        return code
+
+    def _verify(self, bank: ScenarioBank, rows: list[dict[str, Any]]) -> int:
+        """Search again, print lower costs, and add the results to the rows."""
+        from leapnav.experts.second_opinion import verify_bank
+
+        opinions = verify_bank(bank, workers=self.workers)
+        improved = [opinion for opinion in opinions if opinion.improvement > MIN_IMPROVEMENT]
+        for opinion in improved:
+            print(
+                f"{opinion.name}: J = {opinion.best:.6g} instead of {opinion.cost:.6g} "
+                f"({100 * opinion.improvement:.2f} % lower), from {opinion.source}"
+            )
+        tried = sum(opinion.tried for opinion in opinions) / len(opinions)
+        print(
+            f"cost lower by more than {100 * MIN_IMPROVEMENT:g} % in {len(improved)} of {len(bank)} scenarios "
+            f"({tried:.0f} paths tried in each)"
+        )
+        doubtful = sum(bool(opinion.doubts) for opinion in opinions)
+        print(f"scenarios with new solutions of lower cost that collide or are not certified: {doubtful}")
+        found = {opinion.name: asdict(opinion) for opinion in opinions}
+        for row in rows:
+            row.update(found[row["name"]])
+        return FAILED if improved else 0
+
+
+@dataclass(frozen=True)
+class Bank:
+    """Build and inspect scenario banks: files of scenarios with their certified optima."""
+
+    action: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Show, tyro.conf.subcommand("show")]
+    ]
+
+    @property
+    def json(self) -> Path | None:
+        """The JSON file of the action."""
+        return self.action.json
+
+    def run(self) -> int:
+        """Build or show a bank."""
+        return self.action.run()
+
+
+def _print_summary(bank: ScenarioBank) -> None:
+    import numpy as np
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    residual, defect, drift, _ = bank.certificates.max(axis=0)
+    horizons = np.array([scenario.horizon for scenario in bank])
+    excess = bank.second_costs / bank.costs - 1
+    print(f"{bank.path}: {len(bank)} scenarios of {bank.family}, seed {bank.seed}, leapnav {bank.software}")
+    print(f"  sampled            {bank.drawn}")
+    for reason, count in bank.rejected.items():
+        print(f"  rejected           {count} ({reason})")
+    print(f"  maximum residual   {residual:.1e}")
+    print(f"  maximum defect     {defect:.1e}")
+    print(f"  maximum drift of H {drift:.1e}")
+    print(f"  with alternatives  {np.isfinite(excess).sum()}")
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for column in ("", "minimum", "median", "maximum"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for name, values, scale in (
+        ("J*", bank.costs, 1),
+        ("horizon (s)", horizons, 1),
+        ("clearance (m)", bank.certificates[:, 3], 1),
+        ("excess cost of the second best (%)", excess[np.isfinite(excess)], 100),
+    ):
+        if len(values):
+            row = scale * np.percentile(values, [0, 50, 100])
+            table.add_row(name, *(f"{value:.3g}" for value in row))
+    Console().print(table)

@@ -1,0 +1,79 @@
+"""`leapnav evaluate`: scores of policies against the optimum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from leapnav.outputs import check_outputs, write_json
+
+if TYPE_CHECKING:
+    from leapnav.envs.scenarios.bank import ScenarioBank
+
+POLICIES = """Policies: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of a
+shipped policy (a family, or "all"). Runs that differ only in their seed share a row, and so do policies with the same
+LABEL=."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score policies side by side against the optimum, on scenarios that were not used for training."""
+
+    policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
+    family: str = "clutter"
+    """Family of the scenarios: open, clutter, polygons, rooms, slalom, or all of them."""
+    split: Literal["test", "train"] = "test"
+    """Split of the shipped banks."""
+    bank: Path | None = None
+    """Bank file to use instead, from `leapnav bank build`."""
+    count: int | None = None
+    """Number of scenarios per family; by default all."""
+    seed: int = 0
+    """Seed of the bootstrap intervals and of the random policy."""
+    json: Path | None = None
+    """JSON file of the table and of every episode; "-" for standard output."""
+    plot: Path | None = None
+    """Picture of the scores and the performance profiles (.png, .pdf or .svg)."""
+    episodes_plot: Path | None = None
+    """Picture of the first policy's best, median and worst episodes, with their optima (.png, .pdf or .svg)."""
+
+    def run(self) -> int:
+        """Play the episodes and report the scores."""
+        from leapnav.envs.utils.validation import check_at_least
+        from leapnav.training.scoring.comparison import compare_policies
+        from leapnav.training.scoring.policy_specs import load_policy_spec
+        from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores, scores_to_dict
+
+        if not self.policies:
+            raise ValueError("policies: expected at least one: expert, random, go-to-goal or a directory; got none")
+        if self.count is not None:
+            check_at_least("count", self.count, 1)
+        for plot in (self.plot, self.episodes_plot):
+            check_outputs(self.json, plot)
+        # All are loaded before the first episode, so that a damaged file is reported at once.
+        specs = [load_policy_spec(name, seed=self.seed) for name in self.policies]
+        comparison = compare_policies(specs, self._banks(), count=self.count, seed=self.seed)
+        print_scores(comparison)
+        if self.json is not None:
+            write_json(scores_to_dict(comparison), self.json)
+        if self.plot is not None:
+            plot_scores(comparison, self.plot)
+            print(f"wrote {self.plot}")
+        if self.episodes_plot is not None:
+            first = next(iter(comparison.runs.values()))
+            plot_episodes(comparison.banks, first[0].episodes, self.episodes_plot)
+            print(f"wrote {self.episodes_plot}")
+        return 0
+
+    def _banks(self) -> list[ScenarioBank]:
+        from leapnav.envs.scenarios.bank import ScenarioBank
+        from leapnav.envs.scenarios.families import ALL, FAMILIES, check_family
+
+        if self.bank is not None:
+            return [ScenarioBank(self.bank)]
+        check_family(self.family)
+        families = FAMILIES if self.family == ALL else (self.family,)
+        return [ScenarioBank.shipped(family, self.split) for family in families]

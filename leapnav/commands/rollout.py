@@ -1,0 +1,82 @@
+"""`leapnav rollout`: datasets of demonstrations."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from leapnav.outputs import FAILED, check_outputs, write_json
+
+# Maximum deviation of a replay: other versions of the libraries may round the last digits differently.
+REPLAY_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Sample scenarios, find their optima, drive them in the environment, and write a Minari dataset.
+
+    The same command resumes an interrupted rollout.
+    """
+
+    out: Path
+    """Output directory of the dataset."""
+    family: str = "clutter"
+    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
+    count: int = 100
+    """Number of scenarios."""
+    seed: int = 1000
+    """First scenario seed: scenario i has seed SEED + i. At least 2, because the shipped banks have seeds 0 and 1."""
+    recoveries: int = 0
+    """Number of recoveries per scenario: demonstrations from states pushed off the optimum."""
+    noise: float = 0.0
+    """Standard deviation of the noise on the executed actions; the recorded ones are the expert's, in closed loop."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes; the dataset does not depend on it."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
+    force: bool = False
+    """Replace an existing dataset or unfinished rollout in the output directory."""
+    check: bool = False
+    """Replay the existing dataset and report the maximum deviation; exit code 1 if it is above 1e-6."""
+    json: Path | None = None
+    """JSON file of the summary, or of the result of --check; "-" for standard output."""
+
+    def run(self) -> int:
+        """Write the dataset, or check it."""
+        check_outputs(self.json)
+        if self.check:
+            return self._check()
+        from leapnav.experts.data.demonstrations import dataset_id
+        from leapnav.experts.data.rollouts import rollout
+
+        summary = rollout(
+            self.family,
+            self.count,
+            self.out,
+            seed=self.seed,
+            recoveries=self.recoveries,
+            noise=self.noise,
+            workers=self.workers,
+            dask=self.dask,
+            force=self.force,
+        )
+        print(
+            f"wrote {self.out}: {summary.demonstrations} demonstrations, {summary.steps} environment steps "
+            f"({summary.unsolved} scenarios without a certified optimum and "
+            f"{summary.failed_replays} failed replays left out)"
+        )
+        print(f"load it with minari.load_dataset({dataset_id(self.family)!r}) and MINARI_DATASETS_PATH={self.out}")
+        write_json(asdict(summary), self.json)
+        return 0
+
+    def _check(self) -> int:
+        from leapnav.experts.data.rollouts import check_dataset
+
+        replay = check_dataset(self.out)
+        print(
+            f"{self.out}: {replay.episodes} episodes replayed; maximum deviation of observations "
+            f"{replay.observation:.1e}, rewards {replay.reward:.1e}, states {replay.state:.1e} (episode {replay.worst})"
+        )
+        write_json(asdict(replay), self.json)
+        return 0 if max(replay.observation, replay.reward, replay.state) <= REPLAY_TOLERANCE else FAILED

@@ -1,0 +1,160 @@
+"""`leapnav solve`: solutions of one scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import tyro
+
+from leapnav.outputs import FAILED, check_outputs, write_json
+
+if TYPE_CHECKING:
+    from leapnav.envs.scenarios.scenario import Scenario
+    from leapnav.experts import Extremal, Optimum
+
+
+@dataclass(frozen=True)
+class Solve:
+    """Find the optimum of a scenario, solve it with one method, or compare the methods.
+
+    Exit code 0: certified; 1: no certified solution; 2: invalid input.
+    """
+
+    scenario: tyro.conf.Positional[Path]
+    """Scenario file (JSON)."""
+    method: Literal["optimum", "leapfrog", "multiple_shooting", "single_shooting", "collocation", "all"] = "optimum"
+    """Method: "optimum" searches globally; the others solve from the best path of the lattice search; "all" compares
+    them."""
+    plot: Path | None = None
+    """Picture of the solution (.png, .pdf or .svg); with "all", of the certified one of lowest cost."""
+    json: Path | None = None
+    """JSON file of the solution (cost, certificate, states, controls, costates, history), with "all" of one per method;
+    "-" for standard output."""
+
+    def run(self) -> int:
+        """Solve and report."""
+        from leapnav.envs.scenarios.scenario import Scenario
+
+        scenario = Scenario.from_json(self.scenario)
+        check_outputs(self.json, self.plot)
+        return self._compare(scenario) if self.method == "all" else self._solve(scenario)
+
+    def _solve(self, scenario: Scenario) -> int:
+        from leapnav.experts import Optimum, find_optimum, solve
+
+        assert self.method != "all"
+        extremal = find_optimum(scenario) if self.method == "optimum" else solve(scenario, method=self.method)
+        print(f"{scenario.name}: {extremal.status.name}: {extremal.status.value}")
+        certificate = extremal.certificate
+        if certificate is not None:
+            conjugate = certificate.conjugate_point
+            print(f"  cost               {extremal.cost:.9f}")
+            print(f"  residual           {certificate.residual:.1e}")
+            print(f"  defect             {certificate.defect:.1e}")
+            print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")
+            print(f"  conjugate point    {'none' if conjugate is None else f'{conjugate:.3f} s'}")
+            print(f"  clearance          {certificate.clearance:.3f} m")
+            scope = " (of the best candidate only)" if self.method == "optimum" else ""
+            print(f"  iterations         {len(extremal.history)}{scope}")
+            print(f"  evaluations        {extremal.n_evaluations}{scope}")
+        if isinstance(extremal, Optimum) and extremal.success:
+            _print_alternatives(extremal)
+        self._write(scenario, extremal, extremal.to_dict())
+        return 0 if extremal.success else FAILED
+
+    def _compare(self, scenario: Scenario) -> int:
+        extremals = _solve_by_all_methods(scenario)
+        best = min(extremals.values(), key=lambda extremal: (not extremal.success, extremal.cost))
+        content = {method: extremal.to_dict() for method, extremal in extremals.items()}
+        self._write(scenario, best if best.success else None, content)
+        return 0 if best.success else FAILED
+
+    def _write(self, scenario: Scenario, extremal: Extremal | None, content: dict[str, Any]) -> None:
+        from leapnav.experts.plotting import plot_extremal
+
+        write_json(content, self.json)
+        if self.plot is not None and extremal is not None and len(extremal.times):
+            plot_extremal(extremal, self.plot, scenario)
+            print(f"wrote {self.plot}")
+
+
+def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
+    """Solve by every method from the same initial guess, and print the results side by side."""
+    from leapnav.experts import OptimalControlProblem, Status, Trajectory, solve
+    from leapnav.experts.problem.certificate import failure
+    from leapnav.experts.search.candidates import best_candidate
+    from leapnav.experts.search.lattice import Lattice
+    from leapnav.experts.solve import Method
+
+    candidate = best_candidate(Lattice(scenario))
+    if candidate is None:
+        print(f"{scenario.name}: {Status.NO_PATH.name}: {Status.NO_PATH.value}")
+        return dict.fromkeys(get_args(Method), failure(OptimalControlProblem.from_scenario(scenario), Status.NO_PATH))
+    guess = Trajectory(candidate.times, candidate.poses)
+    extremals, seconds = {}, {}
+    for method in get_args(Method):
+        # The first solve loads or compiles the kernels, so that the second one measures the method alone.
+        solve(scenario, method=method, guess=guess)
+        start = perf_counter()
+        extremals[method] = solve(scenario, method=method, guess=guess)
+        seconds[method] = perf_counter() - start
+    print(f"{scenario.name}: every method from the best path of the lattice search")
+    _print_comparison(extremals, seconds)
+    for method, extremal in extremals.items():
+        if not extremal.success:
+            print(f"{method}: {extremal.status.value}")
+    return extremals
+
+
+def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, float]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    table.add_column("status", overflow="fold")
+    for column in ("cost", "residual", "itera-\ntions", "evalu-\nations", "time\nms"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for method, extremal in extremals.items():
+        certificate = extremal.certificate
+        table.add_row(
+            method,
+            extremal.status.name,
+            "-" if certificate is None else f"{extremal.cost:.9g}",
+            "-" if certificate is None else f"{max(certificate.residual, certificate.defect):.1e}",
+            str(len(extremal.history)),
+            str(extremal.n_evaluations),
+            f"{1000 * seconds[method]:.1f}",
+        )
+    Console().print(table)
+
+
+def _print_alternatives(optimum: Optimum) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    for doubt in optimum.doubts:
+        print(f"  not certified      J = {doubt.cost:.6g} was also found: {doubt.status.value}")
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for column in ("cost", "excess", "winding", "clearance"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("driving", overflow="fold")
+    table.add_column("sides", overflow="fold")
+    for extremal in (optimum, *optimum.alternatives):
+        clearance = extremal.certificate.clearance if extremal.certificate is not None else None
+        table.add_row(
+            f"{extremal.cost:.6f}",
+            f"{100 * (extremal.cost / optimum.cost - 1):.2f} %" if optimum.cost > 0 else "-",
+            f"{extremal.heading_winding:+d}" if extremal.heading_winding else "0",
+            "-" if clearance is None else f"{clearance:.3f} m",
+            ", ".join(extremal.driving_modes) or "rotate in place",
+            "".join(side[0].upper() for side in extremal.path_class) or "-",
+        )
+    print("Local optima (excess: cost above the optimum; sides: Left or Right of the path, for each obstacle)")
+    Console().print(table)

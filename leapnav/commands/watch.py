@@ -1,0 +1,133 @@
+"""`leapnav watch`: episodes of a policy, in a window or as a video."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from leapnav.outputs import check_outputs, write_json
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Watch a policy drive beside the optimum (the orange line), in a window or as a video."""
+
+    policy: str = "expert"
+    """Policy: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of a shipped
+    policy."""
+    family: str = "clutter"
+    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
+    split: Literal["train", "test", "fresh"] = "test"
+    """Split of the shipped banks, or "fresh" for newly sampled scenarios."""
+    index: int | None = None
+    """Index of the first scenario in the bank; the next episodes play the next ones. By default random scenarios."""
+    episodes: int = 3
+    """Number of episodes."""
+    seed: int = 0
+    """Seed of the choice of scenarios, of the disturbances and of the random policy."""
+    actuation: Literal["velocity", "motor"] = "velocity"
+    """Actuation of the robot."""
+    disturbance: float = 0.0
+    """Standard deviation of the noise on motion and sensing; see the documentation of the environment."""
+    video: Path | None = None
+    """Video file (.mp4) to write instead of opening a window."""
+    json: Path | None = None
+    """JSON file of the results of the episodes; "-" for standard output."""
+
+    def run(self) -> int:
+        """Play the episodes."""
+        from leapnav.envs.utils.validation import check_at_least
+
+        check_at_least("episodes", self.episodes, 1)
+        if self.index is not None and self.split == "fresh":
+            raise ValueError(f"index: fresh scenarios have no index, got {self.index}; use --split train or test")
+        check_outputs(self.json, video=self.video)
+        if self.video is not None:
+            return self._record(self.video)
+        import pygame
+
+        # SDL falls back to drivers without a display; then nothing would appear.
+        pygame.display.init()
+        if pygame.display.get_driver() in ("dummy", "offscreen") and "SDL_VIDEODRIVER" not in os.environ:
+            raise OSError("no display for a window; --video FILE.mp4 writes a video instead")
+        env = self._make("human")
+        try:
+            self._play(env)
+        finally:
+            env.close()
+        return 0
+
+    def _record(self, video: Path) -> int:
+        import tempfile
+
+        from gymnasium.error import DependencyNotInstalled
+        from gymnasium.wrappers import RecordVideo
+
+        with tempfile.TemporaryDirectory(dir=video.absolute().parent, prefix=".leapnav-watch-") as directory:
+            try:
+                env = RecordVideo(
+                    self._make("rgb_array"),
+                    str(Path(directory) / "videos"),
+                    step_trigger=lambda step: step == 0,
+                    video_length=2**62,  # all episodes in one video, until the environment is closed
+                    name_prefix="watch",
+                    disable_logger=True,
+                )
+            except DependencyNotInstalled:
+                raise OSError('a video needs moviepy: pip install "leapnav[video]"') from None
+            try:
+                self._play(env)
+            finally:
+                env.close()
+            written = next(Path(directory).glob("videos/*.mp4"))
+            written.replace(video)
+        print(f"wrote {video}")
+        return 0
+
+    def _make(self, render_mode: str) -> gym.Env[Any, Any]:
+        import gymnasium as gym
+
+        from leapnav.training.policies.files import policy_environment
+        from leapnav.training.scoring.policy_specs import BASELINES
+
+        sensors = {} if self.policy in BASELINES else policy_environment(self.policy)
+        arguments = {**sensors, "actuation": self.actuation, "disturbance": self.disturbance}
+        return gym.make(
+            "leapnav/Navigate-v0", family=self.family, split=self.split, render_mode=render_mode, **arguments
+        )
+
+    def _play(self, env: gym.Env[Any, Any]) -> None:
+        """Play and report the episodes, until the window is closed."""
+        from leapnav.envs.episodes import act_with, play_episode
+        from leapnav.envs.navigation import NavigateEnv
+        from leapnav.envs.unwrapping import unwrap
+        from leapnav.training.scoring.policy_specs import make_policy_from_spec
+
+        (inner,) = unwrap(env)
+        assert isinstance(inner, NavigateEnv)
+        last = None if self.index is None else self.index + self.episodes - 1
+        if last is not None and inner.bank is not None and not 0 <= last - self.episodes + 1 <= last < len(inner.bank):
+            raise ValueError(f"index: the bank has scenarios 0 to {len(inner.bank) - 1}, got {self.index} to {last}")
+        policy, results = make_policy_from_spec(self.policy, env, seed=self.seed), []
+        for episode in range(self.episodes):
+            options = None if self.index is None or inner.bank is None else {"index": self.index + episode}
+            seed = self.seed if episode == 0 else None
+            _, info, steps = play_episode(env, act_with(policy), seed=seed, options=options)
+            scenario, reference = info["scenario"].name, info.get("reference_cost")
+            for step in steps:
+                info = step.info
+                if inner.window_closed:
+                    break
+            if inner.window_closed:
+                break
+            result = "success" if info["is_success"] else "collision" if info["collision"] else "missed the goal"
+            optimum = "" if reference is None else f", optimum {reference:.3f}"
+            print(f"{scenario}: {result} after {info['time']:.1f} s, cost {info['cost']:.3f}{optimum}")
+            measured = {name: float(info[name]) for name in ("time", "cost")}
+            results.append({"scenario": scenario, "result": result, **measured, "reference_cost": reference})
+        write_json(results, self.json)

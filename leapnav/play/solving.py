@@ -1,0 +1,188 @@
+"""The computations behind the page of `leapnav play`, with results as plain numbers: optima, sweeps, policy paths."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections import OrderedDict
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import check_family
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.utils.validation import check_choice, check_integer
+from leapnav.experts.optimum import Optimum, as_optimum, find_optimum
+from leapnav.experts.problem.extremal import Extremal
+from leapnav.experts.solve import solve
+from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
+
+OPTIMUM_POINTS, OTHER_POINTS = 201, 101  # of the optimum, and of each alternative and sweep
+MAX_STORED = 64  # optima that can be initial guesses of a request
+MAX_DRIVE_HORIZON = 300.0  # s
+FOLLOW_CANDIDATES = 6  # of the short search while the user drags
+MAX_SWEEPS, FIRST_SWEEPS = 40, 16  # sent to the page; the first ones are sent without omissions
+
+
+class PlaySolver:
+    """Solves the scenarios of the page, one request at a time.
+
+    Args:
+        policies: names of the policies that may drive, see `leapnav.training.scoring.policy_specs`.
+
+    """
+
+    def __init__(self, policies: Sequence[str]) -> None:
+        self.policies = tuple(policies)
+        self._stored: OrderedDict[str, Extremal] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def follow(self, scenario: Scenario, previous: str | None) -> dict[str, Any]:
+        """Return a local optimum while the user drags.
+
+        It is re-solved from a previous one. If that fails, a short search follows.
+
+        Args:
+            scenario: the changed scenario.
+            previous: `id` of an earlier result, or None.
+
+        """
+        with self._lock:
+            start = perf_counter()
+            guess = self._stored.get(previous or "")
+            found = None if guess is None else solve(scenario, method="multiple_shooting", guess=guess)
+            if found is not None and found.success:
+                return {**self._describe(scenario, found, start), "searched": False}
+            found = find_optimum(scenario, FOLLOW_CANDIDATES, thorough=False)
+            return {**self._describe(scenario, found, start), "searched": True}
+
+    def search(self, scenario: Scenario) -> dict[str, Any]:
+        """Return the optimum and its alternatives, from the full search."""
+        with self._lock:
+            start = perf_counter()
+            return {**self._describe(scenario, find_optimum(scenario), start), "searched": True}
+
+    def sweeps(self, scenario: Scenario) -> dict[str, Any]:
+        """Return Leapfrog's feasible paths, from the best path of the lattice search to the extremal."""
+        with self._lock:
+            extremal = solve(scenario, method="leapfrog", polish=False)
+        rows = [row for row in extremal.history if row.times is not None]
+        sweeps = []
+        for index in select_sweeps(len(rows), FIRST_SWEEPS, MAX_SWEEPS):
+            times, nodes = rows[index].times, rows[index].nodes
+            assert times is not None and nodes is not None
+            _, states = dense_path(extremal.problem, times, nodes, OTHER_POINTS)
+            sweeps.append(
+                {"index": index, "cost": rows[index].cost, "states": _rows(states), "nodes": _rows(nodes[:, :2])}
+            )
+        return {"status": extremal.status.name, "advice": extremal.status.value, "sweeps": sweeps}
+
+    def drive(self, scenario: Scenario, policy: str) -> dict[str, Any]:
+        """Play an episode of a policy and return its path.
+
+        Raises:
+            ValueError: the policy is not one of `policies`, or the horizon is too long.
+
+        """
+        from leapnav.envs.episodes import act_with, play_episode
+        from leapnav.envs.navigation import NavigateEnv
+        from leapnav.training.policies.files import policy_environment
+        from leapnav.training.scoring.policy_specs import BASELINES, make_policy_from_spec
+
+        check_choice("policy", policy, self.policies)
+        if scenario.horizon > MAX_DRIVE_HORIZON:
+            raise ValueError(
+                f"horizon: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {scenario.horizon:g}"
+            )
+        with self._lock:
+            env = NavigateEnv(scenario=scenario, **({} if policy in BASELINES else policy_environment(policy)))
+            act = act_with(make_policy_from_spec(policy, env))
+            _, info, steps = play_episode(env, act, seed=0)
+            states = [_pose(info)]
+            for step in steps:
+                info = step.info
+                states.append(_pose(info))
+            env.close()
+        return {
+            "policy": policy,
+            "states": states,
+            "period": env.settings.control_period,
+            "success": bool(info["is_success"]),
+            "collision": bool(info["collision"]),
+            "cost": float(info["cost"]),
+        }
+
+    def _describe(self, scenario: Scenario, extremal: Extremal, start: float) -> dict[str, Any]:
+        """Return the result of a solve, and store it as an initial guess if it is certified."""
+        milliseconds = 1000.0 * (perf_counter() - start)
+        optimum = extremal if isinstance(extremal, Optimum) else as_optimum(extremal)
+        result: dict[str, Any] = {
+            "id": None,
+            "status": optimum.status.name,
+            "advice": optimum.status.value,
+            "success": optimum.success,
+            "milliseconds": milliseconds,
+            "path": None,
+            "alternatives": [_summary(other, OTHER_POINTS) for other in optimum.alternatives],
+        }
+        if len(optimum.times):
+            result["path"] = _path(scenario, optimum)
+        if optimum.success:
+            result["id"] = uuid.uuid4().hex
+            self._stored[result["id"]] = optimum
+            while len(self._stored) > MAX_STORED:
+                self._stored.popitem(last=False)
+        return result
+
+
+def bank_scenario(family: str, index: int) -> Scenario:
+    """Return a scenario of a family's test bank.
+
+    Raises:
+        ValueError: the family is unknown, or the index is out of range.
+
+    """
+    check_family(family)
+    bank = ScenarioBank.shipped(family, "test")
+    return bank[check_integer("index", index, 0, len(bank) - 1)]
+
+
+def _path(scenario: Scenario, optimum: Optimum) -> dict[str, Any]:
+    """The optimum over time, for the plots."""
+    times = np.linspace(0.0, optimum.problem.horizon, OPTIMUM_POINTS)
+    _, controls, costates = optimum.evaluate(times)
+    certificate = optimum.certificate
+    return {
+        **_summary(optimum, OPTIMUM_POINTS),
+        "times": np.round(times, 6).tolist(),
+        "controls": _rows(controls),
+        "costates": _rows(costates),
+        "hamiltonian": np.interp(times, optimum.times, optimum.hamiltonian).tolist(),
+        "clearances": np.round(clearances(optimum.interpolate(times)[:, :2], scenario.field), 6).tolist(),
+        "residual": None if certificate is None else max(certificate.residual, certificate.defect),
+        "conjugate_point": None if certificate is None else certificate.conjugate_point,
+    }
+
+
+def _summary(optimum: Optimum, points: int) -> dict[str, Any]:
+    states = optimum.interpolate(np.linspace(0.0, optimum.problem.horizon, points))[:, :3]
+    certificate = optimum.certificate
+    return {
+        "cost": optimum.cost,
+        "states": _rows(states),
+        "driving": list(optimum.driving_modes),
+        "sides": "".join(side[0].upper() for side in optimum.path_class),
+        "clearance": None if certificate is None else certificate.clearance,
+    }
+
+
+def _pose(info: dict[str, Any]) -> list[float]:
+    return [float(value) for value in info["pose"]]
+
+
+def _rows(array: np.ndarray) -> list[list[float]]:
+    return np.round(array, 6).tolist()

@@ -1,0 +1,136 @@
+"""The commands `watch`, `doctor` and `compile`."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from helpers import FastClock, failing
+
+from leapnav.cli import main
+from leapnav.envs import ScenarioBank
+
+
+def test_watch_films_the_policy(tmp_path, capsys, monkeypatch):
+    import imageio.v3 as iio
+
+    video = tmp_path / "rooms.mp4"
+    arguments = ["watch", "--family", "rooms", "--index", "11", "--episodes", "2", "--video", str(video)]
+    assert main(arguments) == 0
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"rooms-1-11: success after [\d.]+ s, cost [\d.]+, optimum [\d.]+", first)
+    assert second.startswith("rooms-1-12: success")
+    assert last == f"wrote {video}"
+    frames = iio.imread(video)
+    bank = ScenarioBank.shipped("rooms", "test")
+    assert len(frames) == pytest.approx(20 * (bank[11].horizon + bank[12].horizon), abs=5)
+    assert frames.shape[1:] == (640, 600, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["rooms.mp4"]
+
+
+def test_watch_opens_a_window(capsys, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("pygame.time.Clock", FastClock)
+    arguments = ["watch", "--family", "open", "--policy", "random", "--episodes", "1", "--actuation", "motor"]
+    assert main([*arguments, "--disturbance", "0.1"]) == 0
+    assert re.match(r"open-1-\d+: (missed the goal|collision) after", capsys.readouterr().out)
+
+
+def test_closing_the_window_ends_the_watching(capsys, monkeypatch):
+    import pygame
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr("pygame.time.Clock", FastClock)
+    monkeypatch.setattr("pygame.event.get", lambda: [pygame.event.Event(pygame.QUIT)])
+    assert main(["watch", "--policy", "random"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--video", "film.gif"], "film.gif: expected a name that ends in .mp4"),
+        (["--video", "nowhere/film.mp4"], "nowhere/film.mp4: the directory does not exist"),
+        (["--video", "film.mp4", "--index", "199"], "index: the bank has scenarios 0 to 199, got 199 to 201"),
+        (["--video", "film.mp4", "--index", "3", "--split", "fresh"], "index: fresh scenarios have no index"),
+        (["--video", "film.mp4", "--episodes", "0"], "episodes: expected at least 1, got 0"),
+        (["--video", "film.mp4", "--family", "maze"], "family: expected one of open, .*got 'maze'"),
+        (["--video", "film.mp4", "--policy", "nowhere"], "nowhere: no such policy"),
+        (["--video", "film.mp4", "--disturbance", "-1"], "disturbance: expected a number >= 0, got -1.0"),
+    ],
+)
+def test_bad_arguments_of_watch_are_one_line(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, line = failing(["watch", *arguments], capsys)
+    assert code == 2
+    assert re.match(f"leapnav: {message}", line)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_display_or_moviepy_watch_says_what_to_do(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    monkeypatch.setattr("pygame.display.init", lambda: None)
+    monkeypatch.setattr("pygame.display.get_driver", lambda: "offscreen")
+    assert main(["watch"]) == 2
+    assert "--video FILE.mp4 writes a video instead" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "moviepy", None)
+    assert main(["watch", "--video", str(tmp_path / "film.mp4")]) == 2
+    assert 'pip install "leapnav[video]"' in capsys.readouterr().err
+
+
+def test_the_doctor_says_what_is_installed_and_that_it_works(tmp_path, capsys):
+    assert main(["doctor", "--json", str(tmp_path / "doctor.json")]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"^torch +2\.", out, re.MULTILINE)
+    assert out.count("ok    ") == 4
+    found = json.loads((tmp_path / "doctor.json").read_text())
+    assert found["versions"]["leapnav"] == version("leapnav")
+    assert "missing" not in found["versions"].values()
+    assert all(check["passed"] for check in found["checks"])
+
+
+def test_the_doctor_says_what_does_not_work(capsys, monkeypatch):
+    monkeypatch.setattr("leapnav.training.policies.files.SHIPPED", Path("/nowhere"))
+    assert main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert re.search(r"FAILED  load a policy .*: \w+Error: .*clutter", out)
+    assert "ok      drive the expert" in out
+
+
+def test_what_is_compiled_is_not_compiled_again(tmp_path, capsys):
+    assert main(["compile"]) == 0  # compiles what no other test has compiled yet
+    assert "cache: " in capsys.readouterr().out
+    assert main(["compile", "--json", str(tmp_path / "compiled.json")]) == 0
+    assert re.match(r"all kernels are in the cache \([\d.]+ s\)\ncache: ", capsys.readouterr().out)
+    found = json.loads((tmp_path / "compiled.json").read_text())
+    assert found["compiled"] == {}
+    assert Path(found["cache"]).is_dir()
+    assert failing(["compile", "--jobs", "0"], capsys) == (2, "leapnav: jobs: expected an integer >= 1, got 0\n")
+
+
+COMPILING = """
+import sys
+from leapnav.cli import main
+from leapnav.commands import compile
+from leapnav.envs.kernels import compilation
+from leapnav.envs.simulation.arcs import arc_point, sinc
+
+compilation.all_kernels = lambda: [arc_point, sinc]
+compile._compile_unicycle_flow = lambda: None
+sys.exit(main(["compile", "--jobs", "1", "--json", "-"]))
+"""
+
+
+def test_what_is_not_in_the_cache_is_compiled(tmp_path):
+    environment = {**os.environ, "LEAPNAV_CACHE_DIR": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    command = [sys.executable, "-c", COMPILING]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    found = json.loads(done.stdout)
+    assert found["compiled"] == {"envs.simulation.arcs": ["arc_point", "sinc"]}
+    assert Path(found["cache"]).parent == tmp_path
+    assert "envs.simulation.arcs: arc_point, sinc\ncompiled 2 kernels in " in done.stderr

@@ -1,0 +1,1 @@
+"""Imitation of the expert: datasets, behaviour cloning, DAgger, warm starts and demonstration replay."""

@@ -1,0 +1,345 @@
+"""Behaviour cloning: regression of a policy's mean action on the expert's actions."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from torch.nn import functional
+from torch.optim.lr_scheduler import LambdaLR
+from tqdm.auto import tqdm
+
+from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.envs.utils.validation import (
+    check_choice,
+    check_fraction,
+    check_integer,
+    check_not_negative,
+    check_positive,
+)
+from leapnav.experts.data.demonstrations import Demonstration
+from leapnav.training.config import CloningConfig
+from leapnav.training.learning.dataset import Dataset
+from leapnav.training.learning.symmetries import mirror, time_reverse
+from leapnav.training.policies.actors import actor_parameters, mean_action, policy_of, set_noise, update_target
+
+WARM_UP_STEPS = 200  # gradient steps of the linear warm-up of the learning rate
+MIN_STD = 0.01  # lower bound of the fitted standard deviation of the actions
+MAX_GRADIENT_NORM = 1.0
+SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
+EVALUATION_BATCH_SIZE = 65_536
+HUBER_DELTA = 0.05  # action error (actions are in [-1, 1]) above which Huber's loss is linear
+
+
+@dataclass(frozen=True)
+class EpochLoss:
+    """Losses of one epoch, relative to the loss of the mean action of the dataset.
+
+    Attributes:
+        epoch: index of the epoch, from 1.
+        training: mean loss of the training samples during the epoch.
+        validation: loss of the held-out samples after the epoch; NaN if none are held out.
+
+    """
+
+    epoch: int
+    training: float
+    validation: float
+
+
+def behaviour_clone(
+    model: BaseAlgorithm | BasePolicy,
+    dataset: Dataset | str | os.PathLike[str] | Sequence[Demonstration],
+    config: CloningConfig | None = None,
+    *,
+    progress: bool = True,
+    on_epoch: Callable[[EpochLoss], None] | None = None,
+) -> list[EpochLoss]:
+    """Fit the mean action of a policy to the expert's actions, in place.
+
+    The standard deviation of a stochastic policy is set to the root mean square of the remaining error. The same model,
+    dataset and configuration give the same weights on the same machine. The global random generators are not used.
+
+    Args:
+        model: a Stable-Baselines3 algorithm with continuous actions (PPO, A2C, SAC, TQC, TD3, ...) or its policy.
+        dataset: a `Dataset`, a directory written by `leapnav rollout`, or demonstrations.
+        config: settings.
+        progress: show a progress bar.
+        on_epoch: function called with the losses after each epoch.
+
+    Returns:
+        The losses of all epochs.
+
+    Raises:
+        FileNotFoundError: the dataset does not exist.
+        ValueError: the dataset is empty or damaged, its observations do not fit the policy, or a setting is invalid.
+
+    """
+    fit = Cloning(policy_of(model), Dataset.of(dataset), config or CloningConfig())
+    total = fit.config.epochs * fit.batches
+    with tqdm(total=total, desc="Cloning", unit="batch", disable=not progress) as bar:
+        while not fit.finished:
+            loss = fit.run_epoch(bar.update)
+            bar.set_postfix(training=f"{loss.training:.4f}", validation=f"{loss.validation:.4f}")
+            if on_epoch is not None:
+                on_epoch(loss)
+    fit.finish()
+    return fit.losses
+
+
+class Cloning:
+    """A behaviour-cloning fit that runs epoch by epoch and can be saved and resumed exactly.
+
+    Args:
+        policy: the policy to fit, in place.
+        dataset: the samples.
+        config: settings.
+        stream: offset added to the seed of the sample order and of the augmentation. The validation split depends on
+            the seed alone.
+
+    Attributes:
+        batches: gradient steps per epoch.
+        losses: losses of the epochs so far.
+
+    Raises:
+        ValueError: the observations of the dataset do not fit the policy, or a setting is invalid.
+
+    """
+
+    def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig, stream: int = 0) -> None:
+        check_cloning(config)
+        check_observations(policy, dataset)
+        beams = dataset.observations.shape[1] - GOAL_ENTRIES
+        if config.augment and beams % 2:
+            raise ValueError(f"augment: expected an even number of lidar beams, got {beams}; set augment=False")
+        self.config, self.losses = config, []
+        self._policy = policy
+        self._rng = th.Generator().manual_seed(config.seed + stream)
+        train, held_out = _split(dataset, config.validation_share, config.seed)
+        self._train, self._held_out = (_Samples(dataset, chosen, policy.device) for chosen in (train, held_out))
+        self._scale = _scale(self._train, config.loss)
+        self.batches = math.ceil(len(self._train) / config.batch_size)
+        parameters = actor_parameters(policy)
+        self._optimiser = th.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+        self._scheduler = LambdaLR(self._optimiser, warm_up_and_cosine(config.epochs * self.batches))
+        self._best: tuple[float, dict[str, th.Tensor]] | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs have run, or the validation loss has not decreased for `patience` epochs."""
+        done, patience = len(self.losses), self.config.patience
+        if done >= self.config.epochs:
+            return True
+        validation = [loss.validation for loss in self.losses]
+        return bool(patience and done > patience and min(validation[:-patience]) <= min(validation[-patience:]))
+
+    def run_epoch(self, on_batch: Callable[[], Any] = lambda: None) -> EpochLoss:
+        """Run one pass over the training samples.
+
+        Args:
+            on_batch: function called after each gradient step.
+
+        Returns:
+            The losses of the epoch.
+
+        Raises:
+            ValueError: the loss is not finite.
+
+        """
+        config, total = self.config, 0.0
+        self._policy.set_training_mode(True)
+        order = th.randperm(len(self._train), generator=self._rng)
+        for chosen in order.split(config.batch_size):
+            loss = self._loss(self._train.augmented(chosen, self._rng) if config.augment else self._train.at(chosen))
+            if not th.isfinite(loss):
+                raise ValueError(
+                    f"learning_rate: the fit diverged in epoch {len(self.losses) + 1} at {config.learning_rate!r}; "
+                    "choose a smaller one"
+                )
+            self._optimiser.zero_grad()
+            loss.backward()
+            th.nn.utils.clip_grad_norm_(actor_parameters(self._policy), MAX_GRADIENT_NORM)
+            self._optimiser.step()
+            self._scheduler.step()
+            total += float(loss.detach()) * len(chosen)
+            on_batch()
+        self._policy.set_training_mode(False)
+        losses = EpochLoss(len(self.losses) + 1, total / len(self._train), self._validation_loss())
+        # Without held-out samples the last epoch counts as the best.
+        if self._best is None or losses.validation < self._best[0] or not len(self._held_out):
+            self._best = (losses.validation, copy.deepcopy(self._policy.state_dict()))
+        self.losses.append(losses)
+        return losses
+
+    def finish(self) -> None:
+        """Restore the weights of the best epoch, and set the action noise to the remaining error."""
+        if self._best is not None:
+            self._policy.load_state_dict(self._best[1])
+        samples = self._held_out if len(self._held_out) else self._train
+        with th.no_grad():
+            squares = [
+                (mean_action(self._policy, batch[0]) - batch[1]).square().sum(dim=0)
+                for batch in samples.batches(EVALUATION_BATCH_SIZE)
+            ]
+        set_noise(self._policy, (th.stack(squares).sum(dim=0) / len(samples)).sqrt().clamp(min=MIN_STD))
+        update_target(self._policy)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the fit, without the policy's weights: tensors and Python numbers only."""
+        return {
+            "optimiser": self._optimiser.state_dict(),
+            "scheduler": self._scheduler.state_dict(),
+            "rng": self._rng.get_state(),
+            "losses": [(loss.epoch, loss.training, loss.validation) for loss in self.losses],
+            "best": self._best,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from a state returned by `state_dict`; the caller restores the policy's weights."""
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._scheduler.load_state_dict(state["scheduler"])
+        self._rng.set_state(state["rng"])
+        self.losses = [EpochLoss(*loss) for loss in state["losses"]]
+        self._best = state["best"]
+
+    def _loss(self, samples: tuple[th.Tensor, ...]) -> th.Tensor:
+        observations, actions, slopes, weights = samples
+        error = mean_action(self._policy, observations) - actions
+        return (
+            (_action_loss(error) if self.config.loss == "action" else _hamiltonian_loss(error, slopes, weights))
+            .mul(self._scale)
+            .sum(dim=1)
+            .mean()
+        )
+
+    def _validation_loss(self) -> float:
+        if not len(self._held_out):
+            return math.nan
+        with th.no_grad():
+            batches = self._held_out.batches(EVALUATION_BATCH_SIZE)
+            losses = [float(self._loss(batch)) * len(batch[0]) for batch in batches]
+        return sum(losses) / len(self._held_out)
+
+
+class _Samples:
+    """Samples as tensors: observations, actions, and the slopes and weights of `_hamiltonian_loss`."""
+
+    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
+        columns = dataset.observations, dataset.actions, action_slopes(dataset), dataset.weights * dataset.limits**2
+        self.columns = tuple(th.as_tensor(np.asarray(c[chosen], dtype=np.float32), device=device) for c in columns)
+
+    def __len__(self) -> int:
+        return len(self.columns[0])
+
+    def at(self, chosen: th.Tensor) -> tuple[th.Tensor, ...]:
+        return tuple(column[chosen] for column in self.columns)
+
+    def batches(self, size: int) -> list[tuple[th.Tensor, ...]]:
+        return list(zip(*(column.split(size) for column in self.columns), strict=True))
+
+    def augmented(self, chosen: th.Tensor, rng: th.Generator) -> tuple[th.Tensor, ...]:
+        """Return samples after a random one of the four combinations of mirroring and time reversal."""
+        observations, actions, slopes, weights = self.at(chosen)
+        combination = int(th.randint(4, (1,), generator=rng))
+        for bit, transform in ((1, mirror), (2, time_reverse)):
+            if combination & bit:
+                _, slopes = transform(observations, slopes)  # the slopes change sign with the actions
+                observations, actions = transform(observations, actions)
+        return observations, actions, slopes, weights
+
+
+def warm_up_and_cosine(total_steps: int) -> Callable[[int], float]:
+    """Return the learning-rate factor per gradient step: linear warm-up, cosine decay to zero."""
+    cosine = cosine_decay(total_steps)
+    return lambda step: min(1.0, (step + 1) / WARM_UP_STEPS) * cosine(step)
+
+
+def cosine_decay(total_steps: int) -> Callable[[int], float]:
+    """Return the learning-rate factor per gradient step: cosine decay from 1 to 0 after `total_steps`."""
+    return lambda step: 0.5 * (1 + math.cos(math.pi * step / total_steps))
+
+
+def _action_loss(error: th.Tensor) -> th.Tensor:
+    """Huber's loss: quadratic for small errors, linear for large ones.
+
+    Where a small displacement decides on which side the expert passes an obstacle, the mean of both actions, which
+    minimises a quadratic loss, leads into the obstacle. The median, which minimises a linear loss, does not.
+    """
+    return functional.huber_loss(error, th.zeros_like(error), reduction="none", delta=HUBER_DELTA)
+
+
+def _hamiltonian_loss(error: th.Tensor, slopes: th.Tensor, weights: th.Tensor) -> th.Tensor:
+    """H(q, lambda, u) - H(q, lambda, u*) for each component of the action: the cost of an error per second.
+
+    With H = 1/2 u'Ru + Phi + lambda'(a + Bu) and p = B'lambda it is 1/2 r e^2 + (p + r u*) e for the error e of a
+    control. The second term vanishes where u* minimises H inside the robot's limits. Where u* is at a limit, the term
+    is the cost of moving away from the limit; an action beyond the limit is not rewarded.
+
+    Args:
+        error (B, 2): action minus the expert's action.
+        slopes (B, 2): p + r u*, per unit of the action.
+        weights (B, 2): r, per square unit of the action.
+
+    """
+    return 0.5 * weights * error.square() + functional.relu(slopes * error)
+
+
+def action_slopes(dataset: Dataset) -> np.ndarray:
+    """dH/du (N, 2) at the expert's actions, per unit of the action; zero for actions that no limit bounds."""
+    heading = dataset.states[:, 2]
+    costates = dataset.costates
+    p = np.stack([np.cos(heading) * costates[:, 0] + np.sin(heading) * costates[:, 1], costates[:, 2]], axis=1)
+    slopes = (p + dataset.weights * dataset.limits * dataset.actions) * dataset.limits
+    # The expert's action belongs to the middle of the control period, the costate to its beginning. Inside the limits
+    # the difference of the two is not meaningful, and at a limit dH/du must point outwards.
+    limited = (np.abs(dataset.actions) >= SATURATION) & (slopes * dataset.actions < 0)
+    return np.where(limited & np.isfinite(slopes), slopes, 0.0)
+
+
+def _scale(samples: _Samples, loss: str) -> th.Tensor:
+    """Factors (2,) of the components of the loss with which the mean action has the loss 1."""
+    _, actions, slopes, weights = samples.columns
+    error = actions.mean(dim=0) - actions
+    if loss == "action":
+        return 0.5 / _action_loss(error).mean(dim=0).clamp(min=1e-6)
+    return (1.0 / _hamiltonian_loss(error, slopes, weights).sum(dim=1).mean()).clamp(max=1e6).repeat(2)
+
+
+def _split(dataset: Dataset, fraction: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (N,) of the training and the validation samples, which have no obstacle course in common.
+
+    A hash of the course decides, so that most courses stay in their part when the dataset grows.
+    """
+    courses = dataset.course_texts
+    hashes = {text: hashlib.blake2b(f"{seed} {text}".encode()).digest() for text in set(courses)}
+    held_out = set(sorted(hashes, key=hashes.__getitem__)[: int(fraction * len(hashes))])
+    mask = np.array([text in held_out for text in courses])[dataset.episodes]
+    return ~mask, mask
+
+
+def check_observations(policy: BasePolicy, dataset: Dataset) -> None:
+    """Raise ValueError unless the observations of a dataset have the shape that a policy expects."""
+    shape, width = policy.observation_space.shape, dataset.observations.shape[1]
+    if shape != (width,):
+        expected = "a dict" if shape is None else " x ".join(map(str, shape))
+        raise ValueError(f"dataset: its observations have {width} numbers, the policy's {expected}")
+
+
+def check_cloning(config: CloningConfig) -> None:
+    """Raise ValueError unless the settings of a fit are valid; the message names the setting and its value."""
+    for name in ("epochs", "batch_size", "learning_rate"):
+        check_positive(name, getattr(config, name))
+    for name in ("weight_decay", "patience"):
+        check_not_negative(name, getattr(config, name))
+    check_integer("seed", config.seed, 0, 2**63 - 1)
+    check_fraction("validation_share", config.validation_share, one=False)
+    check_choice("loss", config.loss, ("action", "hamiltonian"))

@@ -1,0 +1,98 @@
+"""Access to the actor of a Stable-Baselines3 policy, for all supported algorithms."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from torch import nn
+
+
+def policy_of(model: BaseAlgorithm | BasePolicy) -> BasePolicy:
+    """Return the policy of an algorithm, or the policy itself.
+
+    Raises:
+        TypeError: `model` is neither of the two, or the policy has no actor with continuous actions.
+
+    """
+    policy = model.policy if isinstance(model, BaseAlgorithm) else model
+    if not isinstance(policy, BasePolicy):
+        raise TypeError(f"model: expected one of Stable-Baselines3 or its policy, got {type(model).__name__}")
+    if not isinstance(policy, ActorCriticPolicy) and not isinstance(getattr(policy, "actor", None), BasePolicy):
+        raise TypeError(f"model: expected a policy with an actor, got {type(policy).__name__}")
+    return policy
+
+
+def _actor(policy: BasePolicy) -> Any:
+    """Return the actor of an off-policy algorithm; `BasePolicy` does not declare it."""
+    return policy.actor
+
+
+def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
+    """Return the parameters of the actor: of an on-policy algorithm those of the mean action, without the noise."""
+    if isinstance(policy, ActorCriticPolicy):
+        modules = policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net
+        return [parameter for module in modules for parameter in module.parameters()]
+    return list(_actor(policy).parameters())
+
+
+def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
+    """Compute the deterministic action (B, m) of a policy, not clipped, with gradients."""
+    if isinstance(policy, ActorCriticPolicy):
+        features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
+        return policy.action_net(policy.mlp_extractor.forward_actor(features))
+    actor = _actor(policy)
+    if hasattr(actor, "get_action_dist_params"):  # SAC and TQC squash a Gaussian
+        return th.tanh(actor.get_action_dist_params(observations)[0])
+    return actor(observations)
+
+
+def set_noise(policy: BasePolicy, std: th.Tensor) -> None:
+    """Set the standard deviation (m,) of a stochastic policy's actions, independent of the observation."""
+    with th.no_grad():
+        if isinstance(policy, ActorCriticPolicy):
+            policy.log_std.copy_(std.log())
+        elif isinstance(getattr(_actor(policy), "log_std", None), nn.Linear):
+            # This is the standard deviation before squashing, almost the same for actions close to 0.
+            _actor(policy).log_std.weight.zero_()
+            _actor(policy).log_std.bias.copy_(std.log())
+
+
+def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
+    """Copy the weights of the mean action between policies with the same network.
+
+    Raises:
+        ValueError: the networks differ, or only one of the policies squashes its actions.
+
+    """
+    if isinstance(source, ActorCriticPolicy) != isinstance(target, ActorCriticPolicy):
+        raise ValueError(
+            f"policy: expected the same squashing of the actions, got a {type(source).__name__} for a "
+            f"{type(target).__name__}; start from demonstrations instead"
+        )
+    tensors = _actor_tensors(source), _actor_tensors(target)
+    if [t.shape for t in tensors[0]] != [t.shape for t in tensors[1]]:
+        shapes = [[tuple(t.shape) for t in of_one] for of_one in tensors]
+        raise ValueError(f"policy: its network has the shapes {shapes[0]}, the model's {shapes[1]}")
+    with th.no_grad():
+        for a, b in zip(*tensors, strict=True):
+            b.copy_(a)
+    update_target(target)
+
+
+def update_target(policy: BasePolicy) -> None:
+    """Copy the weights of the actor to the target actor, if the algorithm has one."""
+    target: Any = getattr(policy, "actor_target", None)
+    if target is not None:
+        target.load_state_dict(_actor(policy).state_dict())
+
+
+def _actor_tensors(policy: BasePolicy) -> list[th.Tensor]:
+    """Return the weights between the observation and the mean action, in order."""
+    if isinstance(policy, ActorCriticPolicy):
+        return [p.data for p in actor_parameters(policy)]
+    noise = getattr(_actor(policy), "log_std", None)
+    skipped = {id(p) for p in noise.parameters()} if isinstance(noise, nn.Module) else set()
+    return [p.data for p in _actor(policy).parameters() if id(p) not in skipped]

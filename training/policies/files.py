@@ -1,0 +1,250 @@
+"""Files of policies: saving, loading, and the policies that ship with leapnav."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.sac.policies import SACPolicy
+
+import leapnav
+from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.settings import SENSORS, EnvironmentSettings
+from leapnav.envs.unwrapping import unwrap
+from leapnav.envs.utils.files import atomic_path, digest, write_text
+from leapnav.envs.utils.json_utils import encode
+from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.training.policies.actors import policy_of
+from leapnav.training.policies.network import NavigationFeatures, check_spaces, network
+
+FORMAT = 2  # version of policy.json
+SHIPPED = Path(__file__).parent / "pretrained"
+# Settings of the environment that determine the observation and the meaning of an action.
+OBSERVED = (*SENSORS, "actuation", "dict_observation")
+KINDS = ("actor-critic", "sac", "tqc")
+# Fields of policy.json with their types, besides `format` and `environment`.
+FIELDS = {"kind": str, "hidden": list, "critic": list, "actor_only": bool, "training": dict, "sha256": str}
+
+
+def save_policy(
+    model: BaseAlgorithm | BasePolicy,
+    folder: str | Path,
+    environment: Mapping[str, Any] | None = None,
+    *,
+    training: Mapping[str, Any] | None = None,
+    half: bool = False,
+) -> None:
+    """Save a policy as `policy.json` (description) and `weights.pt` (tensors only) in a directory.
+
+    Args:
+        model: an algorithm with the network of `leapnav.training.network` (PPO, A2C, SAC or TQC), or its policy.
+        folder: the directory; created if it does not exist.
+        environment: the arguments of `gym.make` for which the policy was trained, except the family.
+        training: description of the training, as JSON.
+        half: save only the actor, in half precision: about 1/5 of the size; the actions change by about 1e-3.
+
+    Raises:
+        TypeError: the model is not a Stable-Baselines3 algorithm or policy with an actor.
+        ValueError: the policy has another network, or an argument of the environment is invalid.
+
+    """
+    policy, folder = policy_of(model), Path(folder)
+    kind = next((name for name, type_ in _policy_classes().items() if isinstance(policy, type_)), None)
+    if kind is None or policy.features_extractor_class is not NavigationFeatures:
+        raise ValueError(
+            f"model: expected a policy made with policy_kwargs=leapnav.training.network(), got {type(policy).__name__}"
+        )
+    assert isinstance(policy.observation_space, spaces.Box)
+    folder.mkdir(parents=True, exist_ok=True)
+    # The reference of the KL divergence is part of the run, not of the policy.
+    weights = {name: value for name, value in policy.state_dict().items() if not name.startswith("reference_")}
+    if half:
+        weights = {name: value.half() for name, value in weights.items() if _is_actor_weight(name)}
+    # Torch stores the name of the file in the file; that of a buffer is always the same.
+    buffer = io.BytesIO()
+    th.save(weights, buffer)
+    with atomic_path(folder / "weights.pt") as partial:
+        partial.write_bytes(buffer.getvalue())
+    widths: Any = policy.net_arch
+    description = {
+        "format": FORMAT,
+        "leapnav": leapnav.__version__,
+        "environment": {"id": ENVIRONMENT, **_as_dict(EnvironmentSettings(**(environment or {})))},
+        "observation_low": policy.observation_space.low.tolist(),
+        "observation_high": policy.observation_space.high.tolist(),
+        "kind": kind,
+        "hidden": widths["pi"],
+        "critic": widths["vf"],
+        "actor_only": half,
+        "training": dict(training or {}),
+        "sha256": digest(folder / "weights.pt"),
+    }
+    write_text(folder / "policy.json", encode(description, indent=1) + "\n")
+
+
+def read_description(folder: str | Path) -> dict[str, Any]:
+    """Read `policy.json`.
+
+    Args:
+        folder: see `load_policy`.
+
+    Raises:
+        FileNotFoundError: the directory contains no policy.
+        ValueError: the file is damaged, or has another format or environment; the message contains the cause.
+
+    """
+    path = policy_folder(folder) / "policy.json"
+    if not path.parent.exists():
+        shipped = ", ".join(shipped_policies())
+        raise FileNotFoundError(errno.ENOENT, f"no such policy; expected a directory or one of {shipped}", str(folder))
+    text = path.read_text()
+    try:
+        description = json.loads(text)
+        found = description["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
+    if found != FORMAT:
+        raise ValueError(f"{path}: format: expected {FORMAT}, got {found!r}; train the policy again")
+    try:
+        environment = description["environment"]["id"]
+        if environment != ENVIRONMENT:
+            raise ValueError(f"{path}: a policy for {environment}; expected one for {ENVIRONMENT}")
+        for name, type_ in FIELDS.items():
+            if not isinstance(description[name], type_):
+                raise TypeError(f"{name} is {description[name]!r}")
+        if description["kind"] not in KINDS:
+            raise ValueError(f"{path}: kind: expected one of {', '.join(KINDS)}, got {description['kind']!r}")
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
+    return description
+
+
+def policy_environment(folder: str | Path) -> dict[str, Any]:
+    """Return the arguments of `gym.make` for an environment with the observations that a policy was trained with.
+
+    Args:
+        folder: see `load_policy`.
+
+    Raises:
+        FileNotFoundError, ValueError: see `load_policy`.
+
+    """
+    environment = read_description(folder)["environment"]
+    return {name: environment[name] for name in OBSERVED if name in environment}
+
+
+def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
+    """Load a policy saved by `save_policy`. No code from the files is executed.
+
+    Args:
+        folder: the directory of the policy or of the run that trained it; or the name of a family ("clutter", ...) or
+            "all" for a shipped policy (actor only, in half precision).
+        env: an environment for the policy, single or vector; its observations are checked.
+
+    Returns:
+        A Stable-Baselines3 policy: `policy.predict(observation, deterministic=True)[0]` is the action.
+
+    Raises:
+        FileNotFoundError: the directory contains no policy.
+        TypeError: `env` is not an environment of leapnav.
+        ValueError: the files are damaged, or have another format or other observations; the message contains the cause.
+
+    """
+    description = read_description(folder)
+    folder = policy_folder(folder)
+    try:
+        low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
+        observation_space = spaces.Box(low, high, dtype=np.float32)
+        action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        check_spaces(observation_space, action_space)
+        policy = _policy_class(description["kind"])(
+            observation_space,
+            action_space,
+            lambda _: 3e-4,
+            **network(description["hidden"], description["critic"]),
+        )
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # a damaged description may raise any error in gymnasium or torch
+        raise ValueError(f"{folder / 'policy.json'}: not the description of a policy: {error!r}") from None
+    if env is not None:
+        _check_environment(folder, description, observation_space, env)
+    path = folder / "weights.pt"
+    try:
+        if digest(path) != description["sha256"]:
+            raise ValueError("damaged, or of another policy")
+        weights = th.load(path, weights_only=True, map_location="cpu")
+        if description["actor_only"]:
+            initial = policy.state_dict()
+            differing = sorted({name for name in initial if _is_actor_weight(name)} ^ set(weights))
+            if differing:
+                raise ValueError(f"{differing[0]} is missing or unknown")
+            weights = {**initial, **{name: value.float() for name, value in weights.items()}}
+        policy.load_state_dict(weights)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # torch raises many types of errors for a damaged file
+        raise ValueError(f"{path}: not the weights of this policy: {str(error).splitlines()[0]}") from None
+    policy.set_training_mode(False)
+    return policy
+
+
+def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
+    """Check that an environment has the observations that the policy was trained with."""
+    trained = description["environment"]
+    for inner in unwrap(env):
+        settings = _as_dict(inner.settings)
+        differing = [
+            f"{name}={trained.get(name)!r} (here {settings.get(name)!r})"
+            for name in OBSERVED
+            if trained.get(name) != settings.get(name)
+        ]
+        if differing or getattr(inner, "single_observation_space", inner.observation_space) != space:
+            difference = ", ".join(differing) or "other bounds"
+            raise ValueError(f"{folder}: the policy was trained with other observations: {difference}")
+
+
+def shipped_policies() -> list[str]:
+    """Return the names of the policies that ship with leapnav: families, and "all" for a policy for all families."""
+    return [name for name in (*FAMILIES, ALL) if (SHIPPED / name / "policy.json").is_file()]
+
+
+def policy_folder(folder: str | Path) -> Path:
+    """Return the directory of a policy, given as a directory or as the name of a shipped policy."""
+    path = Path(folder)
+    return SHIPPED / path if str(folder) in shipped_policies() and not path.exists() else path
+
+
+def _as_dict(settings: EnvironmentSettings) -> dict[str, Any]:
+    """Return the settings that are not None as a dictionary."""
+    return {name: value for name, value in asdict(settings).items() if value is not None}
+
+
+def _policy_class(kind: str) -> Any:
+    """Return the class of a kind of policies."""
+    if kind == "tqc":
+        from sb3_contrib.tqc.policies import TQCPolicy  # from the extra `contrib`
+
+        return TQCPolicy
+    return {"actor-critic": ActorCriticPolicy, "sac": SACPolicy}[kind]
+
+
+def _policy_classes() -> dict[str, Any]:
+    """Return the installed classes of policies, by kind."""
+    return {kind: _policy_class(kind) for kind in KINDS if kind != "tqc" or find_spec("sb3_contrib") is not None}
+
+
+def _is_actor_weight(name: str) -> bool:
+    """Return whether a weight belongs to the mean action or its noise."""
+    return name.startswith(("actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))

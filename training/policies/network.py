@@ -1,0 +1,132 @@
+"""The network of the policies: features of an observation, and multi-layer perceptrons for the actor and the critic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.experts.data.demonstrations import ENVIRONMENT
+
+HIDDEN = (256, 256, 256)  # default widths of the hidden layers
+ROBOT_RADIUS = 0.25  # radius of the robots in all families (m); a range minus this is the clearance along a beam
+
+
+class NavigationFeatures(BaseFeaturesExtractor):
+    """Features of an observation on several length scales.
+
+    Success depends on the last 0.1 m, and the difference between lidar ranges of 0.3 m and 0.5 m matters more than that
+    between 5 m and 10 m. A small network does not resolve such differences in metres and seconds. The features
+    therefore contain logarithms, saturated values and exponentials in addition to the scaled values.
+    """
+
+    POSE_FEATURES = 23  # features that do not depend on the number of beams
+    BEAM_FEATURES = 3  # features of each lidar beam
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        beams = observation_space.shape[0] - GOAL_ENTRIES
+        super().__init__(observation_space, self.POSE_FEATURES + self.BEAM_FEATURES * beams)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Return the features (B, features_dim) of observations (B, d)."""
+        goal, time_left = observations[:, 0:2], observations[:, 4:5]
+        distance = goal.norm(dim=1, keepdim=True)
+        heading = observations[:, 2:4]  # cosine and sine of the heading error
+        error = th.atan2(observations[:, 3:4], observations[:, 2:3])
+        bearing = th.atan2(goal[:, 1:2], goal[:, 0:1])
+        needed_speeds, needed_turn_rate = observations[:, 5:8], observations[:, 8:9]  # to arrive on time
+        ranges = observations[:, GOAL_ENTRIES:]
+        return th.cat(
+            [
+                goal / 5,
+                distance / 5,
+                heading,
+                time_left / 10,
+                needed_speeds.clamp(-3, 3),
+                (needed_turn_rate / 2).clamp(-3, 3),
+                th.tanh(needed_speeds[:, :2]),
+                goal / (distance + 0.1),
+                th.log(distance + 0.05),
+                th.log(time_left + 0.05),
+                th.exp(-time_left),
+                th.tanh(goal / 0.3),
+                th.tanh(error / 0.3),
+                error,
+                # The angle is zero where a single circular arc reaches the goal pose: the chord of an arc has half its
+                # change of heading.
+                th.cos(error - 2 * bearing),
+                th.sin(error - 2 * bearing),
+                ranges / 5,
+                th.exp(-(ranges - ROBOT_RADIUS) / 0.3),
+                ROBOT_RADIUS / ranges.clamp(min=0.1),
+            ],
+            dim=1,
+        )
+
+
+def network(hidden: Sequence[int] = HIDDEN, critic: Sequence[int] | None = None) -> dict[str, Any]:
+    """Return the `policy_kwargs` with which PPO, A2C, SAC or TQC uses the network of this module.
+
+    Args:
+        hidden: widths of the actor's hidden layers.
+        critic: widths of the critic's hidden layers; None: those of the actor.
+
+    """
+    widths = list(hidden if critic is None else critic)
+    return {
+        "net_arch": {"pi": list(hidden), "vf": widths, "qf": widths},
+        "activation_fn": nn.ReLU,
+        "features_extractor_class": NavigationFeatures,
+    }
+
+
+def make_policy(
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    seed: int = 0,
+    hidden: Sequence[int] = HIDDEN,
+    critic: Sequence[int] | None = None,
+) -> ActorCriticPolicy:
+    """Create an untrained actor-critic policy for `leapnav/Navigate-v0`, which PPO and A2C can train.
+
+    Args:
+        observation_space, action_space: spaces of the environment.
+        seed: random seed of the weights; the global random generator is not changed.
+        hidden: widths of the actor's hidden layers.
+        critic: widths of the critic's hidden layers; None: those of the actor.
+
+    Raises:
+        ValueError: the spaces are not those of the environment with a lidar.
+
+    """
+    check_spaces(observation_space, action_space)
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(seed)
+        return ActorCriticPolicy(
+            observation_space,
+            action_space,
+            lr_schedule=lambda _: 3e-4,
+            log_std_init=-2.0,
+            **network(hidden, critic),
+        )
+
+
+def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """Check that the spaces are those of `leapnav/Navigate-v0` with a lidar.
+
+    Raises:
+        ValueError: they are not.
+
+    """
+    shape = observation_space.shape if isinstance(observation_space, spaces.Box) else ()
+    if not (len(shape) == 1 and shape[0] > GOAL_ENTRIES):
+        got = f"a Box of shape {shape}" if shape else type(observation_space).__name__
+        raise ValueError(f"observation_space: expected that of {ENVIRONMENT} with a lidar, got {got}")
+    if not (isinstance(action_space, spaces.Box) and action_space.shape == (2,)):
+        raise ValueError(f"action_space: expected that of {ENVIRONMENT}, got {action_space}")

@@ -1,0 +1,1 @@
+"""Training runs: run directories, checkpoints and one module per kind of algorithm."""

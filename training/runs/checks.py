@@ -1,0 +1,94 @@
+"""Validation of a run's settings, before the run creates any file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from functools import partial
+from typing import Any
+
+from leapnav.envs.scenarios.families import check_family
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.utils.validation import check_fraction, check_integer, check_not_negative, check_positive
+from leapnav.training.config import CloningConfig, DAggerConfig, PPOConfig, RunConfig, WarmStartConfig
+from leapnav.training.learning.cloning import check_cloning
+from leapnav.training.learning.dagger import check_dagger
+from leapnav.training.learning.warm_start import check_warm_start
+
+
+def check_config(config: RunConfig) -> None:
+    """Check all settings of a run.
+
+    Raises:
+        ValueError: a setting is invalid; the message contains its name and value.
+
+    """
+    check_family(config.family)
+    if not config.hidden or min(config.hidden) < 1:
+        raise ValueError(f"hidden: expected widths of at least 1, got {config.hidden!r}")
+    check_integer("seed", config.seed, 0, 2**32 - 1)
+    if not (config.lidar_beams > 0 and config.lidar_beams % 2 == 0):
+        raise ValueError(f"lidar_beams: expected an even number >= 2, got {config.lidar_beams!r}")
+    EnvironmentSettings(**config.environment)
+    if isinstance(config, PPOConfig) and config.last_std > 0 and config.ent_coef > 0:
+        raise ValueError(
+            f"ent_coef: expected 0, because last_std > 0 fixes the noise and its entropy, got {config.ent_coef!r}"
+        )
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            _check_nested(field.name, value)
+        elif field.name in _CHECKS:
+            _CHECKS[field.name](field.name, value)
+
+
+def _check_entropy_coefficient(name: str, value: Any) -> None:
+    """Check a number, or for SAC "auto" or "auto_NUMBER"."""
+    text = str(value).removeprefix("auto").removeprefix("_") or "1"
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number >= 0):
+        raise ValueError(f"{name}: expected a number >= 0, or auto or auto_NUMBER for SAC, got {value!r}")
+
+
+def _check_nested(name: str, config: Any) -> None:
+    """Check a configuration that is a setting of the run."""
+    if getattr(config, "seed", 0) != 0:
+        raise ValueError(f"{name}.seed: expected 0, got {config.seed!r}; set the seed of the run instead")
+    try:
+        if isinstance(config, CloningConfig):
+            check_cloning(config)
+        elif isinstance(config, DAggerConfig):
+            check_dagger(config)
+        elif isinstance(config, WarmStartConfig):
+            check_warm_start(config)
+    except ValueError as error:
+        raise ValueError(f"{name}.{error}") from None
+
+
+_COUNTS = (
+    "scenarios",
+    "n_envs",
+    "total_timesteps",
+    "evaluate_every",
+    "checkpoint_every",
+    "evaluation_scenarios",
+    "n_steps",
+    "batch_size",
+    "n_epochs",
+    "gradient_steps",
+    "buffer_size",
+)
+# The check of each setting, called with the setting's name and value.
+_CHECKS: dict[str, Callable[[str, Any], object]] = {
+    **dict.fromkeys(_COUNTS, partial(check_integer, minimum=1)),
+    **dict.fromkeys(("learning_starts",), partial(check_integer, minimum=0)),
+    **dict.fromkeys(("learning_rate", "reward_scale", "clip_range", "std", "control_period"), check_positive),
+    **dict.fromkeys(("divergence", "imitation", "penalty", "last_std", "quiet"), check_not_negative),
+    **dict.fromkeys(("jump_start", "jump_start_until", "divergence_until", "gamma", "gae_lambda"), check_fraction),
+    **dict.fromkeys(("demonstrations", "critic_first"), partial(check_fraction, one=False)),
+    "ent_coef": _check_entropy_coefficient,
+}

@@ -1,0 +1,353 @@
+"""Runs of reinforcement learning: PPO, SAC and TQC, from scratch or with a warm start."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch as th
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
+from tqdm.auto import tqdm
+
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.utils.validation import check_choice
+from leapnav.training.config import PPOConfig, SACConfig
+from leapnav.training.learning.dataset import Dataset
+from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
+from leapnav.training.learning.warm_start import warm_start
+from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
+from leapnav.training.policies.files import load_policy, policy_folder
+from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
+from leapnav.training.policies.network import network
+from leapnav.training.robots.jump_start import JumpStart
+from leapnav.training.robots.rewards import GradedMiss, ScaledReward
+from leapnav.training.robots.vec_env import environment_seed, make_vec_env
+from leapnav.training.runs.checks import check_config
+from leapnav.training.runs.imitation import make_env, observed_settings, show_scores
+from leapnav.training.runs.run import Run
+from leapnav.training.scoring.evaluation import Evaluation
+
+Config = PPOConfig | SACConfig
+
+
+def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
+    """Train a policy by proximal policy optimisation.
+
+    With `config.resume` the run resumes after any interruption, with bit-identical results.
+
+    Args:
+        config: settings.
+        progress: show progress bars.
+
+    Returns:
+        The final evaluation of each family.
+
+    Raises:
+        TypeError: the configuration is not a `PPOConfig`.
+        FileNotFoundError, FileExistsError, ValueError: see `Run`, `Dataset.of` and `load_policy`.
+
+    """
+    if not isinstance(cast(object, config), PPOConfig):
+        raise TypeError(f"config: expected a PPOConfig, got {type(config).__name__}")
+
+    def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
+        return PPO(
+            KLRegularizedPolicy,
+            venv,
+            n_steps=config.n_steps,
+            batch_size=config.batch_size,
+            n_epochs=config.n_epochs,
+            learning_rate=LinearSchedule(config.learning_rate, 0.0, 1.0),
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            clip_range=config.clip_range,
+            ent_coef=1.0,  # the policy applies the weights of the entropy and of the divergence
+            policy_kwargs={
+                **network(config.hidden),
+                "log_std_init": math.log(config.std),
+                "entropy_weight": config.ent_coef,
+                "quiet": config.quiet,
+            },
+            seed=config.seed,
+            device="cpu",
+        )
+
+    return _train("ppo", config, make, progress)
+
+
+def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
+    """Train a policy by soft actor-critic or truncated quantile critics.
+
+    Arguments, returns and further errors are those of `train_ppo`.
+
+    Raises:
+        TypeError: the configuration is not a `SACConfig`.
+        ModuleNotFoundError: TQC without the extra `contrib`.
+
+    """
+    if not isinstance(cast(object, config), SACConfig):
+        raise TypeError(f"config: expected a SACConfig, got {type(config).__name__}")
+    check_choice("algorithm", config.algorithm, ("sac", "tqc"))
+    algorithm: Any = SAC
+    if config.algorithm == "tqc":
+        try:
+            from sb3_contrib import TQC as algorithm  # noqa: N811 (a class like SAC)
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError('TQC needs sb3-contrib: pip install "leapnav[contrib]"') from None
+
+    def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
+        return algorithm(
+            "MlpPolicy",
+            venv,
+            learning_rate=LinearSchedule(config.learning_rate, 0.0, 1.0),
+            buffer_size=config.buffer_size,
+            learning_starts=config.learning_starts,
+            batch_size=config.batch_size,
+            gamma=config.gamma,
+            gradient_steps=config.gradient_steps,
+            ent_coef=config.ent_coef if config.ent_coef.startswith("auto") else float(config.ent_coef),
+            policy_kwargs=network(config.hidden),
+            seed=config.seed,
+            device="cpu",
+            **_buffer_arguments(config, dataset),
+        )
+
+    return _train(config.algorithm, config, make, progress)
+
+
+def _train(
+    algorithm: str, config: Config, make: Callable[[VecEnv, Dataset | None], BaseAlgorithm], progress: bool
+) -> list[Evaluation]:
+    """Train the model that `make` returns for the training environment and the demonstrations."""
+    # Invalid arguments are reported before the run directory is created.
+    check_config(config)
+    demos, start = _resolve_warm_start(config)
+    if demos and config.reward != "cost":
+        raise ValueError(f"reward: expected 'cost', the reward of demonstrations, got {config.reward!r}")
+    if isinstance(config, PPOConfig) and config.divergence > 0 and not (config.warm_start and config.start.actor):
+        raise ValueError(
+            f"divergence: expected 0 without a warm start of the actor (warm_start, start.actor), "
+            f"got {config.divergence!r}"
+        )
+    dataset = Dataset.of(demos).observed(observed_settings(config)) if demos else None
+    venv = _training_env(config)
+    model = make(venv, dataset)
+    # Stable-Baselines3 has seeded the environment with the seed of the run itself, see `environment_seed`.
+    venv.seed(environment_seed(config.seed))
+    if start is not None and config.start.actor:
+        copy_actor(start, model.policy)
+    run = Run(algorithm, config)
+    checkpoint = run.load_checkpoint() if config.resume else None
+    if checkpoint is None:
+        _warm_start(model, config, dataset, actor_copied=start is not None, progress=progress)
+    else:
+        model = _load_model(type(model), checkpoint[0], venv, dataset, config)
+    model.set_logger(run.logger)
+    if isinstance(config, SACConfig) and config.imitation > 0 and dataset is not None:
+        imitate(cast(OffPolicyAlgorithm, model), dataset, config.imitation)
+    callback = _RunCallback(run, config, venv, checkpoint[1] if checkpoint else None, progress)
+    if checkpoint is not None:
+        run.restore_generators()
+    remaining = config.total_timesteps - model.num_timesteps
+    if remaining > 0:
+        model.learn(remaining, callback=callback, reset_num_timesteps=checkpoint is None)
+        callback.save_checkpoint()
+    callback.bar.close()
+    if isinstance(config, PPOConfig) and config.last_std > 0:
+        set_noise(model.policy, th.full((2,), config.last_std))
+    evaluations = run.evaluate(model.policy, model.num_timesteps, final=True)
+    run.save_policy(model.policy)
+    return evaluations
+
+
+def _resolve_warm_start(config: Config) -> tuple[list[Path], BasePolicy | None]:
+    """Return the directories of demonstrations and the policy among the paths in `config.warm_start`."""
+    given: Any = config.warm_start
+    paths = [Path(path) for path in ([given] if isinstance(given, (str, Path)) else given)]
+    policies = [path for path in paths if (policy_folder(path) / "policy.json").is_file()]
+    if len(policies) > 1:
+        raise ValueError(f"warm_start: expected at most one policy, got {policies[0]} and {policies[1]}")
+    for path in paths:
+        if path not in policies and not path.is_dir():
+            raise FileNotFoundError(f"warm_start: {path}: no such directory of demonstrations or of a policy")
+    start = load_policy(policies[0], make_env(config)) if policies else None
+    return [path for path in paths if path not in policies], start
+
+
+def _training_env(config: Config) -> VecEnv:
+    """Return the training environment, which samples a new scenario for each episode."""
+    task: dict[str, Any] = {}
+    if isinstance(config, PPOConfig):
+        penalty = config.penalty
+        task = {"control_period": config.control_period, "collision_penalty": penalty, "miss_penalty": penalty}
+    robots = make_vec_env(
+        n_envs=config.n_envs,
+        family=config.family,
+        split="fresh",
+        reward=config.reward,
+        discount=config.gamma,
+        **config.environment,
+        **task,
+    )
+    venv: VecEnv = robots
+    if config.jump_start > 0:
+        families = FAMILIES if config.family == ALL else (config.family,)
+        banks = [ScenarioBank.shipped(family, "train") for family in families]
+        venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
+    if config.graded_miss:
+        venv = GradedMiss(venv)
+    return ScaledReward(venv, config.reward_scale)
+
+
+def _warm_start(
+    model: BaseAlgorithm, config: Config, dataset: Dataset | None, *, actor_copied: bool, progress: bool
+) -> None:
+    """Fit the model to the demonstrations, and set the initial noise and the reference policy of PPO.
+
+    Args:
+        model: the model, in place.
+        config: settings of the run.
+        dataset: the demonstrations, if any.
+        actor_copied: whether the actor is that of a given policy; then only the critic is fitted.
+        progress: show progress bars.
+
+    """
+    if dataset is not None:
+        warm_start(
+            model,
+            dataset,
+            replace(config.start, seed=config.seed, actor=config.start.actor and not actor_copied),
+            cloning=replace(config.cloning, seed=config.seed),
+            reward_scale=config.reward_scale,
+            progress=progress,
+        )
+    if isinstance(config, PPOConfig) and isinstance(model.policy, KLRegularizedPolicy):
+        set_noise(model.policy, th.full((2,), config.std))
+        model.policy.set_reference()
+
+
+def _load_model(kind: Any, folder: Path, venv: VecEnv, dataset: Dataset | None, config: Config) -> BaseAlgorithm:
+    """Load the model of a checkpoint, and restore the state of the training environment."""
+    buffer = folder / "replay_buffer.pkl"
+    arguments = _buffer_arguments(config, dataset) if isinstance(config, SACConfig) else {}
+    model = kind.load(folder / "model.zip", env=venv, device="cpu", force_reset=False, **arguments)
+    if buffer.exists():
+        model.load_replay_buffer(buffer)
+        if isinstance(model.replay_buffer, DemonstrationReplayBuffer):
+            assert dataset is not None  # the configuration is that of the stored run
+            model.replay_buffer.demonstrate(dataset, config.reward_scale)
+    with (folder / "robots.pkl").open("rb") as file:
+        wrapper_states, action_generator = pickle.load(file)
+    # Loading has seeded the generator of the action space, from which the random actions before learning are drawn.
+    model.action_space.np_random.bit_generator.state = action_generator
+    for wrapper, state in zip(_stateful_wrappers(venv), wrapper_states, strict=True):
+        wrapper.load_state_dict(state)
+    return model
+
+
+def _buffer_arguments(config: SACConfig, dataset: Dataset | None) -> dict[str, Any]:
+    """Return the arguments of SAC for a replay buffer with demonstrations, if there are any."""
+    if dataset is None or config.demonstrations == 0:
+        return {}
+    fraction, scale = config.demonstrations, config.reward_scale
+    return {
+        "replay_buffer_class": DemonstrationReplayBuffer,
+        "replay_buffer_kwargs": {"dataset": dataset, "share": fraction, "reward_scale": scale},
+    }
+
+
+def _stateful_wrappers(venv: Any) -> list[Any]:
+    """Return the wrappers and the vector environment that have a `state_dict`, outermost first."""
+    found = []
+    while isinstance(venv, VecEnv):
+        if "state_dict" in type(venv).__dict__:
+            found.append(venv)
+        venv = getattr(venv, "venv", None)
+    return found
+
+
+class _RunCallback(BaseCallback):
+    """Evaluations, checkpoints, schedules and the progress bar of a run.
+
+    Args:
+        run: the run directory.
+        config: settings of the run.
+        venv: the training environment.
+        progress: the progress stored in the checkpoint; None for a new run.
+        show_bar: show a progress bar.
+
+    """
+
+    def __init__(self, run: Run, config: Config, venv: VecEnv, progress: dict[str, Any] | None, show_bar: bool) -> None:
+        super().__init__()
+        self._run, self._config, self._venv = run, config, venv
+        self._evaluated_step = -1 if progress is None else int(progress["evaluated"])
+        self._checkpoint_step = 0 if progress is None else int(progress["step"])
+        self.bar = tqdm(
+            total=config.total_timesteps,
+            initial=self._checkpoint_step,
+            desc=run.algorithm.upper(),
+            unit="step",
+            disable=not show_bar,
+        )
+
+    def _on_step(self) -> bool:
+        self.bar.update(self._config.n_envs)
+        return True
+
+    def _on_rollout_start(self) -> None:
+        # The state is complete here: the last update is done, and the next environment steps have not begun.
+        step, config = self.num_timesteps, self._config
+        if step // config.evaluate_every > self._evaluated_step // config.evaluate_every or self._evaluated_step < 0:
+            show_scores(self.bar, self._run.evaluate(self.model.policy, step))
+            self._run.save_policy(self.model.policy)
+            self._evaluated_step = step
+        if step // config.checkpoint_every > self._checkpoint_step // config.checkpoint_every:
+            self.save_checkpoint()
+        self._apply_schedules(step / config.total_timesteps)
+
+    def _apply_schedules(self, completed: float) -> None:
+        """Set everything that depends on the completed fraction of the run."""
+        config, policy = self._config, self.model.policy
+        if isinstance(config, PPOConfig) and isinstance(policy, KLRegularizedPolicy):
+            policy.divergence_weight = _linear_decay(config.divergence, config.divergence_until, completed)
+            self.logger.record("train/divergence", policy.divergence)
+            for parameter in actor_parameters(policy):
+                parameter.requires_grad_(completed >= config.critic_first)
+            policy.log_std.requires_grad_(completed >= config.critic_first and config.last_std == 0)
+            if config.last_std > 0:
+                std = config.std + min(1.0, completed) * (config.last_std - config.std)
+                set_noise(policy, th.full((2,), std))
+        for wrapper in _stateful_wrappers(self._venv):
+            if isinstance(wrapper, JumpStart):
+                wrapper.max_fraction = _linear_decay(config.jump_start, config.jump_start_until, completed)
+
+    def save_checkpoint(self) -> None:
+        """Replace the checkpoint."""
+        self._checkpoint_step = self.model.num_timesteps
+        progress = {"step": self._checkpoint_step, "evaluated": self._evaluated_step}
+        self._run.save_checkpoint(self._write_checkpoint, progress)
+
+    def _write_checkpoint(self, folder: Path) -> None:
+        self.model.save(folder / "model.zip", exclude=["replay_buffer_kwargs"])
+        if isinstance(self.model, OffPolicyAlgorithm):
+            self.model.save_replay_buffer(folder / "replay_buffer.pkl")
+        with (folder / "robots.pkl").open("wb") as file:
+            action_generator = self.model.action_space.np_random.bit_generator.state
+            pickle.dump(([wrapper.state_dict() for wrapper in _stateful_wrappers(self._venv)], action_generator), file)
+
+
+def _linear_decay(initial: float, until: float, completed: float) -> float:
+    """Return a weight that decreases linearly to zero at the completed fraction `until` of the run."""
+    return initial * max(0.0, 1.0 - completed / until) if until > 0 else 0.0

@@ -1,0 +1,236 @@
+"""Run directories: configuration, policy, evaluations, logs, and checkpoints to resume from."""
+
+from __future__ import annotations
+
+import json
+import platform
+import random
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.policies import BasePolicy
+
+import leapnav
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.utils.files import digest, write_text
+from leapnav.envs.utils.json_utils import encode, plain
+from leapnav.training.config import RunConfig
+from leapnav.training.policies.files import save_policy
+from leapnav.training.runs.checks import check_config
+from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, evaluate
+
+LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
+# Settings that may differ when a run is resumed.
+FREE_SETTINGS = ("out", "resume")
+MEASURES = ("success", "collision", "soc", "regret")  # of an evaluation, for each family
+
+
+class Run:
+    """The directory of a training run.
+
+    | File | Content |
+    |---|---|
+    | `config.json` | algorithm, configuration, versions of the libraries |
+    | `policy.json`, `weights.pt` | the policy of the last evaluation, see `load_policy` |
+    | `evaluations.jsonl` | one line per evaluation: step, seconds; success, collision, SOC and regret per family |
+    | `tensorboard/` | logs |
+    | `checkpoint/` | state to resume from; it contains pickle files, so resume only runs from a trusted source |
+
+    Args:
+        algorithm: name of the algorithm.
+        config: the configuration; with `resume`, the directory must contain a run with the same configuration.
+
+    Attributes:
+        folder: the run directory.
+        evaluations: the lines of `evaluations.jsonl`.
+        logger: writer of the TensorBoard logs.
+
+    Raises:
+        FileExistsError: the directory is not empty, and `resume` is not set.
+        FileNotFoundError: there is no run to resume.
+        ValueError: a setting is invalid, or the directory contains a run with another configuration; the message
+            contains the setting and both values.
+
+    """
+
+    def __init__(self, algorithm: str, config: RunConfig) -> None:
+        check_config(config)
+        self.algorithm, self.config, self.folder = algorithm, config, Path(config.out)
+        self._settings: dict[str, Any] = {"algorithm": algorithm, **plain(config)}
+        path = self.folder / "config.json"
+        if config.resume:
+            self._check_settings(path)
+        elif self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+            raise FileExistsError(f"{self.folder}: exists; use --resume to continue this run, or another directory")
+        else:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            content = {"leapnav": leapnav.__version__, "config": self._settings, "versions": _versions()}
+            write_text(path, encode(content, indent=1) + "\n")
+        self.evaluations: list[dict[str, Any]] = []
+        self.logger: Logger = configure(str(self.folder / "tensorboard"), ["tensorboard"])
+        self._started, self._seconds_before = time.monotonic(), 0.0
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """The families of the run's scenarios."""
+        return tuple(FAMILIES) if self.config.family == ALL else (self.config.family,)
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time of the run (s), with evaluations and without interruptions."""
+        return self._seconds_before + time.monotonic() - self._started
+
+    def _check_settings(self, path: Path) -> None:
+        """Check that the stored configuration is that of this run."""
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such run to resume")
+        try:
+            stored: dict[str, Any] = json.loads(path.read_text())["config"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
+        missing = sorted(set(self._settings) - set(stored))
+        if missing:
+            raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
+        for name in sorted({*stored, *self._settings} - set(FREE_SETTINGS)):
+            if stored.get(name) != self._settings.get(name):
+                raise ValueError(
+                    f"{name}: the run in {self.folder} has {stored.get(name)!r}, got {self._settings.get(name)!r}; "
+                    "resume a run with its own configuration"
+                )
+
+    def evaluate(self, policy: PolicyOrFactory, step: int, *, final: bool = False) -> list[Evaluation]:
+        """Evaluate a policy on the test splits of the run's families, and record the results.
+
+        Args:
+            policy: the policy.
+            step: number of samples or environment steps from which the policy has learned.
+            final: play all scenarios instead of the first `evaluation_scenarios`.
+
+        Returns:
+            One evaluation for each family.
+
+        """
+        count = None if final else self.config.evaluation_scenarios
+        options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
+        evaluations = [
+            evaluate(policy, ScenarioBank.shipped(family, "test"), count=count, **options) for family in self.families
+        ]
+        line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
+        for family, evaluation in zip(self.families, evaluations, strict=True):
+            line[family] = plain({name: getattr(evaluation, name) for name in MEASURES})
+            for name, value in line[family].items():
+                if value is not None:
+                    self.logger.record(f"optimum/{family}/{name}", value)
+        self.logger.dump(step)
+        self.evaluations.append(line)
+        self._write_evaluations()
+        return evaluations
+
+    def _write_evaluations(self) -> None:
+        write_text(self.folder / "evaluations.jsonl", "".join(encode(line) + "\n" for line in self.evaluations))
+
+    def save_policy(self, model: BaseAlgorithm | BasePolicy) -> None:
+        """Save the policy with the settings of the run, by which runs that differ only in their seed are grouped."""
+        excluded = (*FREE_SETTINGS, "evaluation_scenarios")  # no influence on the policy
+        training = {name: value for name, value in self._settings.items() if name not in excluded}
+        save_policy(model, self.folder, self.config.environment, training=training)
+
+    def save_checkpoint(self, write: Callable[[Path], None], progress: Mapping[str, Any]) -> None:
+        """Replace the checkpoint; if the process is killed meanwhile, the old one or the new one can be loaded.
+
+        Args:
+            write: function that writes files into a directory.
+            progress: further state to store, as JSON.
+
+        """
+        partial, current = self.folder / ".checkpoint-partial", self.folder / "checkpoint"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        write(partial)
+        th.save(_generator_states(), partial / "generators.pt")
+        manifest = {
+            "files": {path.name: digest(path) for path in sorted(partial.iterdir())},
+            "progress": dict(progress),
+            "seconds": self.seconds,
+            "evaluations": len(self.evaluations),
+        }
+        # Not `encode`: NaN in the progress has to be restored as NaN.
+        (partial / "manifest.json").write_text(json.dumps(manifest) + "\n")
+        old = self.folder / ".checkpoint-old"
+        shutil.rmtree(old, ignore_errors=True)
+        if current.exists():
+            current.rename(old)
+        partial.rename(current)
+        shutil.rmtree(old, ignore_errors=True)
+
+    def load_checkpoint(self) -> tuple[Path, dict[str, Any]] | None:
+        """Load the checkpoint, and discard the evaluations recorded after it.
+
+        Call `restore_generators` after everything else is restored.
+
+        Returns:
+            The directory and the progress of the checkpoint; None if there is no checkpoint.
+
+        Raises:
+            ValueError: the checkpoint is damaged; the message contains the file.
+
+        """
+        folder = self.folder / "checkpoint"
+        if not folder.exists() and (self.folder / ".checkpoint-old").exists():
+            # The process was killed between the two renames in `save_checkpoint`.
+            (self.folder / ".checkpoint-old").rename(folder)
+        if not folder.exists():
+            return None
+        try:
+            manifest = json.loads((folder / "manifest.json").read_text())
+            digests, progress = dict(manifest["files"]), dict(manifest["progress"])
+            self._seconds_before, count = float(manifest["seconds"]), int(manifest["evaluations"])
+            lines = (self.folder / "evaluations.jsonl").read_text().splitlines() if count else []
+            self.evaluations = [json.loads(line) for line in lines[:count]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{folder}: a damaged checkpoint: {error}") from None
+        for name, expected in digests.items():
+            if not (folder / name).is_file() or digest(folder / name) != expected:
+                raise ValueError(f"{folder / name}: damaged; the run cannot be resumed")
+        self._started = time.monotonic()
+        if count:
+            self._write_evaluations()
+        return folder, progress
+
+    def restore_generators(self) -> None:
+        """Restore the states of the global random generators of Python, NumPy and torch from the checkpoint."""
+        state = th.load(self.folder / "checkpoint" / "generators.pt", weights_only=True)
+        th.set_rng_state(state["torch"])
+        np.random.set_state(("MT19937", state["numpy"].numpy().astype(np.uint32), *state["numpy_rest"]))  # noqa: NPY002
+        random.setstate((state["python"][0], tuple(state["python"][1]), state["python"][2]))
+
+
+def _generator_states() -> dict[str, Any]:
+    """The states of the global random generators of Python, NumPy and torch."""
+    numpy_state: Any = np.random.get_state()  # noqa: NPY002 (Stable-Baselines3 draws from it)
+    _, keys, *rest = numpy_state
+    return {
+        "torch": th.get_rng_state(),
+        "numpy": th.as_tensor(keys.astype(np.int64)),
+        "numpy_rest": rest,
+        "python": list(random.getstate()),
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in LIBRARIES},
+        "threads": str(th.get_num_threads()),
+        "begun": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }

@@ -1,0 +1,288 @@
+"""Evaluation of policies, the expert included, on the scenarios of a bank with known optima."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Protocol
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from leapnav.envs.episodes import act_with, play_episode
+from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenarios.bank import Reference, ScenarioBank
+from leapnav.envs.scenarios.families import FAMILIES
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
+from leapnav.experts.problem.problem import Trajectory
+from leapnav.experts.solve import solve
+
+BATCH_SIZE = 256  # episodes simulated in parallel
+MAX_TIMED_ACTIONS = 100
+MIN_REVERSE_SPEED = 0.05  # m/s; an optimum that reaches this speed backwards counts as reversing
+
+
+class Policy(Protocol):
+    """Any object with the `predict` method of Stable-Baselines3, for one observation or a batch of observations."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions for observations, and the state of a recurrent policy."""
+        ...
+
+
+# A policy that depends on the environment, such as `ExpertPolicy`, is given as a function of the environment.
+PolicyOrFactory = Policy | Callable[[Any], Policy]
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """The result of a policy on one scenario.
+
+    Attributes:
+        family, index, scenario: the scenario: its family, its index in the bank, its name.
+        success, collision: outcome of the episode.
+        cost: cost J of the episode.
+        episode_return: sum of the rewards.
+        reference_cost: optimal cost J* of the scenario.
+        reached_reference: optimal cost J* for the pose that a successful episode has reached, solved with the reference
+            as the initial guess; NaN for other episodes, and if no certified extremal was found.
+        clearance: minimum clearance of the episode (m).
+        reference_clearance: minimum clearance of the optimum (m).
+        reversing: whether the optimum contains backward driving.
+        states (K + 1, 3): the poses before and after each environment step.
+
+    """
+
+    family: str
+    index: int
+    scenario: str
+    success: bool
+    collision: bool
+    cost: float
+    episode_return: float
+    reference_cost: float
+    reached_reference: float
+    clearance: float
+    reference_clearance: float
+    reversing: bool
+    states: np.ndarray
+
+    @property
+    def soc(self) -> float:
+        """Success weighted by optimal cost: S J* / max(J, J*)."""
+        return float(self.success) * self.reference_cost / max(self.cost, self.reference_cost)
+
+    @property
+    def ratio(self) -> float:
+        """Cost ratio J / J* of the performance profile; infinite for an unsuccessful episode."""
+        return self.cost / self.reference_cost if self.success else math.inf
+
+    @property
+    def regret(self) -> float:
+        """Regret (J - J*) / J*, with J* for the reached pose."""
+        return (self.cost - self.reached_reference) / self.reached_reference
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The results of a policy on a bank.
+
+    Attributes:
+        episodes: the episodes, in the order of the bank.
+        milliseconds: median computation time of one action (ms).
+
+    """
+
+    episodes: tuple[Episode, ...]
+    milliseconds: float
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.episodes)
+
+    @property
+    def success(self) -> float:
+        """Success rate."""
+        return float(np.mean([episode.success for episode in self.episodes]))
+
+    @property
+    def collision(self) -> float:
+        """Collision rate."""
+        return float(np.mean([episode.collision for episode in self.episodes]))
+
+    @property
+    def soc(self) -> float:
+        """Mean success weighted by optimal cost."""
+        return float(np.mean([episode.soc for episode in self.episodes]))
+
+    @property
+    def regret(self) -> float:
+        """Median regret of the successful episodes; NaN if there are none."""
+        values = [episode.regret for episode in self.episodes if episode.success]
+        return float(np.nanmedian(values)) if values else math.nan
+
+
+def evaluate(
+    policy: PolicyOrFactory,
+    bank: ScenarioBank | str = "clutter",
+    *,
+    count: int | None = None,
+    environment: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    timed: bool = True,
+    label: str = "Evaluating",
+    progress: bool = True,
+) -> Evaluation:
+    """Evaluate a policy on each scenario of a bank, with deterministic actions.
+
+    The same policy, bank and seed give the same episodes.
+
+    Args:
+        policy: an object with the `predict` method of Stable-Baselines3 for batches of observations, or a function that
+            returns one for an environment, such as `ExpertPolicy`.
+        bank: a bank, or the name of a family for its test split.
+        count: number of scenarios, from the first of the bank; None: all.
+        environment: arguments of the environment, such as `observation`.
+        seed: random seed of the disturbances.
+        timed: measure the computation time of an action; otherwise `milliseconds` is NaN.
+        label: label of the progress bar.
+        progress: show a progress bar.
+
+    Raises:
+        TypeError: `policy` is neither a policy nor a function that returns one.
+        ValueError: an argument is invalid, or the policy expects other observations.
+
+    """
+    if not (hasattr(policy, "predict") or callable(policy)):
+        raise TypeError(
+            "policy: expected one with `predict`, or a function that makes one for an environment, got "
+            f"{type(policy).__name__}"
+        )
+    if not isinstance(bank, ScenarioBank):
+        if not isinstance(bank, str) or bank not in FAMILIES:
+            got = repr(bank) if isinstance(bank, str) else type(bank).__name__
+            raise ValueError(f"bank: expected a ScenarioBank or one of {', '.join(FAMILIES)}, got {got}")
+        bank = ScenarioBank.shipped(bank, "test")
+    if len(bank) == 0 or (count is not None and count < 1):
+        raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
+    arguments = dict(environment or {})
+    indices = list(range(len(bank) if count is None else min(count, len(bank))))
+    episodes: list[Episode] = []
+    with tqdm(total=len(indices), desc=label, unit="episode", disable=not progress) as bar:
+        for first in range(0, len(indices), BATCH_SIZE):
+            batch = indices[first : first + BATCH_SIZE]
+            episodes += _play_batch(policy, bank, batch, arguments, seed, bar.update)
+    return Evaluation(tuple(episodes), _median_milliseconds(policy, bank, arguments) if timed else math.nan)
+
+
+def _play_batch(
+    policy_or_factory: PolicyOrFactory,
+    bank: ScenarioBank,
+    indices: Sequence[int],
+    arguments: Mapping[str, Any],
+    seed: int,
+    on_episode: Callable[[], Any],
+) -> list[Episode]:
+    """Play scenarios of a bank in parallel, one robot for each."""
+    count = len(indices)
+    venv = NavigateVectorEnv(count, bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
+    policy = _policy_for(policy_or_factory, venv, venv.single_observation_space)
+    observations, _ = venv.reset(seed=seed, options={"index": list(indices)})
+    poses, returns, clearances = [venv.poses], np.zeros(count), np.full(count, np.inf)
+    episodes: list[Episode | None] = [None] * count
+    state, starts = None, np.ones(count, dtype=bool)
+    while any(episode is None for episode in episodes):
+        actions, state = policy.predict(observations, state, starts, deterministic=True)
+        observations, rewards, starts, _, infos = venv.step(actions)
+        playing = np.array([episode is None for episode in episodes])
+        returns += np.where(playing, rewards, 0.0)
+        # Robots whose episode has ended are already in the next one; their last step is in `final_info`.
+        last = infos.get("final_info", infos)
+        poses.append(np.where(starts[:, None], last["pose"], infos["pose"]))
+        clearances = np.minimum(clearances, np.where(starts, last["clearance"], infos["clearance"]))
+        for i in np.flatnonzero(starts & playing).tolist():
+            episodes[i] = _make_episode(
+                bank,
+                indices[i],
+                np.array([row[i] for row in poses]),
+                success=bool(last["is_success"][i]),
+                collision=bool(last["collision"][i]),
+                cost=float(last["cost"][i]),
+                episode_return=float(returns[i]),
+                clearance=float(clearances[i]),
+            )
+            on_episode()
+    venv.close()
+    return [episode for episode in episodes if episode is not None]
+
+
+def _make_episode(bank: ScenarioBank, index: int, states: np.ndarray, *, success: bool, **outcome: Any) -> Episode:
+    """Combine the outcome of an episode with the reference of its scenario."""
+    scenario, reference = bank[index], bank.reference(index)
+    return Episode(
+        family=bank.family,
+        index=index,
+        scenario=scenario.name,
+        success=success,
+        reference_cost=reference.cost,
+        reached_reference=_optimal_cost_to(states[-1], scenario, reference) if success else math.nan,
+        reference_clearance=reference.certificate[3],
+        reversing=bool(reference.controls[:, 0].min() < -MIN_REVERSE_SPEED),
+        states=states,
+        **outcome,
+    )
+
+
+def _optimal_cost_to(pose: np.ndarray, scenario: Scenario, reference: Reference) -> float:
+    """Return J* for a goal pose within the tolerances of the scenario's goal; NaN if no certified extremal is found."""
+    heading = None if scenario.goal[2] is None else math.remainder(float(pose[2]), 2 * math.pi)
+    reached = scenario.model_copy(update={"goal": (float(pose[0]), float(pose[1]), heading)})
+    guess = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
+    extremal = solve(reached, "multiple_shooting", guess=guess)
+    return extremal.cost if extremal.success else math.nan
+
+
+def _median_milliseconds(policy_or_factory: PolicyOrFactory, bank: ScenarioBank, arguments: Mapping[str, Any]) -> float:
+    """Return the median computation time of one action on the first scenario of a bank (ms)."""
+    env = NavigateEnv(bank=bank, **arguments)
+    act = act_with(_policy_for(policy_or_factory, env, env.observation_space))
+    seconds: list[float] = []
+
+    def timed_act(observation: Any, info: dict[str, Any]) -> np.ndarray | None:
+        started = time.perf_counter()
+        action = act(observation, info)
+        seconds.append(time.perf_counter() - started)
+        return action
+
+    _, _, steps = play_episode(env, timed_act, seed=0, options={"index": 0})
+    for _ in islice(steps, MAX_TIMED_ACTIONS):
+        pass
+    env.close()
+    return 1e3 * float(np.median(seconds))
+
+
+def _policy_for(policy_or_factory: PolicyOrFactory, env: Any, observation_space: Any) -> Policy:
+    """Return the policy for an environment, after a check of its observation space."""
+    given: Any = policy_or_factory
+    policy: Policy = given if hasattr(given, "predict") and not isinstance(given, type) else given(env)
+    if not hasattr(policy, "predict"):
+        raise TypeError(f"policy: expected one with `predict`, got {type(policy).__name__}")
+    expected = getattr(policy, "observation_space", None)
+    if expected is not None and expected != observation_space:
+        raise ValueError(
+            f"policy: expected observations {expected.shape or 'as a dict'}, got {observation_space.shape or 'a dict'} "
+            "or other bounds; pass the arguments of the environment that the policy was trained with"
+        )
+    return policy

@@ -1,0 +1,259 @@
+"""`leapnav report`: a self-contained HTML page about training runs."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+import leapnav
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.utils.files import write_text
+from leapnav.envs.utils.json_utils import encode
+from leapnav.experts.plotting import CURVES
+from leapnav.training.config import RunConfig, read_config
+from leapnav.training.scoring.comparison import Comparison, compare_policies
+from leapnav.training.scoring.evaluation import Episode, Evaluation
+from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
+from leapnav.training.scoring.reports import COLUMNS, cell, draw_profiles, plot_episodes, row_name
+
+BASELINES = ("expert", "go-to-goal", "random")  # in the order of the table
+CLEARANCE_BINS = (0.0, 0.05, 0.1, 0.2, math.inf)  # bin edges of the optimum's clearance (m)
+N_GALLERY_COLUMNS = 4
+
+
+@dataclass(frozen=True)
+class _RunRecord:
+    """The files of a run.
+
+    Attributes:
+        spec: the policy.
+        config: the configuration.
+        record: content of `config.json`.
+        evaluations: lines of `evaluations.jsonl`.
+
+    """
+
+    spec: PolicySpec
+    config: RunConfig
+    record: dict[str, Any]
+    evaluations: list[dict[str, Any]]
+
+
+def write_report(
+    runs: Sequence[str | os.PathLike[str]],
+    path: str | os.PathLike[str],
+    *,
+    count: int | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> Comparison:
+    """Evaluate runs, the expert and the baselines, and write the page.
+
+    Args:
+        runs: run directories. Runs that differ only in their seed share a row and a curve, as do runs with the same
+            label ("LABEL=DIRECTORY").
+        path: file of the page.
+        count: number of scenarios of each family; None: all.
+        seed: random seed of the bootstrap intervals.
+        progress: show progress bars.
+
+    Returns:
+        The results.
+
+    Raises:
+        FileNotFoundError: a directory contains no run.
+        ValueError: there are no runs, or a run is damaged.
+
+    """
+    if not runs:
+        raise ValueError("runs: expected at least one, got none")
+    records = [_read_run(os.fspath(run)) for run in runs]
+    trained = {family for record in records for family in _families(record.config)}
+    families = [family for family in FAMILIES if family in trained]
+    banks = [ScenarioBank.shipped(family, "test") for family in families]
+    specs = [record.spec for record in records] + [load_policy_spec(name) for name in BASELINES]
+    comparison = compare_policies(specs, banks, count=count, seed=seed, progress=progress)
+    by_row = {
+        row: [record for record in records if any(record.spec is member for member in members)]
+        for row, members in group_by_row([record.spec for record in records]).items()
+    }
+    scores = comparison.scores()
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    template = environment.from_string(files("leapnav.training.scoring").joinpath("report.html.jinja").read_text())
+    page = template.render(
+        title="Training runs" if len(records) > 1 else f"Training run {records[0].spec.name}",
+        version=leapnav.__version__,
+        date=datetime.now().astimezone().strftime("%Y-%m-%d"),
+        episodes=scores[0].episodes,
+        families=families,
+        resampled="the runs" if any(row.runs > 1 for row in scores) else "the scenarios",
+        columns=[title.replace("\n", " ").strip() for title, *_ in COLUMNS] + ["time ms"],
+        rows=[
+            {
+                "name": row_name(row),
+                "cells": [_split_cell(cell(getattr(row, name), *form)) for _, name, *form in COLUMNS]
+                + [(f"{row.milliseconds:.2f}", "")],
+            }
+            for row in scores
+        ],
+        curves=_learning_curves(by_row, families),
+        profiles=_profiles(comparison),
+        failures=_success_tables(comparison),
+        galleries=[{"name": row, "png": _gallery(banks, comparison.runs[row][0])} for row in by_row],
+        runs=[_summary(record) for record in records],
+    )
+    write_text(path, page)
+    return comparison
+
+
+def _families(config: RunConfig) -> tuple[str, ...]:
+    """Return the families that a run was trained for."""
+    return tuple(FAMILIES) if config.family == ALL else (config.family,)
+
+
+def _split_cell(text: str) -> tuple[str, str]:
+    """Return the value of a cell and its interval, which may be empty."""
+    value, _, interval = text.partition("\n")
+    return value, interval
+
+
+def _read_run(name: str) -> _RunRecord:
+    """Read the files of a run, given as DIRECTORY or LABEL=DIRECTORY."""
+    spec = load_policy_spec(name)
+    folder = Path(spec.name)
+    _, config = read_config(folder)
+    try:
+        record = json.loads((folder / "config.json").read_text())
+        lines = (folder / "evaluations.jsonl").read_text().splitlines()
+        return _RunRecord(spec, config, record, [json.loads(line) for line in lines])
+    except ValueError as error:
+        raise ValueError(f"{folder / 'evaluations.jsonl'}: damaged: {error}") from None
+
+
+def _learning_curves(rows: dict[str, list[_RunRecord]], families: Sequence[str]) -> list[dict[str, str]]:
+    """Plot success rate and SOC, means over the families of a run, over steps and over time."""
+    several_runs = any(len(records) > 1 for records in rows.values())
+    note = "; bands: range over the seeds" if several_runs else ""
+    curves = []
+    for axis, label, caption in (
+        ("step", "samples or environment steps", "samples or environment steps used for training"),
+        ("seconds", "wall-clock time (min)", "wall-clock time, evaluations included"),
+    ):
+        figure = Figure(figsize=(10, 3.6), layout="constrained")
+        panels = figure.subplots(1, 2)
+        for axes, measure in zip(panels, ("success", "soc"), strict=True):
+            for index, (row, records) in enumerate(rows.items()):
+                _draw_curve(axes, records, axis, measure, CURVES[index % len(CURVES)], row)
+            if axis == "step":
+                axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.set(xlabel=label, ylabel={"success": "success rate", "soc": "SOC"}[measure], ylim=(-0.02, 1.02))
+            axes.grid(alpha=0.3)
+        handles = panels[1].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+        text = f"Scores on the test split ({', '.join(families)}) against {caption}{note}."
+        curves.append({"svg": _as_svg(figure), "caption": text})
+    return curves
+
+
+def _draw_curve(axes: Axes, records: Sequence[_RunRecord], axis: str, measure: str, color: str, label: str) -> None:
+    """Draw the mean over the seeds, and their range."""
+    curves = []
+    for record in records:
+        families, lines = _families(record.config), record.evaluations
+        values = [float(np.mean([line[family][measure] for family in families])) for line in lines]
+        curves.append((np.array([line[axis] for line in lines], dtype=float), np.array(values)))
+    if axis == "seconds":
+        curves = [(places / 60, values) for places, values in curves]
+    # The grid is that of the run with the most evaluations, up to the end of the shortest run.
+    grid = max(curves, key=lambda curve: len(curve[0]))[0]
+    common = grid[grid <= min(places[-1] for places, _ in curves)]
+    rows = np.array([np.interp(common, places, values) for places, values in curves])
+    axes.plot(common, rows.mean(axis=0), color=color, linewidth=1.6, label=label, marker="o", markersize=2.5)
+    if len(rows) > 1:
+        axes.fill_between(common, rows.min(axis=0), rows.max(axis=0), color=color, alpha=0.18, linewidth=0)
+
+
+def _success_tables(comparison: Comparison) -> list[dict[str, Any]]:
+    """Tabulate the success rate by family, by the optimum's clearance, and by whether the optimum reverses."""
+    bins = [
+        (f"{low:g} to {high:g} m" if math.isfinite(high) else f"over {low:g} m", low, high)
+        for low, high in pairwise(CLEARANCE_BINS)
+    ]
+    groupings: list[tuple[str, dict[str, Callable[[Episode], bool]]]] = [
+        ("by family", {family: lambda e, family=family: e.family == family for family in comparison.families}),
+        (
+            "by clearance",
+            {name: lambda e, low=low, high=high: low <= e.reference_clearance < high for name, low, high in bins},
+        ),
+        ("by reversing", {"forwards": lambda e: not e.reversing, "reversing": lambda e: e.reversing}),
+    ]
+    first = next(iter(comparison.runs.values()))[0]
+    tables = []
+    for title, groups in groupings:
+        sizes = {name: sum(map(contains, first)) for name, contains in groups.items()}
+        groups = {name: contains for name, contains in groups.items() if sizes[name]}
+        rows = [
+            {
+                "name": policy,
+                "cells": [
+                    f"{100 * np.mean([e.success for run in runs for e in run if contains(e)]):.1f}"
+                    for contains in groups.values()
+                ],
+            }
+            for policy, runs in comparison.runs.items()
+        ]
+        tables.append({"title": title, "columns": [f"{name} ({sizes[name]})" for name in groups], "rows": rows})
+    return tables
+
+
+def _gallery(banks: Sequence[ScenarioBank], evaluation: Evaluation) -> str:
+    """Plot selected episodes of a run, as a PNG file in base64."""
+    buffer = io.BytesIO()
+    plot_episodes(banks, evaluation.episodes, buffer, N_GALLERY_COLUMNS)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def _summary(record: _RunRecord) -> dict[str, str]:
+    """Summarise a run for the list of runs."""
+    last = record.evaluations[-1] if record.evaluations else {"step": 0, "seconds": 0.0}
+    config, algorithm = record.config, record.record["config"]["algorithm"]
+    return {
+        "name": record.spec.name,
+        "summary": (
+            f"{algorithm}, {config.family}, seed {config.seed}, {last['step']:,} samples or environment steps, "
+            f"{last['seconds'] / 60:.1f} min"
+        ),
+        "config": encode(record.record, indent=1),
+    }
+
+
+def _profiles(comparison: Comparison) -> str:
+    """Plot the performance profiles as SVG text."""
+    figure = Figure(figsize=(8, 3.8), layout="constrained")
+    draw_profiles(figure.subplots(), comparison)
+    return _as_svg(figure)
+
+
+def _as_svg(figure: Figure) -> str:
+    """Return a figure as an SVG element, without the XML header."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg")
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]

@@ -1,0 +1,108 @@
+"""Specifications of policies by name, as given on the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from leapnav.experts.acting.policy import ExpertPolicy
+from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
+from leapnav.training.policies.files import load_policy, policy_environment, read_description
+from leapnav.training.scoring.evaluation import Policy, PolicyOrFactory
+
+BASELINES = ("expert", "random", "go-to-goal")
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """Specification of a policy to evaluate.
+
+    Attributes:
+        name: the name without the label: a baseline, a directory or a shipped policy.
+        label: name of the row in the table; None if not given.
+        method: text that is identical for runs that differ only in their seed; None if unknown.
+        policy: the policy, or a function that makes it for an environment.
+        environment: arguments of the environment that determine the policy's observations.
+
+    """
+
+    name: str
+    label: str | None
+    method: str | None
+    policy: PolicyOrFactory
+    environment: Mapping[str, Any]
+
+
+def load_policy_spec(name: str, *, seed: int = 0) -> PolicySpec:
+    """Load a policy by its name.
+
+    Args:
+        name: "expert", "random", "go-to-goal", the directory of a policy or a run, or the name of a shipped policy.
+            With the prefix "LABEL=", policies with the same label are treated as runs of one method.
+        seed: random seed of the random policy.
+
+    Raises:
+        FileNotFoundError: there is no such policy.
+        ValueError: the policy cannot be loaded, see `load_policy`.
+
+    """
+    label, place = (None, name) if Path(name).exists() or "=" not in name else name.split("=", 1)
+    if place in BASELINES:
+        factories: dict[str, Any] = {
+            "expert": ExpertPolicy,
+            "random": lambda env: RandomPolicy(_single_action_space(env), seed),
+            "go-to-goal": GoToGoal,
+        }
+        return PolicySpec(place, label, None, factories[place], {})
+    policy, description = load_policy(place), read_description(place)
+    # The method is the configuration of the run without the seed and the directory.
+    training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
+    method = json.dumps(training, sort_keys=True) if training else None
+    return PolicySpec(place, label, method, policy, policy_environment(place))
+
+
+def group_by_row(specs: Sequence[PolicySpec]) -> dict[str, list[PolicySpec]]:
+    """Group policies by the rows of the table.
+
+    Policies with the same label share a row. Without a label, runs that differ only in their seed share a row.
+
+    Raises:
+        ValueError: two rows would have the same name.
+
+    """
+    groups: dict[tuple[str, str], list[PolicySpec]] = {}
+    for spec in specs:
+        key = ("label", spec.label) if spec.label is not None else ("method", spec.method or spec.name)
+        groups.setdefault(key, []).append(spec)
+    rows: dict[str, list[PolicySpec]] = {}
+    for (kind, label), members in groups.items():
+        name = label if kind == "label" else members[0].name
+        if name in rows:
+            raise ValueError(f"policies: {name}: given more than once")
+        if len({member.name for member in members}) < len(members):
+            raise ValueError(f"policies: {members[0].name}: given more than once")
+        rows[name] = members
+    return rows
+
+
+def make_policy_from_spec(name: str, env: Any, *, seed: int = 0) -> Policy:
+    """Load a policy by its name for an environment, see `load_policy_spec`.
+
+    Raises:
+        FileNotFoundError: there is no such policy.
+        ValueError: the policy cannot be loaded, or was trained with other observations.
+
+    """
+    if name not in BASELINES:
+        return load_policy(name, env)
+    make: Any = load_policy_spec(name, seed=seed).policy
+    return make(env)
+
+
+def _single_action_space(env: Any) -> gym.spaces.Space:
+    return getattr(env, "single_action_space", env.action_space)

@@ -1,0 +1,211 @@
+"""Output of a comparison: tables on the terminal, JSON, and plots of scores, profiles and episodes."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import IO, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+import leapnav
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.utils.files import write_text
+from leapnav.envs.utils.json_utils import encode, plain
+from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.experts.plotting import CURVES, OPTIMUM, draw_scenario
+from leapnav.training.scoring.comparison import Comparison
+from leapnav.training.scoring.evaluation import Episode
+from leapnav.training.scoring.scores import Interval, Score, profile
+
+POLICY_COLOR, FAILURE_COLOR = "#2662ab", "#c0392b"
+RATIOS = np.concatenate([np.linspace(1.0, 1.2, 81), np.linspace(1.2, 2.0, 41)[1:]])  # of the profiles
+# Columns of the table: title, attribute of `Score`, factor, decimals of the value and of its interval.
+COLUMNS = (
+    ("success\n%", "success", 100, 1, 0),
+    ("collision\n%", "collision", 100, 1, 0),
+    ("SOC\n", "soc", 1, 3, 2),
+    ("SOC\nIQM", "soc_iqm", 1, 3, 2),
+    ("regret\n%, median", "regret", 100, 2, 2),
+    ("clearance\nm, median", "clearance", 1, 2, 2),
+)
+N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal; the other outputs have all
+
+
+def print_scores(comparison: Comparison, console: Console | None = None) -> None:
+    """Print the table of the policies with 95 % bootstrap intervals, and for several families a table by family."""
+    console = console or Console()
+    scores = comparison.scores()
+    resampled = "the runs" if any(row.runs > 1 for row in scores) else "the scenarios"
+    table = Table(
+        title=f"{scores[0].episodes} scenarios; brackets: 95 % bootstrap interval over {resampled}",
+        box=box.SIMPLE_HEAD,
+        padding=0,
+        pad_edge=False,
+    )
+    table.add_column("policy", min_width=10, overflow="fold")
+    for title, *_ in COLUMNS[:N_TERMINAL_COLUMNS]:
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("time\nms", justify="right", no_wrap=True)
+    for row in scores:
+        cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS[:N_TERMINAL_COLUMNS]]
+        table.add_row(row_name(row), *cells, f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-")
+    console.print(table)
+    if len(comparison.families) > 1:
+        console.print(_family_table(comparison))
+
+
+def _family_table(comparison: Comparison) -> Table:
+    table = Table(title="success % / SOC by family", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("policy", min_width=6, overflow="fold")
+    rows: dict[str, list[str]] = {name: [] for name in comparison.runs}
+    for family in comparison.families:
+        table.add_column(family, justify="right", no_wrap=True)
+        for row in comparison.of(family).scores():
+            rows[row.policy].append(f"{100 * row.success.value:.1f} / {row.soc.value:.3f}")
+    for name, cells in rows.items():
+        table.add_row(name, *cells)
+    return table
+
+
+def row_name(row: Score) -> str:
+    """Return the name of a row with its number of runs."""
+    return row.policy if row.runs == 1 else f"{row.policy} ({row.runs} runs)"
+
+
+def cell(interval: Interval, factor: float, digits: int, interval_digits: int) -> str:
+    """Format a value and, on the next line, its interval."""
+    if math.isnan(interval.value):
+        return "-"
+    low, high = (f"{factor * bound:.{interval_digits}f}" for bound in (interval.low, interval.high))
+    return f"{factor * interval.value:.{digits}f}\n[{low}, {high}]"
+
+
+def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
+    """Return the tables and all episodes as JSON-able values; NaN and infinity become None."""
+    content = {
+        "environment": ENVIRONMENT,
+        "leapnav": leapnav.__version__,
+        "banks": [{"family": bank.family, "file": bank.path.name} for bank in comparison.banks],
+        "scores": [asdict(row) for row in comparison.scores()],
+        "families": {family: [asdict(row) for row in comparison.of(family).scores()] for family in comparison.families},
+        "episodes": {
+            name: [[_episode_record(episode) for episode in run] for run in runs]
+            for name, runs in comparison.runs.items()
+        },
+    }
+    return plain(content)
+
+
+def write_scores(comparison: Comparison, path: str | os.PathLike[str]) -> None:
+    """Write `scores_to_dict` to a JSON file."""
+    write_text(path, encode(scores_to_dict(comparison), indent=1) + "\n")
+
+
+def _episode_record(episode: Episode) -> dict[str, Any]:
+    record = {name: value for name, value in vars(episode).items() if name not in ("states", "episode_return")}
+    return {**record, "return": episode.episode_return, "soc": episode.soc, "regret": episode.regret}
+
+
+def plot_scores(comparison: Comparison, path: str | os.PathLike[str]) -> None:
+    """Plot success rate and SOC with their intervals, and the performance profiles, into a file."""
+    names = list(comparison.runs)
+    figure = Figure(figsize=(11, 2.4 + 0.35 * len(names)), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.6))
+    scores = comparison.scores()
+    for axes, attribute, title in ((left, "success", "success rate"), (middle, "soc", "SOC")):
+        draw_intervals(axes, {row.policy: getattr(row, attribute) for row in scores}, title)
+    middle.set_yticklabels([])
+    draw_profiles(right, comparison)
+    figure.savefig(path, dpi=130)
+
+
+def draw_intervals(axes: Axes, intervals: Mapping[str, Interval], title: str) -> None:
+    """Draw values with their intervals, one row for each."""
+    for row, interval in enumerate(intervals.values()):
+        color = CURVES[row % len(CURVES)]
+        axes.plot([interval.low, interval.high], [row, row], color=color, linewidth=5, alpha=0.35)
+        axes.plot([interval.value], [row], "o", color=color, markersize=5)
+    axes.set_yticks(range(len(intervals)), list(intervals))
+    axes.invert_yaxis()
+    axes.set(title=title, xlim=(-0.02, 1.02))
+    axes.grid(axis="x", alpha=0.3)
+
+
+def draw_profiles(axes: Axes, comparison: Comparison) -> None:
+    """Draw the performance profiles: the fraction of episodes that succeed with J / J* up to a ratio."""
+    for index, (name, runs) in enumerate(comparison.runs.items()):
+        value, low, high = profile(runs, RATIOS, comparison.seed)
+        color = CURVES[index % len(CURVES)]
+        axes.plot(RATIOS, value, color=color, linewidth=1.6, label=name)
+        axes.fill_between(RATIOS, low, high, color=color, alpha=0.15, linewidth=0)
+    axes.set(xlabel="cost / optimal cost", ylabel="fraction of episodes", ylim=(0, 1.02), xlim=(RATIOS[0], RATIOS[-1]))
+    axes.set_title("performance profile")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=8)
+
+
+def plot_episodes(
+    banks: Sequence[ScenarioBank],
+    episodes: Sequence[Episode],
+    path: str | os.PathLike[str] | IO[bytes],
+    columns: int = 4,
+) -> None:
+    """Plot the best, median and worst episodes of a policy with their optima into a file.
+
+    Args:
+        banks: the banks of the episodes.
+        episodes: the episodes of a policy.
+        path: the file.
+        columns: number of episodes in each row, see `extremes`.
+
+    """
+    rows = extremes(episodes, columns)
+    figure = Figure(figsize=(3.1 * columns, 3.3 * len(rows)), layout="constrained")
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    for row_axes, (title, chosen) in zip(grid, rows.items(), strict=True):
+        for column, axes in enumerate(row_axes):
+            if column < len(chosen):
+                draw_episode(axes, banks, chosen[column])
+            else:
+                axes.set_visible(False)
+        row_axes[0].set_ylabel(title, fontsize=11)
+    figure.savefig(path, dpi=130)
+
+
+def extremes(episodes: Sequence[Episode], count: int) -> dict[str, list[Episode]]:
+    """Select the best, median and worst episodes, without empty groups.
+
+    Best and median refer to the cost ratio J / J* of the successful episodes. The worst are unsuccessful episodes,
+    collisions first, followed by the successful episodes with the highest cost ratio.
+
+    Args:
+        episodes: the episodes.
+        count: maximum number of episodes in each group.
+
+    """
+    successes = sorted((e for e in episodes if e.success), key=lambda e: e.cost / e.reference_cost)
+    failures = sorted((e for e in episodes if not e.success), key=lambda e: not e.collision)
+    middle = max(0, len(successes) // 2 - count // 2)
+    worst = failures[:count] + successes[::-1][: max(0, count - len(failures))]
+    rows = {"best": successes[:count], "median": successes[middle : middle + count], "worst": worst}
+    return {title: chosen for title, chosen in rows.items() if chosen}
+
+
+def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) -> None:
+    """Draw a scenario with its optimum (dashed) and the policy's path (blue if successful, else red)."""
+    bank = next(bank for bank in banks if bank.family == episode.family)
+    draw_scenario(axes, bank[episode.index])
+    axes.plot(*bank.states(episode.index)[:, :2].T, color=OPTIMUM, linewidth=1.2, linestyle="--")
+    axes.plot(*episode.states[:, :2].T, color=POLICY_COLOR if episode.success else FAILURE_COLOR, linewidth=1.8)
+    outcome = "collision" if episode.collision else "missed"
+    if episode.success:
+        outcome = f"cost {100 * (episode.cost / episode.reference_cost - 1):+.1f} %"
+    axes.set_title(f"{episode.scenario}: {outcome}", fontsize=9)
