@@ -251,7 +251,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self._choice = choice
         self._playing[0] = True
         self._trail = [self.pose]
-        info = self._info()
+        info = self._info(self._simulator.state[0].tolist())
         info["scenario"] = self.scenario
         if isinstance(choice, int) and self.bank is not None:
             info["index"], info["reference_cost"] = choice, float(self.bank.costs[choice])
@@ -273,13 +273,13 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self._simulator.step(check_actions(action, (2,)).reshape(1, 2), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)
-        row = self._simulator.state[0]
-        observation, info = self._observe(), self._info()
-        terminated = bool(row[columns.TERMINATED])
+        row = self._simulator.state[0].tolist()
+        observation, info = self._observe(), self._info(row)
+        terminated = row[columns.TERMINATED] != 0.0
         self._playing[0] = not terminated
         if self.render_mode == "human":
             self.render()
-        return observation, float(row[columns.REWARD]), terminated, False, info
+        return observation, row[columns.REWARD], terminated, False, info
 
     def render(self) -> np.ndarray | None:
         """Render the scene.
@@ -365,8 +365,8 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self._simulator.observe(out)
         return self._simulator.layout.divide(out[0])
 
-    def _info(self) -> dict[str, Any]:
-        row = self._simulator.state[0].tolist()
+    def _info(self, row: list[float]) -> dict[str, Any]:
+        """Return the info of a step, from the robot's row of the state."""
         parts = {name: -row[column] for name, column in columns.PARTS.items()}
         if self.settings.reward == "shaped":
             parts["shaping"] = row[columns.SHAPING]

@@ -101,6 +101,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._noise_generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._ended = np.zeros(self.num_envs, dtype=bool)
+        self._all_robots, self._no_robots = np.ones(self.num_envs, dtype=bool), np.zeros(self.num_envs, dtype=bool)
         self._trails: list[list[tuple[float, float, float]]] = [[] for _ in range(self.num_envs)]
 
     def reset(
@@ -209,7 +210,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and restarting.any():
             self._start(np.flatnonzero(restarting))
         else:
-            restarting = np.zeros(self.num_envs, dtype=bool)
+            restarting = self._no_robots
         ended = state[:, columns.TERMINATED] > 0
         flat = self._flat_observations()
         rewards = self._rewards(flat, ended, restarting)
@@ -224,8 +225,8 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._start(robots)
             simulator.observe(flat, robots)
             restarting = ended
-        self._ended = ended & (self.autoreset_mode is not AutoresetMode.SAME_STEP)
-        infos.update(self._infos(np.ones(self.num_envs, dtype=bool), restarting))
+        self._ended = (self._no_robots if self.autoreset_mode is AutoresetMode.SAME_STEP else ended).copy()
+        infos.update(self._infos(self._all_robots, restarting if restarting is not self._no_robots else None))
         truncated = np.zeros(self.num_envs, dtype=bool)
         return simulator.layout.divide(flat), rewards, ended, truncated, infos
 

@@ -203,25 +203,26 @@ class BatchSimulator:
 
         """
         active = self._all_active if active is None else active
-        state = self.state
+        state, arrays = self.state, self._arrays
         if self._disturbed:
             self._noise_rows[:] = state[:, STEPS] % NOISE_ROWS
-        invalid = stepping.command(actions, active, self._arrays)
+        start = stepping.command if self._motors else stepping.drive_arcs
+        invalid = start(actions, active, arrays)
         if invalid >= 0:
             robot = "" if len(state) == 1 else f" for robot {invalid}"
             raise ValueError(f"action: expected two finite numbers, got {actions[invalid].tolist()}{robot}")
         if self._motors:
-            for substep in range(self._substeps):
-                stepping.drive_motors(self._arrays, substep, self._substeps)
+            bodies, substeps = self._free.rows, self._substeps
+            for substep in range(substeps):
+                stepping.drive_motors(bodies, state, self.tasks, self.fields, self._packed, substep, substeps)
                 self._free.advance()
-                stepping.read_velocities(self._arrays, self._substeps)
+            stepping.read_velocities(bodies, state, substeps)
         else:
-            stepping.drive_arcs(self._arrays)
             self._free.advance()
         if not self.settings.terminate_on_collision:
             for i in np.flatnonzero(state[:, REMAINING] > 0).tolist():
                 self._drive_in_contact(i)
-        stepping.end_periods(active, self._arrays)
+        stepping.end_periods(active, arrays)
         if self._disturbed:
             # The observation at the end of a period uses the noise row of the next period.
             for i in np.flatnonzero(active & (state[:, STEPS] % NOISE_ROWS == 0)).tolist():
@@ -298,5 +299,6 @@ def _get_field(choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray:
 
 def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
-    moving = (stepping.drive_motors, stepping.read_velocities) if settings.motors else (stepping.drive_arcs,)
-    return stepping.start_episodes, stepping.command, *moving, stepping.end_periods, observe_robots
+    motors = stepping.command, stepping.drive_motors, stepping.read_velocities
+    moving = motors if settings.motors else (stepping.drive_arcs,)
+    return stepping.start_episodes, *moving, stepping.end_periods, observe_robots

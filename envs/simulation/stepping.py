@@ -149,15 +149,22 @@ def command(actions, active, packed):
     return -1
 
 
-@kernel(NOTHING(PACKED_STATE))
-def drive_arcs(packed):
+@kernel(int64(MATRIX, FLAGS, PACKED_STATE))
+def drive_arcs(actions, active, packed):
     """Set the velocity of each body for its period, up to the first contact, and add the running cost.
 
     The chord of the arc that a command drives has the length v h sinc(omega h / 2) and the mean heading. A body whose
     velocity is the chord ends at the end of the arc, because Chipmunk moves bodies by an explicit Euler step.
+
+    Returns:
+        As `command`, which is called first.
+
     """
     sim = SimulationState(*packed)
     bodies, state = sim.bodies, sim.state
+    invalid = command(actions, active, packed)
+    if invalid >= 0:
+        return invalid
     for i in range(len(state)):
         bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
         if state[i, DURATION] == 0.0:
@@ -178,6 +185,7 @@ def drive_arcs(packed):
             state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, field) * driven
         chord, middle = distance * sinc(turn / 2), heading + turn / 2
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = chord * math.cos(middle), chord * math.sin(middle), turn
+    return -1
 
 
 @kernel(types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, float64, float64, VECTOR))
@@ -201,11 +209,24 @@ def wheel_forces(vx, vy, heading, spin, speed, turn_rate, duration, settings):
     return cos * along - sin * across, sin * along + cos * across, half * (right - left)
 
 
-@kernel(NOTHING(PACKED_STATE, int64, int64))
-def drive_motors(packed, substep, substeps):
-    """Set velocity and force of each body for one substep, up to the first contact, and add the running cost."""
-    sim = SimulationState(*packed)
-    bodies, state = sim.bodies, sim.state
+# The kernels of a substep take the arrays that they use: Numba takes twice as long to receive a tuple from Python.
+@kernel(NOTHING(MATRIX, MATRIX, int64))
+def read_velocities(bodies, state, substeps):
+    """Read the velocities after a substep; those of a robot in contact are unchanged."""
+    for i in range(len(state)):
+        step = state[i, DURATION] / substeps
+        if step > 0.0 and state[i, IN_CONTACT] == 0.0:
+            state[i, VX], state[i, VY], state[i, SPIN] = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
+
+
+@kernel(NOTHING(MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, int64, int64))
+def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
+    """Set velocity and force of each body for one substep, up to the first contact, and add the running cost.
+
+    The velocities after the previous substep are read first.
+    """
+    if substep > 0:
+        read_velocities(bodies, state, substeps)
     for i in range(len(state)):
         for column in range(3, 9):
             bodies[i, column] = 0.0
@@ -213,12 +234,12 @@ def drive_motors(packed, substep, substeps):
         if step == 0.0 or state[i, IN_CONTACT] != 0.0:
             continue
         dx, dy, turn = state[i, VX] * step, state[i, VY] * step, state[i, SPIN] * step
-        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.fields[i]
+        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], fields[i]
         distance, course = math.sqrt(dx * dx + dy * dy), math.atan2(dy, dx)
         lowest, fraction, after = follow_arc(x, y, course, distance, 0.0, state[i, POSE_CLEARANCE], field)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = min(state[i, CLEARANCE], lowest), after
         speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
-        state[i, EFFORT] += effort(sim.tasks, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
+        state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
         state[i, PROXIMITY] += arc_proximity(x, y, course, distance * fraction, 0.0, field) * step * fraction
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * fraction, dy * fraction, turn * fraction
         if fraction < 1.0:
@@ -227,19 +248,8 @@ def drive_motors(packed, substep, substeps):
             state[i, REMAINING] = state[i, DURATION] - step * (substep + fraction)
             continue
         wheels = state[i, SPEED], state[i, TURN_RATE]
-        fx, fy, torque = wheel_forces(state[i, VX], state[i, VY], heading, state[i, SPIN], *wheels, step, sim.settings)
+        fx, fy, torque = wheel_forces(state[i, VX], state[i, VY], heading, state[i, SPIN], *wheels, step, settings)
         bodies[i, 6], bodies[i, 7], bodies[i, 8] = fx * step * step, fy * step * step, torque * step * step
-
-
-@kernel(NOTHING(PACKED_STATE, int64))
-def read_velocities(packed, substeps):
-    """Read the velocities after a substep; those of a robot in contact are unchanged."""
-    sim = SimulationState(*packed)
-    bodies, state = sim.bodies, sim.state
-    for i in range(len(state)):
-        step = state[i, DURATION] / substeps
-        if step > 0.0 and state[i, IN_CONTACT] == 0.0:
-            state[i, VX], state[i, VY], state[i, SPIN] = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
 
 
 @kernel(boolean(int64, SIMULATION_STATE))

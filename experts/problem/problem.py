@@ -9,13 +9,11 @@ from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
-import sympy as sp
 
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
-from leapnav.experts.problem.generated_flow import compile_flow
 from leapnav.experts.problem.system import ControlAffineSystem, as_expression, unicycle
 
 
@@ -120,7 +118,7 @@ class OptimalControlProblem:
         """Return the problem of a scenario, with the robot's limits as control bounds."""
         robot, cost = scenario.robot, scenario.cost
         return cls(
-            system=_UNICYCLE,
+            system=unicycle(),
             start=scenario.start,
             goal=scenario.goal,
             horizon=scenario.horizon,
@@ -147,8 +145,11 @@ class OptimalControlProblem:
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem in the form that the kernels take."""
+        from leapnav.experts.problem.generated_flow import compile_flow
+
         m = self.system.m
-        flow, control = compile_flow(self.system, sp.sympify(self.state_cost), self.field is not None)
+        state_cost = as_expression("state_cost", self.state_cost)
+        flow, control = compile_flow(self.system, state_cost, self.field is not None)
         bounds = np.array(
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
@@ -255,9 +256,6 @@ def _constant(values: Sequence[float] | list[float]) -> np.ndarray:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
-
-
-_UNICYCLE = unicycle()
 
 
 def as_problem(task: OptimalControlProblem | Scenario) -> OptimalControlProblem:

@@ -1,12 +1,14 @@
-"""Control-affine systems, declared in SymPy."""
+"""Control-affine systems, declared in SymPy, which is imported when the first one is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
-import sympy as sp
+if TYPE_CHECKING:
+    import sympy as sp
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ class ControlAffineSystem:
         position: Sequence[sp.Symbol] | None = None,
         parameters: Sequence[sp.Symbol] = (),
     ) -> None:
+        import sympy as sp
+
         n = len(state)
         if n == 0 or len(set(state)) < n or not all(isinstance(s, sp.Symbol) for s in state):
             raise ValueError(f"state: expected distinct SymPy symbols, got {state!r}")
@@ -116,6 +120,8 @@ def as_expression(where: str, value: Any) -> sp.Expr:
         ValueError: the value is no expression, or it contains NaN or infinity.
 
     """
+    import sympy as sp
+
     try:
         expression = sp.sympify(value)
     except (sp.SympifyError, TypeError, AttributeError, SyntaxError):
@@ -125,8 +131,11 @@ def as_expression(where: str, value: Any) -> sp.Expr:
     return expression
 
 
+@cache
 def unicycle() -> ControlAffineSystem:
     """Return the unicycle: q = (x, y, theta), u = (v, omega) in m/s and rad/s."""
+    import sympy as sp
+
     x, y, theta = sp.symbols("x y theta")
     return ControlAffineSystem(
         state=(x, y, theta),
@@ -142,6 +151,8 @@ def differential_drive() -> ControlAffineSystem:
 
     Its parameter `track` is the distance (m) between the wheels.
     """
+    import sympy as sp
+
     x, y, theta, track = sp.symbols("x y theta track")
     return ControlAffineSystem(
         state=(x, y, theta),
@@ -158,6 +169,8 @@ def differential_drive() -> ControlAffineSystem:
 
 def unicycle_with_inertia() -> ControlAffineSystem:
     """Return the unicycle with inertia: q = (x, y, theta, v, omega), u = (dv/dt, domega/dt) in m/s^2 and rad/s^2."""
+    import sympy as sp
+
     x, y, theta, v, omega = sp.symbols("x y theta v omega")
     return ControlAffineSystem(
         state=(x, y, theta, v, omega),
