@@ -16,10 +16,11 @@ from typing import Any
 from llvmlite import ir
 from numba import float64, types
 from numba.core import cgutils
+from numba.core.boxing import unbox_tuple
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
-from numba.extending import intrinsic
+from numba.extending import NativeValue, intrinsic, unbox
 from numba.np.numpy_support import carray
 
 __all__ = ["FunctionPointer", "Kernel", "carray", "power_of_two", "scratch_buffer"]
@@ -201,3 +202,22 @@ def _typed_scratch_buffer(context: Any, count: Any) -> Any:
 
 scratch_buffer: Any = intrinsic(prefer_literal=True)(_typed_scratch_buffer)
 """In kernels: a pointer to a literal number of floats on the stack, which costs no allocation."""
+
+
+@unbox(types.NamedTuple)
+def _unbox_named_tuple(kind: Any, value: Any, c: Any) -> Any:
+    """Unboxing of a named tuple. For the records of leapnav, without Numba's check of the class.
+
+    The check unpickles the class in every call, which takes longer than many kernels run. `Kernel.typeof_pyval` has
+    already compared the class.
+    """
+    if not hasattr(kind.instance_class, "numba_record_type"):
+        return unbox_tuple(kind, value, c)
+    failed = cgutils.alloca_once_value(c.builder, cgutils.false_bit)
+    members = []
+    for i, member_type in enumerate(kind.types):
+        member = c.unbox(member_type, c.pyapi.tuple_getitem(value, i))
+        with c.builder.if_then(member.is_error, likely=False):
+            c.builder.store(cgutils.true_bit, failed)
+        members.append(member.value)
+    return NativeValue(c.context.make_tuple(c.builder, kind, members), is_error=c.builder.load(failed))

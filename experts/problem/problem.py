@@ -233,11 +233,6 @@ class ProblemArrays:
         self.flow.function(z, self.data, self.field, none, dz, none)
         return dz
 
-    def running_cost(self, z: np.ndarray) -> float:
-        """Return the running cost at z = (q, lambda)."""
-        none, dz = np.empty((len(z), 0)), np.empty(len(z))
-        return self.flow.function(z, self.data, self.field, none, dz, none)
-
 
 def _is_number(value: Any) -> bool:
     """Return whether a value is a real number of Python, NumPy or SymPy that a double can represent."""

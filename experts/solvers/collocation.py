@@ -11,7 +11,7 @@ from numba import int64
 from scipy.integrate import solve_bvp
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CUBE, MATRIX
+from leapnav.envs.kernels.types import CUBE, MATRIX, VECTOR
 from leapnav.experts.numerics.flow import FLOW
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
@@ -44,7 +44,7 @@ def collocation(problem: OptimalControlProblem, path: Trajectory, options: Solve
     def rates(_: np.ndarray, z: np.ndarray) -> np.ndarray:
         nonlocal evaluations
         out = np.empty((z.shape[1], 2 * n))
-        evaluations += _rates(arrays.flow, np.ascontiguousarray(z.T), out)
+        evaluations += _rates(arrays.flow, np.ascontiguousarray(z.T), out, np.empty(len(out)))
         return out.T
 
     def jacobians(_: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -86,15 +86,17 @@ def collocation(problem: OptimalControlProblem, path: Trajectory, options: Solve
 
 def _cost(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> float:
     """Return J by the trapezoidal rule on the mesh, which is accurate enough for the history."""
-    return float(np.trapezoid([problem.arrays.running_cost(z) for z in nodes], times))
+    costs = np.empty(len(nodes))
+    _rates(problem.arrays.flow, nodes, np.empty_like(nodes), costs)
+    return float(np.trapezoid(costs, times))
 
 
-@kernel(int64(FLOW, MATRIX, MATRIX))
-def _rates(flow, Z, out):
-    """Fill the derivatives (N, 2n) of the flow at Z (N, 2n); return the number of evaluations."""
+@kernel(int64(FLOW, MATRIX, MATRIX, VECTOR))
+def _rates(flow, Z, out, costs):
+    """Fill the derivatives (N, 2n) and running costs (N,) at Z (N, 2n); return the number of evaluations."""
     none, d_none = np.empty((Z.shape[1], 0)), np.empty((Z.shape[1], 0))
     for k in range(len(Z)):
-        flow.function(Z[k], flow.data, flow.field, none, out[k], d_none)
+        costs[k] = flow.function(Z[k], flow.data, flow.field, none, out[k], d_none)
     return len(Z)
 
 
