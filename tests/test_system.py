@@ -16,8 +16,10 @@ PROBLEMS["unicycle among discs"] = OptimalControlProblem.from_scenario(best_know
 
 def reduced_hamiltonian(problem, z):
     """Return H* = a'lam + Phi + sum of 1/2 r u^2 + u p, computed from the flow as H = L + lam'q'."""
-    n = problem.system.n
-    return problem.arrays.running_cost(z) + z[n:] @ problem.arrays.rates(z)[:n]
+    n, flow = problem.system.n, problem.arrays.flow
+    none, dz = np.empty((len(z), 0)), np.empty(len(z))
+    running_cost = flow.function(z, flow.data, flow.field, none, dz, none)
+    return running_cost + z[n:] @ dz[:n]
 
 
 def rates(problem, z):

@@ -84,5 +84,5 @@ SIMULATION_STATE = record_type(
     noise_rows=INTEGERS,
     settings=VECTOR,
 )
-# The same as a plain tuple, which is how Python passes it: Numba unpickles the class of a named one at every call.
+# The same as a plain tuple, which Numba receives from Python in less time than a named one.
 PACKED_STATE = types.Tuple(SIMULATION_STATE.types)
