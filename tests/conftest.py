@@ -59,7 +59,7 @@ def clone(dataset, tmp_path_factory):
     policy = make_policy(env.observation_space, env.action_space, seed=0)
 
     def make(out):
-        config = CloningConfig(epochs=60, batch_size=256, patience=0)
+        config = CloningConfig(epochs=40, batch_size=256, patience=0)
         losses = behaviour_clone(policy, dataset, config, progress=False)
         out.mkdir()
         th.save({"policy": policy.state_dict(), "losses": [vars(loss) for loss in losses]}, out / "clone.pt")

@@ -120,16 +120,16 @@ def test_neither_workers_nor_a_half_done_build_change_a_bit(bank, tmp_path):
 
 
 def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
-    whole = build(tmp_path / "whole.bank", count=24)
+    whole = build(tmp_path / "whole.bank", count=16)
     code = (
         "from leapnav.experts import build_bank\n"
         "if __name__ == '__main__':\n"
-        f"    build_bank('clutter', 24, {str(tmp_path / 'killed.bank')!r}, seed=3, workers=2, progress=False)\n"
+        f"    build_bank('clutter', 16, {str(tmp_path / 'killed.bank')!r}, seed=3, workers=2, progress=False)\n"
     )
     script, directory = tmp_path / "build.py", tmp_path / "killed.bank.build"
     script.write_text(code)
     finished: set[str] = set()
-    for more in (4, 7):
+    for more in (3, 5):
         process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
         while process.poll() is None and len(shards(directory)) < len(finished) + more:
             time.sleep(0.01)
@@ -138,7 +138,7 @@ def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
         assert not (tmp_path / "killed.bank").exists()
         before, finished = finished, shards(directory)
         assert finished > before  # nothing finished was lost
-    assert build(tmp_path / "killed.bank", count=24).path.read_bytes() == whole.path.read_bytes()
+    assert build(tmp_path / "killed.bank", count=16).path.read_bytes() == whole.path.read_bytes()
 
 
 def test_two_builds_of_one_bank_do_not_get_in_each_other_s_way(tmp_path):

@@ -59,7 +59,7 @@ def test_killed_and_resumed_it_is_the_dataset_of_one_that_was_not(whole, tmp_pat
     command = [sys.executable, "-m", "leapnav", *arguments, "--out", str(out)]
     rng = np.random.default_rng(0)
     kept = 0
-    for shards in (1, 2, 3):
+    for shards in (1, 3):
         process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
         while len(list(out.glob(f"{WORK}/shard-*.npz"))) < shards and process.poll() is None:
             time.sleep(0.01)

@@ -198,7 +198,7 @@ def warm(out, demos, **changes):
     return ppo(out, start=start, **{**extra, **changes})
 
 
-@pytest.mark.parametrize("name", ["bc", "ppo", "sac", "sac, learning"])
+@pytest.mark.parametrize("name", ["bc", "ppo", pytest.param("sac", marks=pytest.mark.slow), "sac, learning"])
 def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
     """SIGKILL after the first checkpoint; PPO with all parts of a warm start, SAC with demonstrations."""
     straight, killed = tmp_path / "straight", tmp_path / "killed"
