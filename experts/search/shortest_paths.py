@@ -265,21 +265,13 @@ def tree(metric, seeds, targets, rest, exact, limits):
     return cost, parent, limit
 
 
-def meeting_nodes(
-    ahead: np.ndarray, behind: np.ndarray, cost_ahead: np.ndarray, cost_behind: np.ndarray, limit: float
-) -> np.ndarray:
+@kernel(INTEGERS(INDICES, INDICES, VECTOR, VECTOR, float64))
+def meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit):
     """Return the nodes at which both trees share an edge, in order of the cost of the path through them, up to `limit`.
 
     Only there the path through a node is locally shortest; through all other nodes it is a detour. (These nodes are the
     plateaus of alternative routes: I. Abraham et al., Alternative Routes in Road Networks, J. Exp. Algorithmics, 2013.)
     """
-    found, through = _shared_edges(ahead, behind, cost_ahead, cost_behind, limit)
-    return found[np.argsort(through, kind="quicksort")]
-
-
-@kernel(tuple_of(INTEGERS, VECTOR)(INDICES, INDICES, VECTOR, VECTOR, float64))
-def _shared_edges(ahead, behind, cost_ahead, cost_behind, limit):
-    """Return the nodes of `meeting_nodes`, unordered, and the costs of the paths through them."""
     found = np.empty(len(ahead), dtype=np.int64)
     through = np.empty(len(ahead))
     count = 0
@@ -288,7 +280,8 @@ def _shared_edges(ahead, behind, cost_ahead, cost_behind, limit):
         if total <= limit and (behind[node] < 0 or ahead[behind[node]] == node):
             found[count], through[count] = node, total
             count += 1
-    return found[:count], through[:count]
+    # Sorted here, because the order in which NumPy puts equal costs depends on the processor.
+    return found[:count][np.argsort(through[:count])]
 
 
 @kernel(INTEGERS(int64, INDICES, INDICES))
@@ -344,4 +337,4 @@ def energy_of(lengths, phi, horizon):
     return math.exp(0.5 * (low + high))
 
 
-LATTICE_KERNELS = (plane_costs, tree, _shared_edges, path_through, mark, energy_of)
+LATTICE_KERNELS = (plane_costs, tree, meeting_nodes, path_through, mark, energy_of)
