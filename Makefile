@@ -20,7 +20,7 @@ compile: .venv/installed
 test: lint types compile .venv/examples
 	$(PYTEST)
 
-# What takes long by nature: see CONTRIBUTING.md.
+# Long checks, see CONTRIBUTING.md.
 test-all: test
 	$(PYTEST) -m "slow"
 	HYPOTHESIS_PROFILE=long $(PYTEST) tests/test_fuzz.py
@@ -35,7 +35,7 @@ lint: .venv/installed
 types: .venv/installed
 	$(BIN)/basedpyright
 
-# Into build/site; needs no network once the packages are there.
+# Into build/site; needs no network once the packages are installed.
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "wrote build/site/index.html"

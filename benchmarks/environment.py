@@ -55,7 +55,7 @@ def measure_rates() -> None:
 
 
 def replay(bank: ScenarioBank, plans: list[np.ndarray], **arguments: object) -> tuple[float, float]:
-    """Fraction of successes when the optima are driven open-loop, and median ratio to the reference cost."""
+    """Fraction of successes when the optima are executed open-loop, and median ratio to the reference cost."""
     venv = NavigateVectorEnv(len(bank), bank=bank, observation="state", autoreset_mode="SameStep", **arguments)
     venv.reset(seed=0, options={"index": list(range(len(bank)))})
     actions = np.zeros((max(map(len, plans)), len(bank), 2), np.float32)

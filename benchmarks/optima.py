@@ -1,8 +1,8 @@
 """From scenario to certified optimum: `find_optimum` compared with IPOPT, and the scaling of bank builds.
 
-Scenarios are unseen by both. The IPOPT problem (CasADi, trapezoidal transcription, 60 intervals) is built once per
-scenario, which is timed separately, and solved from each candidate of the lattice search that `find_optimum` uses. Its
-best path is accurate to about 1e-3 and not certified. In scenes with hundreds of obstacles, which are sampled here,
+The scenarios are not in the banks. The IPOPT problem (CasADi, trapezoidal transcription, 60 intervals) is built once
+per scenario, which is timed separately, and solved from each candidate of the lattice search that `find_optimum` uses.
+Its best path is accurate to about 1e-3 and not certified. In scenes with hundreds of obstacles, which are sampled here,
 IPOPT solves from the first candidate only, with 400 intervals; with fewer, paths cut through obstacles between nodes.
 """
 

@@ -149,7 +149,7 @@ def rows() -> dict[str, Callable[[], Work]]:
 
 
 def serve() -> None:
-    """The loop of one version's process: reads the name of a row, does the work once, answers time and costs."""
+    """The loop of one version's process: reads the name of a row, does the work once, writes time and costs."""
     prepared: dict[str, Work] = {}
     for line in sys.stdin:
         name = line.strip()

@@ -131,7 +131,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     |---|---|---|
     | `family` | `"clutter"` | family of the scenarios, see `leapnav.envs.FAMILIES`; `"all"` samples the family for each episode, with `split="fresh"` only |
     | `scenario` | None | the scenario of all episodes |
-    | `split` | `"train"` | the family's shipped bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
+    | `split` | `"train"` | the family's included bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
     | `observation` | `"lidar"` | `"lidar"`, `"state"` or `"map"` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |

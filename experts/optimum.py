@@ -35,7 +35,7 @@ MAX_ROUNDS = 4
 LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, False), (1, None, True))
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
 # Most families need 1/15 of it, slalom occasionally 4/3; among hundreds of obstacles one candidate takes 1/3. With
-# 10,000, one scenario of the shipped banks would lose its second-best optimum.
+# 10,000, one scenario of the included banks would lose its second-best optimum.
 ALTERNATIVES_BUDGET = 12_000
 
 

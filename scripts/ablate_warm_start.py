@@ -60,7 +60,7 @@ def variants(clone: Path, demos: Path) -> dict[str, PPOConfig | SACConfig]:
 
 
 def summary(run: Path) -> str:
-    """Return the cells of a run: first, worst and final success and SOC, final collisions and median regret."""
+    """Return the cells of a run: initial, minimum and final success and SOC, final collisions and median regret."""
     lines = [json.loads(line)["clutter"] for line in (run / "evaluations.jsonl").read_text().splitlines()]
     first, last, worst = lines[0], lines[-1], min(lines, key=lambda line: line["soc"])
     pairs = [f"{100 * line['success']:.1f} / {line['soc']:.3f}" for line in (first, worst, last)]
@@ -80,7 +80,7 @@ def main() -> None:
     rollout("clutter", DEMONSTRATIONS, demos, seed=DEMONSTRATION_SEED, workers=arguments.workers)
     config = BCConfig.tuned("clutter", out=clone, demos=(demos,), resume=(clone / "config.json").exists())
     train_bc(config)
-    print("| run | first success (%) / SOC | worst | final | collision (%) | regret (%) |")
+    print("| run | initial success (%) / SOC | minimum | final | collision (%) | regret (%) |")
     print("|---|---|---|---|---|---|")
     for index, (name, variant) in enumerate(variants(clone, demos).items()):
         run = runs / f"{index:02d}"

@@ -1,4 +1,4 @@
-"""Build the scenario banks that are shipped with leapnav, or check that a new build is bitwise identical.
+"""Build the scenario banks that are included in leapnav, or check that a new build is bitwise identical.
 
 python scripts/build_banks.py            # builds missing banks; remove a bank to build it again
 python scripts/build_banks.py --check    # builds all banks in a temporary directory and compares
@@ -15,7 +15,7 @@ from leapnav.envs import FAMILIES
 from leapnav.experts import build_bank
 
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
-# Number of scenarios, and seed. Different seeds give independent scenarios, so the splits share none.
+# Number of scenarios, and seed. Different seeds give independent scenarios, so no scenario is in both splits.
 SPLITS = {"train": (400, 0), "test": (200, 1)}
 
 

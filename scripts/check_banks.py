@@ -1,4 +1,4 @@
-"""Builds every bank that ships anew, and compares it with the file (`make test-all`).
+"""Build every included bank again, and compare it with the file (`make test-all`).
 
     python scripts/check_banks.py [FAMILY-SPLIT ...]
 
@@ -23,7 +23,7 @@ PATH_TOLERANCE = 1e-4  # of states, controls and costates, which are stored in s
 
 
 def compare(path: Path, folder: str) -> list[str]:
-    """What differs between a bank and the same bank built anew."""
+    """Return the differences between a bank and a new build of it."""
     shipped = ScenarioBank(path)
     out = Path(folder) / path.name
     bank = build_bank(shipped.family, len(shipped), out, seed=shipped.seed, workers=os.cpu_count() or 1, progress=False)
@@ -42,7 +42,7 @@ def compare(path: Path, folder: str) -> list[str]:
             deviation = float(np.abs(getattr(ours, name) - getattr(theirs, name)).max())
             if deviation > PATH_TOLERANCE:
                 found.append(f"{path.name}: scenario {index}: {name} deviate by {deviation:.1e}")
-    print(f"{path.name}: identical to the byte: {out.read_bytes() == path.read_bytes()}", flush=True)
+    print(f"{path.name}: bitwise identical: {out.read_bytes() == path.read_bytes()}", flush=True)
     return found
 
 

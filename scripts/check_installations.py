@@ -1,8 +1,8 @@
-"""Installs leapnav in fresh environments and runs a smoke test there (`make test-all`).
+"""Install leapnav in fresh environments and run a smoke test there (`make test-all`).
 
     python scripts/check_installations.py [wheel] [lowest] [newest]
 
-- wheel: the built wheel with the pinned versions; the whole suite runs against it, none of the sources beside it.
+- wheel: the built wheel with the pinned versions; the whole test suite runs against it, without the source directories.
 - lowest: the lowest versions that `pyproject.toml` declares (direct dependencies).
 - newest: the newest versions that it allows.
 """

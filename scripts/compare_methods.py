@@ -1,4 +1,4 @@
-"""Compare all methods on all families: clones, PPO and SAC from scratch and from a clone, and the shipped policies.
+"""Compare all methods on all families: clones, PPO and SAC from scratch and from a clone, and the included policies.
 
 python scripts/compare_methods.py --runs DIR                      # skips finished runs in DIR, resumes the others
 python scripts/compare_methods.py --only bc --families open       # trains only these
@@ -83,7 +83,7 @@ def specs(family: str, runs: Path) -> list[str]:
         for run in sorted((runs / family).glob(f"{method}-*"))
         if is_finished(run)
     ]
-    return [*finished, f"DAgger (shipped)={family}", "go-to-goal"]
+    return [*finished, f"DAgger (included)={family}", "go-to-goal"]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Train and score the policies that are shipped with leapnav.
+"""Train and score the policies that are included in leapnav.
 
 python scripts/ship_policies.py                    # all policies, trained in runs/ship; skips finished runs
 python scripts/ship_policies.py clutter all        # only these

@@ -107,7 +107,7 @@ def test_a_bank_is_mapped_and_aligned_and_crosses_processes(bank):
     assert len(pickle.dumps(bank)) < 1000
 
 
-def test_neither_workers_nor_a_half_done_build_change_a_bit(bank, tmp_path):
+def test_a_bank_is_bitwise_independent_of_workers_and_interruptions(bank, tmp_path):
     content = bank.path.read_bytes()
     assert build(tmp_path / "two.bank", workers=2).path.read_bytes() == content
     with partial_build(tmp_path / "half.bank") as store:
@@ -119,7 +119,7 @@ def test_neither_workers_nor_a_half_done_build_change_a_bit(bank, tmp_path):
     assert not store.directory.exists()
 
 
-def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
+def test_a_killed_build_resumes(tmp_path):
     whole = build(tmp_path / "whole.bank", count=16)
     code = (
         "from leapnav.experts import build_bank\n"
@@ -141,27 +141,27 @@ def test_a_build_that_is_killed_goes_on_where_it_was(tmp_path):
     assert build(tmp_path / "killed.bank", count=16).path.read_bytes() == whole.path.read_bytes()
 
 
-def test_two_builds_of_one_bank_do_not_get_in_each_other_s_way(tmp_path):
+def test_a_bank_is_built_by_one_process_at_a_time(tmp_path):
     with partial_build(tmp_path / "x.bank"), pytest.raises(BankError, match="another process"):
         build(tmp_path / "x.bank")
     assert len(build(tmp_path / "x.bank")) == 6
 
 
-def test_a_build_killed_between_its_last_two_steps_is_tidied_up(bank):
+def test_a_build_directory_left_beside_a_complete_bank_is_removed(bank):
     with partial_build(bank.path) as store:
         pass
     assert len(build(bank.path)) == 6
     assert not store.directory.exists()
 
 
-def test_a_damaged_scenario_is_told_by_file_and_number(bank, tmp_path):
+def test_the_error_for_a_damaged_scenario_names_file_and_index(bank, tmp_path):
     path = tmp_path / "damaged.bank"
     path.write_bytes(bank.path.read_bytes().replace(bank[1].to_json().encode()[:20], b"\xff" * 20))
     with pytest.raises(BankError, match=r"damaged\.bank: scenario 1: damaged"):
         ScenarioBank(path)[1]
 
 
-def test_what_is_complete_is_not_built_again_and_nothing_else_is_overwritten(bank):
+def test_a_complete_bank_is_not_rebuilt_and_no_other_file_is_overwritten(bank):
     content, changed = bank.path.read_bytes(), bank.path.stat().st_mtime_ns
     assert len(build(bank.path)) == 6
     with pytest.raises(BankError, match="exists, with count 6 instead of 7"):
@@ -233,14 +233,14 @@ def without_costs(path):
         (without_costs, "not a scenario bank, or damaged: .*costs"),
     ],
 )
-def test_what_is_no_bank_is_told_by_name(bank, change, message, tmp_path):
+def test_the_error_for_an_invalid_bank_names_the_file(bank, change, message, tmp_path):
     path = damaged(bank, tmp_path, change)
     with pytest.raises(BankError, match=message) as caught:
         ScenarioBank(path)
     assert "damaged.bank" in str(caught.value)
 
 
-def test_a_missing_bank_is_told_by_name(tmp_path):
+def test_the_error_for_a_missing_bank_names_the_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.bank: no such bank"):
         ScenarioBank(tmp_path / "none.bank")
 
@@ -267,7 +267,7 @@ def test_a_failed_write_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_only_certified_optima_beyond_doubt_are_admitted():
+def test_only_certified_optima_without_doubts_are_admitted():
     optimum = find_optimum(sample_scenario("clutter", 0))
     assert judge(optimum) is None
     from leapnav.experts import Status
@@ -292,7 +292,7 @@ def test_a_cheaper_path_through_an_obstacle_s_edge_is_a_doubt():
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_shipped_banks_hold_what_they_promise(family):
+def test_the_included_banks_are_certified_and_complete(family):
     for split, count in zip(SPLITS, (400, 200), strict=True):
         shipped = ScenarioBank.shipped(family, split)
         assert len(shipped) == count
@@ -350,7 +350,7 @@ def test_episodes_are_drawn_from_the_bank_by_the_seed(bank):
         ({"bank": "x.bank"}, FileNotFoundError, "x.bank: no such bank"),
     ],
 )
-def test_impossible_banks_are_told_when_the_environment_is_made(arguments, error, message):
+def test_invalid_banks_are_refused_when_the_environment_is_made(arguments, error, message):
     with pytest.raises(error, match=message):
         gym.make(ID, **arguments)
 
@@ -371,6 +371,6 @@ def test_impossible_options_are_named(bank, options, error, message):
         env.reset(options=options)
 
 
-def test_an_index_without_a_bank_is_told():
+def test_an_index_without_a_bank_is_refused():
     with pytest.raises(ValueError, match="'index' needs a bank"):
         gym.make(ID, split="fresh").reset(options={"index": 1})

@@ -46,7 +46,7 @@ def test_an_extremal_past_its_conjugate_point_is_no_success():
             assert found == pytest.approx(conjugate, abs=1e-3)
 
 
-def test_the_other_published_grushin_extremal_is_a_local_minimum_and_dearer():
+def test_the_other_published_grushin_extremal_is_a_local_minimum_of_higher_cost():
     # J = 6.333416555 was published as the optimum. Its b is just beyond pi, where it stops being the global minimum,
     # but before 4.49, where it would stop being a local one.
     problem, cost, _ = PROBLEMS["grushin"]
@@ -169,7 +169,7 @@ def test_a_conjugate_point_of_even_multiplicity_is_seen(method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("horizon", [4.0, 7.0, 13.0])
-def test_an_extremal_at_rest_hides_no_conjugate_point(horizon, method):
+def test_a_conjugate_point_of_an_extremal_at_rest_is_detected(horizon, method):
     # The integrator would take the whole horizon in one step if it controlled the error of the extremal alone.
     x = sp.Symbol("x")
     system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))

@@ -185,7 +185,7 @@ def test_rollout_train_evaluate_and_report_work_together(tmp_path, capsys):
     assert "seed: the run in" in line
 
 
-def test_a_bank_of_ones_own_can_be_played(tmp_path, capsys):
+def test_a_custom_bank_can_be_played(tmp_path, capsys):
     bank = tmp_path / "mine.bank"
     arguments = ["bank", "build", "--family", "open", "--count", "3", "--seed", "5", "--workers", "1"]
     assert main([*arguments, "--out", str(bank)]) == 0
@@ -225,7 +225,7 @@ def test_the_package_is_a_command():
     assert "usage: leapnav" in done.stdout
 
 
-def test_solve_tells_the_alternatives_apart(tmp_path, capsys):
+def test_solve_prints_and_plots_the_alternatives(tmp_path, capsys):
     from leapnav.envs import sample_scenario
 
     path, out, plot = tmp_path / "hard.json", tmp_path / "out.json", tmp_path / "hard.svg"
@@ -278,7 +278,7 @@ def test_every_command_writes_json_to_a_file_or_to_standard_output_alone(
     assert failing([*words, "--json", tmp_path / "missing" / "x.json"], capsys)[0] == 2
 
 
-def test_a_dataset_that_deviates_by_no_number_is_told_in_json_too(tmp_path, capsys, monkeypatch):
+def test_deviations_that_are_not_finite_are_null_in_json(tmp_path, capsys, monkeypatch):
     from leapnav.experts.data import rollouts
 
     replay = rollouts.Replay(episodes=1, observation=float("inf"), reward=0.0, state=float("nan"), worst=0)

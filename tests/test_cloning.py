@@ -108,7 +108,7 @@ def test_a_resumed_fit_has_the_same_bits_as_an_uninterrupted_one(dataset, env, t
     assert second.parameters_to_vector().tobytes() == straight.parameters_to_vector().tobytes()
 
 
-def test_the_hamiltonian_loss_is_what_an_error_costs():
+def test_the_hamiltonian_loss_equals_the_cost_of_an_error():
     """The loss equals H(q, lambda, u) - H(q, lambda, u*) for optima inside the robot's limits and at them."""
     from leapnav.training.learning.cloning import _hamiltonian_loss, action_slopes
 
@@ -177,7 +177,7 @@ def test_the_learning_rate_rises_linearly_and_falls_along_a_cosine():
     assert factor(total) == 0.0
 
 
-def test_a_fit_that_diverges_says_so(dataset, env):
+def test_a_diverging_fit_raises_an_error(dataset, env):
     config = CloningConfig(epochs=3, batch_size=64, learning_rate=1e30)
     with pytest.raises(ValueError, match="learning_rate: the fit diverged in epoch"):
         behaviour_clone(fresh(env), dataset, config, progress=False)

@@ -71,7 +71,7 @@ def test_bad_arguments_of_watch_are_one_line(arguments, message, tmp_path, capsy
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_display_or_moviepy_watch_says_what_to_do(tmp_path, capsys, monkeypatch):
+def test_without_a_display_or_moviepy_watch_names_the_remedy(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     monkeypatch.setattr("pygame.display.init", lambda: None)
     monkeypatch.setattr("pygame.display.get_driver", lambda: "offscreen")
@@ -82,7 +82,7 @@ def test_without_a_display_or_moviepy_watch_says_what_to_do(tmp_path, capsys, mo
     assert 'pip install "leapnav[video]"' in capsys.readouterr().err
 
 
-def test_the_doctor_says_what_is_installed_and_that_it_works(tmp_path, capsys):
+def test_doctor_reports_versions_and_passed_checks(tmp_path, capsys):
     assert main(["doctor", "--json", str(tmp_path / "doctor.json")]) == 0
     out = capsys.readouterr().out
     assert re.search(r"^torch +2\.", out, re.MULTILINE)
@@ -93,7 +93,7 @@ def test_the_doctor_says_what_is_installed_and_that_it_works(tmp_path, capsys):
     assert all(check["passed"] for check in found["checks"])
 
 
-def test_the_doctor_says_what_does_not_work(capsys, monkeypatch):
+def test_doctor_reports_failed_checks(capsys, monkeypatch):
     monkeypatch.setattr("leapnav.training.policies.files.SHIPPED", Path("/nowhere"))
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
@@ -125,7 +125,7 @@ sys.exit(main(["compile", "--jobs", "1", "--json", "-"]))
 """
 
 
-def test_what_is_not_in_the_cache_is_compiled(tmp_path):
+def test_missing_kernels_are_compiled(tmp_path):
     environment = {**os.environ, "LEAPNAV_CACHE_DIR": str(tmp_path)}
     environment.pop("NUMBA_CACHE_DIR", None)
     command = [sys.executable, "-c", COMPILING]

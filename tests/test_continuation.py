@@ -108,7 +108,7 @@ def test_a_blend_lies_between():
     assert middle.field == pytest.approx(expected.field)
 
 
-def test_a_start_heading_turned_by_a_whole_turn_is_the_same_start():
+def test_start_headings_are_equivalent_modulo_2_pi():
     turned = SCENARIO.model_copy(update={"start": (*SCENARIO.start[:2], SCENARIO.start[2] + 2 * math.pi)})
     reference = find_optimum(SCENARIO)
     found = continuation([SCENARIO, turned], guess=reference)
@@ -116,6 +116,6 @@ def test_a_start_heading_turned_by_a_whole_turn_is_the_same_start():
     assert found[1].cost == pytest.approx(reference.cost, rel=1e-9)
 
 
-def test_a_failure_is_that_of_the_problem_asked_for():
+def test_a_failure_is_that_of_the_target_problem():
     found = continuation([pendulum(2.0, bound=20.0), pendulum(2.0, bound=0.1)])
     assert found[1].problem.control_bounds == ((-0.1, 0.1),)

@@ -65,7 +65,7 @@ def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
         assert rest.horizon >= 1.0
 
 
-def test_where_the_expert_cannot_save_an_episode_it_takes_over_no_later():
+def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
     """Takeovers after the first one without an optimum are skipped."""
     solvable = sample_scenario("open", 7)
     hopeless = solvable.model_copy(update={"horizon": 1.0})

@@ -58,7 +58,7 @@ def test_the_error_of_a_replay_falls_with_the_square_of_the_control_period():
     assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 1.7), errors
 
 
-def test_the_expert_policy_drives_whatever_the_environment_plays():
+def test_the_expert_policy_drives_the_scenario_of_the_environment():
     env = NavigateEnv("clutter")
     expert = ExpertPolicy(env)
     for seed in range(3):
@@ -72,7 +72,7 @@ def test_the_expert_policy_drives_whatever_the_environment_plays():
         assert -total == pytest.approx(find_optimum(env.scenario).cost, rel=1e-3)
 
 
-def test_the_expert_says_which_scenario_it_cannot_solve():
+def test_the_error_of_the_expert_names_the_unsolved_scenario():
     walls = tuple({"polygon": {"vertices": ((5.0, y), (5.5, y), (5.5, y + 5.0), (5.0, y + 5.0))}} for y in (0.0, 5.0))
     shut = Scenario(
         name="shut",

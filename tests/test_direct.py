@@ -93,7 +93,7 @@ def test_weights_in_other_units_change_the_cost_and_not_the_path():
     assert other.costates == pytest.approx(100 * one.costates, abs=1e-3)
 
 
-def test_what_cannot_be_solved_is_not_called_converged():
+def test_an_infeasible_problem_does_not_converge():
     """Three metres in a second at two metres a second."""
     limits, field = np.array([2.0, 3.0]), Scenario.from_dict(scenario_fields(obstacles=[])).field
     limits.flags.writeable = False

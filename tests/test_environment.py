@@ -152,7 +152,7 @@ def test_long_periods_are_charged_the_integral_too(period):
     assert coarse[-1][3] == pytest.approx(fine[-1][3], rel=1e-4)
 
 
-def test_after_the_end_nothing_moves_and_nothing_is_paid():
+def test_after_the_end_the_robot_stays_and_the_reward_is_zero():
     env = NavigateEnv(scenario=scenario(horizon=0.1))
     play(env, [np.array([0.5, 0.0])] * 5)
     pose, cost = env.pose, env.step(np.array([1.0, 0.0]))[4]["cost"]
@@ -199,7 +199,7 @@ def test_success_is_within_the_heading_tolerance_modulo_a_turn(heading, success)
     assert info["is_success"] is success
 
 
-def test_a_touch_ends_the_episode_and_is_charged():
+def test_a_collision_ends_the_episode_and_is_penalised():
     wall = {"polygon": {"vertices": [[6, 4], [6.05, 4], [6.05, 6], [6, 6]]}}
     task = scenario(start=[5, 5, 0], goal=[8, 5, 0], obstacles=[wall])
     env = NavigateEnv(scenario=task)
@@ -209,7 +209,7 @@ def test_a_touch_ends_the_episode_and_is_charged():
     assert rows[-1][4][0] == pytest.approx(5.75, abs=0.1)
 
 
-def test_a_robot_that_goes_on_after_a_touch_does_not_pass_through():
+def test_a_robot_that_continues_after_a_contact_does_not_pass_through():
     wall = {"polygon": {"vertices": [[6, 4], [6.05, 4], [6.05, 6], [6, 6]]}}
     task = scenario(start=[5, 5, 0], goal=[8, 5, 0], obstacles=[wall], horizon=10.0)
     env = NavigateEnv(scenario=task, terminate_on_collision=False)
@@ -225,8 +225,8 @@ def test_a_robot_that_goes_on_after_a_touch_does_not_pass_through():
 
 
 @pytest.mark.parametrize(("gap", "period"), [(0.001, 0.05), (0.003, 0.2), (0.005, 0.5)])
-def test_an_arc_close_round_a_disc_is_no_touch(gap, period):
-    # A circle of 1 m at 2 m/s; the chord of a period cuts the corner by more than the gap.
+def test_an_arc_close_to_a_disc_is_not_a_collision(gap, period):
+    # A circle of 1 m at 2 m/s; the chord of a period deviates from the arc by more than the clearance.
     disc = {"circle": {"center": [5.0, 5.0], "radius": 1.0 - 0.25 - gap}}
     task = scenario(start=[6.0, 5.0, math.pi / 2], goal=[2.0, 2.0, 0.0], obstacles=[disc], horizon=3.0)
     env = NavigateEnv(scenario=task, control_period=period)
@@ -240,7 +240,7 @@ def test_an_arc_close_round_a_disc_is_no_touch(gap, period):
     assert env.pose[:2] == pytest.approx((5 + math.cos(angle), 5 + math.sin(angle)), abs=1e-6)
 
 
-def test_lidar_ranges_agree_with_a_fine_walk():
+def test_lidar_ranges_agree_with_dense_sampling_of_the_beams():
     for task, _ in best_known()[::4]:
         x, y, heading = task.start
         # The robot's radius is taken off in `clearances`, not in a ray.
@@ -263,7 +263,7 @@ def test_beams_along_the_axes_see_what_is_there(heading):
     assert east_first == pytest.approx([2.2, 9.0, 1.0, 1.0], abs=1e-5)
 
 
-def test_the_observation_says_what_the_docstring_promises():
+def test_the_observation_agrees_with_the_docstring():
     task = scenario(start=[2.0, 3.0, math.pi / 2], goal=[1.0, 6.0, math.pi], horizon=4.0)
     observation, _ = NavigateEnv(scenario=task).reset()
     assert observation[:GOAL_ENTRIES] == pytest.approx(

@@ -62,7 +62,7 @@ def test_the_expert_scores_one_and_random_zero():
     assert [e.reference_cost for e in random] == pytest.approx(BANK.costs[:10].tolist())
 
 
-def test_going_to_the_goal_suffices_where_nothing_is_in_the_way():
+def test_go_to_goal_succeeds_without_obstacles():
     found = evaluate(GoToGoal, "open", count=50, timed=False, progress=False)
     reached = np.mean([np.hypot(*(e.states[-1, :2] - np.array(BANK[e.index].goal[:2]))) < 0.3 for e in found])
     assert reached > 0.9

@@ -27,7 +27,7 @@ def drive(env, expert, **reset):
 
 @pytest.mark.parametrize("feedback", ["resolve", "gains"])
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_the_expert_arrives_whatever_happens(settings, feedback):
+def test_the_expert_succeeds_under_disturbances(settings, feedback):
     regrets = []
     for family in FAMILIES:
         bank = ScenarioBank.shipped(family, "test")
@@ -41,7 +41,7 @@ def test_the_expert_arrives_whatever_happens(settings, feedback):
     assert np.median(regrets) < (0.002 if not settings else 0.03)
 
 
-def test_without_feedback_noise_leads_astray():
+def test_without_feedback_noise_causes_failures():
     env = NavigateEnv("clutter", split="test", disturbance={"actuation": 0.1})
     results = {}
     for feedback in ("none", "resolve"):
@@ -51,7 +51,7 @@ def test_without_feedback_noise_leads_astray():
     assert not all(results["none"])
 
 
-def test_after_a_push_it_goes_on_from_there():
+def test_the_expert_continues_after_a_push():
     """Half a metre and half a radian off, in the middle of an episode."""
     rng = np.random.default_rng(0)
     tried = 0
@@ -150,7 +150,7 @@ def test_stable_baselines_evaluates_the_expert():
         assert -6 < mean < 0
 
 
-def test_wrapped_environments_are_seen_through():
+def test_the_expert_accepts_wrapped_environments():
     env = gym.make("leapnav/Navigate-v0", family="open", dict_observation=True)
     env = gym.wrappers.TimeLimit(gym.wrappers.FlattenObservation(env), 1000)
     assert drive(env, ExpertPolicy(env), seed=0)[1]["is_success"]

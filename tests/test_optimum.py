@@ -85,7 +85,7 @@ def test_the_same_scenario_gives_the_same_optimum_bit_for_bit():
 
 
 @pytest.mark.parametrize("scale", [2e-3, 1e-3, 5e-4])
-def test_an_obstacle_that_is_hardly_felt_outside_is_gone_round(scale):
+def test_an_obstacle_with_a_very_small_proximity_scale_is_avoided(scale):
     """Inside it the proximity cost is 1e40 and more, beyond any integer; the search once did not end."""
     scenario = Scenario.from_discs(
         [[7.0, 5.0, 1.0]],
@@ -100,8 +100,8 @@ def test_an_obstacle_that_is_hardly_felt_outside_is_gone_round(scale):
     assert 3.15 < optimum.cost < 3.19
 
 
-def test_alternatives_get_only_so_much_work(monkeypatch):
-    """Among hundreds of obstacles they would take most of the time; the optimum does not depend on them."""
+def test_the_work_for_alternatives_is_limited(monkeypatch):
+    """Among hundreds of obstacles the alternatives would take most of the time; the optimum does not depend on them."""
     scenario = sample_scenario("clutter", 2)
     optimum = find_optimum(scenario)
     monkeypatch.setattr("leapnav.experts.optimum.ALTERNATIVES_BUDGET", 1)
@@ -174,7 +174,7 @@ def test_unusual_scenarios_are_solved_too(scenario):
         (changed(horizon=3.0), Status.HORIZON_TOO_SHORT),
         (changed(horizon=1e-9), Status.HORIZON_TOO_SHORT),
         (changed(obstacles=[{"polygon": {"vertices": [[4.9, 0], [5.1, 0], [5.1, 10], [4.9, 10]]}}]), Status.NO_PATH),
-        # A gap of 0.4 m, for a robot of 0.5 m.
+        # A passage of 0.4 m, for a robot of 0.5 m.
         (
             changed(
                 obstacles=[
@@ -184,12 +184,12 @@ def test_unusual_scenarios_are_solved_too(scenario):
             ),
             Status.NO_PATH,
         ),
-        # Without a proximity cost the way leads straight through the obstacle.
+        # Without a proximity cost the optimum leads straight through the obstacle.
         (changed(cost={"proximity_weight": 0.0}, start=[1, 4.5, 0.0], goal=[8, 4.5, 0.0]), Status.COLLISION),
     ],
-    ids=["too fast", "no time", "wall", "gap too narrow", "collision"],
+    ids=["too fast", "no time", "wall", "passage too narrow", "collision"],
 )
-def test_what_cannot_be_solved_says_why(scenario, status):
+def test_the_status_of_a_failure_is_its_reason(scenario, status):
     extremal = find_optimum(scenario)
     assert extremal.status is status
     assert not extremal.success
@@ -206,19 +206,19 @@ def test_bad_arguments_are_named():
         find_optimum(BEST_KNOWN[0][0], candidates=0)
 
 
-def test_a_gap_in_which_every_first_candidate_grazes_is_left_for_another_way():
+def test_another_path_class_is_searched_if_all_first_candidates_collide():
     extremal = find_optimum(sample_scenario("clutter", 40_040))
     assert extremal.success, extremal
     assert extremal.certificate.clearance > 0
 
 
-def test_a_gap_just_too_narrow_leaves_patience_for_a_way_round():
-    """Nearly all first candidates lead through a gap that lacks 0.14 m, where Newton's method mostly fails."""
+def test_a_passage_slightly_too_narrow_does_not_exhaust_the_search():
+    """Nearly all first candidates lead through a passage 0.14 m too narrow, where Newton's method mostly fails."""
     extremal = find_optimum(sample_scenario("polygons", 2_000_188))
     assert extremal.success, extremal
 
 
-def test_walls_full_of_gaps_that_are_a_little_too_narrow_are_gone_round():
+def test_walls_with_many_passages_slightly_too_narrow_are_avoided():
     """100 combinations of passages are on the straight line, and all are too narrow."""
     discs = [(x, y, 0.3) for x in (3.0, 5.0, 7.0) for y in np.arange(0.35, 8.5, 0.95)]
     robot = Robot(radius=0.2)
@@ -231,7 +231,7 @@ def test_walls_full_of_gaps_that_are_a_little_too_narrow_are_gone_round():
         assert optimum.states[np.abs(optimum.states[:, 0] - x).argmin(), 1] > 8.4
 
 
-def test_a_lattice_without_a_place_leads_round_it():
+def test_lattice_paths_avoid_a_closed_place():
     scenario = BEST_KNOWN[0][0]
     lattice = Lattice(scenario)
     first = first_candidate(lattice)
@@ -260,13 +260,13 @@ def test_candidates_elsewhere_leave_the_first_ones():
 
 
 @pytest.mark.parametrize(("seed", "cost"), [(700_000, 3.37391), (710_085, 6.06953)])
-def test_a_first_path_through_too_narrow_a_gap_does_not_spoil_the_metric(seed, cost):
-    """Such a path takes nearly the horizon even at E = 0, and at E = 0 the metric knows no distance."""
+def test_a_first_path_through_a_closed_passage_does_not_degenerate_the_metric(seed, cost):
+    """Such a path takes nearly the horizon even at E = 0, and at E = 0 the metric is degenerate."""
     assert find_optimum(sample_scenario("clutter", seed)).cost <= cost
 
 
 def test_a_goal_beside_an_island_of_the_lattice_is_reached():
-    """One of the four cells around the goal is shut in: no way leads from there to the start."""
+    """One of the four cells around the goal is enclosed: no path leads from there to the start."""
     ring = [
         {"circle": {"center": [7.0 + 0.16 * np.cos(a), 7.0 + 0.16 * np.sin(a)], "radius": 0.09}}
         for a in np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
@@ -277,12 +277,12 @@ def test_a_goal_beside_an_island_of_the_lattice_is_reached():
 
 
 @pytest.mark.parametrize("gap", [1e-4, 1e-3, 1e-2])
-def test_poses_in_a_corner_have_a_way_out(gap):
+def test_poses_in_a_corner_are_connected(gap):
     near, far = 0.25 + gap, 9.75 - gap
     assert is_connected(changed(obstacles=[], start=[near, near, -2.3], goal=[far, far, 2.0]))
 
 
-def test_turns_that_cost_next_to_nothing_do_not_make_the_search_endless():
+def test_the_search_ends_for_a_very_small_turn_weight():
     assert find_optimum(changed(cost={"turn_weight": 1e-3})).success
     lattice = Lattice(changed(cost={"turn_weight": 1e-7}))
     assert first_candidate(lattice).cost > 0

@@ -34,12 +34,12 @@ def test_a_way_round_the_other_side_changes_only_that_obstacle():
         (-np.ones(100), ("backward",)),
         (np.concatenate([np.ones(50), -np.ones(50)]), ("forward", "backward")),
         (np.cos(np.linspace(0, 2 * np.pi, 100)), ("forward", "backward", "forward")),
-        # A backward stretch of a centimetre between two long ones is none.
+        # A backward section of a centimetre between two long ones is ignored.
         (np.concatenate([np.ones(50), [-0.05, -0.05], np.ones(48)]), ("forward",)),
         (np.zeros(100), ()),
     ],
 )
-def test_driving_modes_are_the_gears_in_turn(speeds, modes):
+def test_driving_modes_are_listed_in_order(speeds, modes):
     assert driving_modes(np.linspace(0.0, 10.0, 100), speeds) == modes
 
 
@@ -70,8 +70,8 @@ def test_alternatives_are_distinct_certified_and_in_order():
     assert found >= 10
 
 
-def test_a_way_that_the_lattice_sees_only_through_a_gap_too_narrow_is_no_reason_to_stop():
-    """The first dozen lattice paths lead through such a gap; what they end on costs 5.73, and a way round 4.73."""
+def test_candidates_through_a_closed_passage_do_not_end_the_search():
+    """The first 12 lattice paths lead through such a passage; their extremals cost 5.73, and a detour 4.73."""
     optimum = find_optimum(sample_scenario("clutter", 910_065))
     assert optimum.cost < 4.7326
     assert optimum.path_class != optimum.alternatives[-1].path_class

@@ -110,7 +110,7 @@ def test_a_policy_drives_beside_it(ask):
     assert (status, found["error"]) == (400, "policy: expected one of open, got '../../somewhere'")
 
 
-def test_where_there_is_no_way_the_status_says_so(ask):
+def test_a_scenario_without_a_path_is_reported(ask):
     wall = [{"polygon": {"vertices": [[3.9, 0], [4.1, 0], [4.1, 5], [3.9, 5]]}}]
     for path in ("/follow", "/search"):
         status, found = ask(path, {"scenario": fields(obstacles=wall)})
@@ -137,7 +137,7 @@ def test_questions_are_validated_like_a_file(question, message, ask):
     assert status == 400 and found["error"].startswith(message)
 
 
-def test_what_is_no_question_is_refused(ask):
+def test_invalid_requests_are_refused(ask):
     assert ask("/search", body="{")[0] == 400
     assert ask("/search", body="[" * 100_000)[0] == 400
     assert ask("/search", body=b"\xff\xfe")[0] == 400

@@ -53,7 +53,7 @@ def whole(tmp_path_factory):
     return out
 
 
-def test_killed_and_resumed_it_is_the_dataset_of_one_that_was_not(whole, tmp_path):
+def test_a_killed_and_resumed_rollout_gives_the_same_dataset(whole, tmp_path):
     out = tmp_path / "out"
     arguments = ["rollout", "--family", "open", "--count", "60", "--seed", "3", "--recoveries", "1", "--workers", "2"]
     command = [sys.executable, "-m", "leapnav", *arguments, "--out", str(out)]
@@ -90,7 +90,7 @@ def test_stopped_while_the_dataset_is_written_it_writes_it_again(whole, tmp_path
     assert contents(tmp_path / "out") == contents(whole)
 
 
-def test_stopped_just_before_the_end_it_ends(whole, tmp_path, monkeypatch):
+def test_a_rollout_interrupted_after_its_last_step_is_completed(whole, tmp_path, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patched:
         patched.setattr(rollouts, "RolloutSummary", lambda *totals: 1 / 0)  # made when the dataset is in its place
@@ -99,7 +99,7 @@ def test_stopped_just_before_the_end_it_ends(whole, tmp_path, monkeypatch):
     assert {path.name for path in out.iterdir()} == {WORK, "leapnav"}
     rollout("open", 60, out, seed=3, recoveries=1, progress=False)
     assert contents(out) == contents(whole)
-    (out / DONE).mkdir()  # a run that was stopped while it tidied up
+    (out / DONE).mkdir()  # left by a run that was interrupted during its cleanup
     before = (out / RECORD).stat().st_mtime_ns
     again = rollout("open", 60, out, seed=3, recoveries=1, progress=False)
     assert again.demonstrations == 120

@@ -121,7 +121,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("changes", "field", "value"), FAULTS, ids=lambda v: v if isinstance(v, str) else "")
-def test_a_fault_is_told_in_one_line_with_field_and_value(changes, field, value):
+def test_the_error_for_an_invalid_scenario_names_field_and_value(changes, field, value):
     with pytest.raises(ScenarioError) as error:
         Scenario.from_dict(scenario_fields(**changes))
     message = str(error.value)

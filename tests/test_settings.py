@@ -125,7 +125,7 @@ def discounted(rewards, discount):
 
 @pytest.mark.parametrize(("discount", "family"), [(1.0, "clutter"), (0.97, "rooms")])
 def test_shaping_changes_every_return_by_the_same(discount, family):
-    """Whatever the policy does, the shaped return is the other one minus the potential of the start."""
+    """For any policy, the shaped return is the other one minus the potential of the start."""
     plain = gym.make(ID, family=family, split="test")
     shaped = gym.make(ID, family=family, split="test", reward="shaped", discount=discount)
     rng = np.random.default_rng(0)

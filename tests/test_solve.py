@@ -92,7 +92,7 @@ def test_controls_that_saturate_do_so_to_the_last_digit(method):
 
 
 @pytest.mark.parametrize("method", ["multiple_shooting", "leapfrog", "collocation"])
-def test_a_horizon_too_long_for_simple_shooting(method):
+def test_a_horizon_too_long_for_single_shooting(method):
     # Single shooting would need the costate to a precision of e^-T.
     costs = []
     for horizon in (10.0, 25.0, 100.0):

@@ -102,7 +102,7 @@ def test_attributes_and_methods_reach_the_environment():
     venv.close()
 
 
-def test_what_cannot_be_adapted_is_told():
+def test_other_environments_are_refused():
     with pytest.raises(ValueError, match="autoreset_mode='SameStep', got 'NextStep'"):
         NavigateVecEnv(NavigateVectorEnv(2))
     with pytest.raises(ValueError, match="env_id: expected one of leapnav's environments, got 'CartPole-v1'"):

@@ -227,7 +227,7 @@ def test_a_jump_start_begins_on_the_optimum_with_the_time_that_is_left():
     assert jumped > 5
 
 
-def test_without_a_share_nothing_jumps():
+def test_a_jump_start_fraction_of_zero_changes_nothing():
     one = make_vec_env(n_envs=4, family="open", seed=0)
     other = JumpStart(
         make_vec_env(n_envs=4, family="open", seed=0), [ScenarioBank.shipped("open", "train")], max_fraction=0.0

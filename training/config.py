@@ -84,8 +84,8 @@ class WarmStartConfig:
     critic_batch_size: int = 4096
     """Samples per gradient step of the critic."""
     gradient_weight: float = 0.3
-    """Weight of the gradient error (by the state; for Q functions also by the action) relative to the value error, both
-    in units of their spread."""
+    """Weight of the gradient error (with respect to the state; for Q functions also to the action) relative to the
+    value error, both in units of their spread."""
     slopes: int = 200_000
     """Number of samples at which the gradient is fitted."""
     seed: int = 0

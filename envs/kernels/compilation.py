@@ -24,7 +24,7 @@ MIN_PARALLEL = 6  # kernels; fewer are compiled in this process: starting others
 WORKER = "from leapnav.envs.kernels.compilation import serve; serve()"
 
 
-def prepare(*kernels: Kernel, jobs: int | None = None) -> None:
+def prepare(*kernels: Kernel, jobs: int | None = None, advise: bool = True) -> None:
     """Makes kernels ready, with those that they call.
 
     Kernels that are not in the cache are compiled by several processes, if they are many. Processes that need them at
@@ -33,6 +33,7 @@ def prepare(*kernels: Kernel, jobs: int | None = None) -> None:
     Args:
         kernels: the kernels.
         jobs: number of processes; None for one per core.
+        advise: whether the progress line mentions `leapnav compile`.
 
     """
     if all(one.is_ready for one in kernels):
@@ -41,7 +42,7 @@ def prepare(*kernels: Kernel, jobs: int | None = None) -> None:
         with FileLock(cache_root() / "compile.lock"):
             remaining = missing(kernels)  # another process may have compiled them meanwhile
             if remaining:
-                _compile(remaining, jobs or usable_cores())
+                _compile(remaining, jobs or usable_cores(), advise)
     for one in kernels:
         one.prepare()
 
@@ -66,7 +67,7 @@ def missing(kernels: Iterable[Kernel]) -> list[Kernel]:
     return [one for one in ordered if not one.is_cached(cache_directory(one.py_func.__module__))]
 
 
-def _compile(kernels: list[Kernel], jobs: int) -> None:
+def _compile(kernels: list[Kernel], jobs: int, advise: bool) -> None:
     """Compiles kernels in processes; one is started when those that it calls are finished."""
     waiting = dict.fromkeys(one for one in kernels if _is_importable(one))
     unfinished, running = set(waiting), dict[Future[None], Kernel]()
@@ -78,7 +79,7 @@ def _compile(kernels: list[Kernel], jobs: int) -> None:
         idle.put(worker)
 
     count = min(jobs, len(waiting))
-    with _workers(count) as workers, progress.counted(waiting) as done, ThreadPoolExecutor(jobs) as pool:
+    with _workers(count) as workers, progress.counted(waiting, advise) as done, ThreadPoolExecutor(jobs) as pool:
         for worker in workers:
             idle.put(worker)
         while waiting or running:
@@ -130,7 +131,7 @@ def _ask(worker: subprocess.Popen[str], one: Kernel) -> None:
 
 
 def serve() -> None:
-    """The loop of a process that compiles: reads names of kernels and answers when each is in the cache."""
+    """The loop of a process that compiles: reads names of kernels and reports when each is in the cache."""
     from leapnav.envs.kernels.numba_internals import named
 
     for line in sys.stdin:

@@ -21,14 +21,14 @@ class _Progress:
         self._reported = -INTERVAL
         self._is_announced = False
 
-    def report(self) -> None:
+    def report(self, advise: bool) -> None:
         """Writes how far the compilation is: in place on a terminal, elsewhere as lines."""
         count, total, now = len(self.compiled), len(self.expected), monotonic()
         text = f"leapnav: compiling, once per installation: {count} of {total} kernels"
         if sys.stderr.isatty():
             print(f"\r{text} ", end="\n" if count == total else "", file=sys.stderr)
         elif not self._is_announced or now - self._reported >= INTERVAL:
-            advice = "" if self._is_announced else "; `leapnav compile` compiles all in advance"
+            advice = "" if self._is_announced or not advise else "; `leapnav compile` compiles all in advance"
             print(f"{text}{advice}", file=sys.stderr)
             self._reported = now
         self._is_announced = True
@@ -39,14 +39,17 @@ _PROGRESS = _Progress()
 
 
 @contextmanager
-def counted(kernels: Iterable[Kernel]) -> Iterator[Callable[[Kernel], None]]:
-    """Adds kernels to the total, and yields what to call when one of them is compiled."""
+def counted(kernels: Iterable[Kernel], advise: bool = True) -> Iterator[Callable[[Kernel], None]]:
+    """Adds kernels to the total, and yields what to call when one of them is compiled.
+
+    With `advise`, the first line mentions `leapnav compile`.
+    """
     _PROGRESS.expected.update(kernels)
-    _PROGRESS.report()
+    _PROGRESS.report(advise)
 
     def done(one: Kernel) -> None:
         _PROGRESS.compiled.add(one)
-        _PROGRESS.report()
+        _PROGRESS.report(advise)
 
     yield done
 

@@ -44,7 +44,7 @@ from leapnav.envs.utils.validation import check_choice, is_integer
 FORMAT, VERSION = "leapnav-bank", 3
 MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
 SPLITS = ("train", "test")
-BANK_DIRECTORY = Path(__file__).parent / "banks"  # of the shipped banks
+BANK_DIRECTORY = Path(__file__).parent / "banks"  # of the included banks
 _TYPES = {
     "scenarios": "u1",
     "scenario_ends": "<i8",
@@ -173,7 +173,7 @@ class ScenarioBank(Sequence[Scenario]):
 
     @classmethod
     def shipped(cls, family: str, split: str) -> ScenarioBank:
-        """Return a bank shipped with the package; repeated calls return the same object.
+        """Return a bank included in the package; repeated calls return the same object.
 
         Args:
             family: one of `leapnav.envs.FAMILIES`.

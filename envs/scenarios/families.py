@@ -223,7 +223,7 @@ def _shortest_path(field: np.ndarray, start: np.ndarray, goal: np.ndarray) -> fl
     usable = free[_HEADS] & free[_TAILS]
     usable[usable] = clearances(_MIDDLES[usable], field) > PASSAGE_MARGIN
     size = len(_POINTS)
-    # As above.
+    # Imported here because only fresh scenarios need it.
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 

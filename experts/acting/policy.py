@@ -87,7 +87,7 @@ class ExpertPolicy:
             are computed at the first step of an episode.
         feedback: "resolve": at each step the optimal control from the current state and time, re-solved from the
             solution of the previous step, or found by a new search if that fails. "gains": neighbouring-extremal gains
-            along the optimum from the start, 100 times cheaper and accurate close to that optimum. "none": the optimum
+            along the optimum from the start, much faster, and accurate close to that optimum. "none": the optimum
             from the start, without feedback.
         quick: examine only the most promising candidates in a search, see `find_optimum`. Suitable for DAgger, which
             needs many optima and tolerates a few missing ones.

@@ -60,8 +60,8 @@ def build_bank(
     """Draw random scenarios, find their optima, and write the admitted ones to a bank.
 
     The result of each finished scenario is stored in the directory `<out>.build`. A build resumes after any
-    interruption, including SIGKILL, when it is called again with the same arguments. The bank does not depend on
-    interruptions or on the number of workers, to the last bit.
+    interruption, including SIGKILL, when it is called again with the same arguments. The bank is bitwise
+    identical regardless of interruptions and of the number of workers.
 
     Args:
         family: family of the scenarios.

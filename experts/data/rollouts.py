@@ -39,7 +39,7 @@ from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal
 
 VERSION = 1  # format of the shards
-MIN_SEED = 2  # seeds 0 and 1 give the first scenarios of the shipped training and test banks
+MIN_SEED = 2  # seeds 0 and 1 give the first scenarios of the included training and test banks
 SHARD_SIZE = 16  # scenarios per shard
 DASK_TIMEOUT = 30  # s to wait for a scheduler and its workers
 WORK = ".rollout"  # directory of an unfinished rollout
@@ -97,7 +97,7 @@ def rollout(
     Args:
         family: family of the scenarios.
         count: number of scenarios; scenario i has the seed `seed + i`. Scenarios without a certified optimum are
-            replaced by following ones. Seeds 0 and 1 are refused: their scenarios are in the shipped banks, one of
+            replaced by following ones. Seeds 0 and 1 are refused: their scenarios are in the included banks, one of
             them in the test split.
         out: directory, a root of Minari datasets. Read it with `load_demonstrations(out)`; if the environment variable
             MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family))`.

@@ -74,12 +74,12 @@ def polish(
         times: (segments + 1,), s.
         nodes: (segments + 1, 2n), changed in place.
         tol: largest residual.
-        max_iterations: largest index of Newton steps.
+        max_iterations: largest number of Newton steps.
         predict: whether the evaluation of the last iterate may be skipped if quadratic convergence predicts its
             residual.
 
     Returns:
-        Status, one `Iteration` per iterate, and the index of evaluations of the flow.
+        Status, one `Iteration` per iterate, and the number of evaluations of the flow.
 
     """
     arrays = problem.arrays
@@ -102,7 +102,7 @@ def _refine(problem: OptimalControlProblem, path: Trajectory, times: np.ndarray)
     times, nodes = start_nodes(problem, path, times)
     growth = np.empty(len(times) - 1)
     evaluations = segment_growth(problem.arrays.flow, times, nodes, growth)
-    # The growth is exponential in time, so the index of pieces is proportional to its logarithm.
+    # The growth is exponential in time, so the number of pieces is proportional to its logarithm.
     with np.errstate(divide="ignore"):
         needed = np.ceil(np.log(growth) / np.log(MAX_GROWTH))
     pieces = np.where(np.isfinite(growth), needed, PIECES_DIVERGED).clip(1, MAX_PIECES).astype(int)

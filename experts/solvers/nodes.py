@@ -22,7 +22,7 @@ class SolverOptions:
         segments: number of shooting segments; None chooses it from the guess.
         polish: whether Leapfrog and collocation end with multiple-shooting Newton steps.
         update: where Leapfrog moves a node on the extremal of its sub-problem, at the mean time or at half the cost.
-        order: order of the nodes in a Leapfrog sweep; "red_black" moves the odd nodes before the resampled nodes.
+        order: order of the nodes in a Leapfrog sweep; "red_black" moves the odd nodes before the others.
 
     """
 

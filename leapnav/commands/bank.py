@@ -32,7 +32,7 @@ class Build:
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
-    """Seed of the bank; the shipped banks have 0 (training) and 1 (test)."""
+    """Seed of the bank; the included banks have 0 (training) and 1 (test)."""
     workers: int = os.cpu_count() or 1
     """Number of processes; the bank does not depend on it."""
     json: Path | None = None
@@ -59,7 +59,7 @@ class Show:
     """
 
     file: tyro.conf.Positional[Path]
-    """Bank file, or the name of a shipped bank, for example rooms-test."""
+    """Bank file, or the name of an included bank, for example rooms-test."""
     plot: Path | None = None
     """Picture of the scenarios (.png, .pdf or .svg); by default the bank's name with .png in the current directory."""
     count: int = 24

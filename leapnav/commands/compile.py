@@ -72,7 +72,7 @@ def compile_missing(jobs: int | None = None) -> CompilationSummary:
 
     start = perf_counter()
     before = _cached()
-    prepare(*missing(all_kernels()), jobs=jobs)
+    prepare(*missing(all_kernels()), jobs=jobs, advise=False)
     _compile_unicycle_flow()
     compiled: defaultdict[str, list[str]] = defaultdict(list)
     for path in sorted(_cached() - before):

@@ -17,7 +17,7 @@ from leapnav.outputs import FAILED, check_outputs, write_json
 FAMILY, INDEX = "clutter", 7  # the test scenario of the checks
 COST_TOLERANCE = 1e-6  # relative, between the optimum found and the reference
 TRACKING_TOLERANCE = 1e-3  # relative, between the expert's cost in the environment and the reference
-EPISODES, MIN_SUCCESS = 10, 0.8  # of the shipped policy
+EPISODES, MIN_SUCCESS = 10, 0.8  # of the included policy
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def drive_the_expert() -> str:
 
 
 def load_a_policy() -> str:
-    """Check that a shipped policy loads and drives."""
+    """Check that an included policy loads and drives."""
     from leapnav.training import evaluate, load_policy, policy_environment
 
     sensors = policy_environment(FAMILY)

@@ -13,8 +13,8 @@ from leapnav.outputs import check_outputs, write_json
 if TYPE_CHECKING:
     from leapnav.envs.scenarios.bank import ScenarioBank
 
-POLICIES = """Policies: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of a
-shipped policy (a family, or "all"). Runs that differ only in their seed share a row, and so do policies with the same
+POLICIES = """Policies: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of an
+included policy (a family, or "all"). Runs that differ only in their seed share a row, and so do policies with the same
 LABEL=."""
 
 
@@ -26,7 +26,7 @@ class Evaluate:
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms, slalom, or all of them."""
     split: Literal["test", "train"] = "test"
-    """Split of the shipped banks."""
+    """Split of the included banks."""
     bank: Path | None = None
     """Bank file to use instead, from `leapnav bank build`."""
     count: int | None = None

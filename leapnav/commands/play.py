@@ -20,7 +20,7 @@ class Play:
     scenario: Path | None = None
     """Initial scenario file (JSON); by default a scenario of the test bank."""
     policies: tuple[str, ...] = ()
-    """Directories of additional policies or runs; the shipped policies are always available."""
+    """Directories of additional policies or runs; the included policies are always available."""
     port: int = 8765
     """Port of the server; 0 for any free one."""
     host: str = "127.0.0.1"

@@ -14,7 +14,7 @@ REPLAY_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Rollout:
-    """Sample scenarios, find their optima, drive them in the environment, and write a Minari dataset.
+    """Sample scenarios, find their optima, execute them in the environment, and write a Minari dataset.
 
     The same command resumes an interrupted rollout.
     """
@@ -26,7 +26,7 @@ class Rollout:
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000
-    """First scenario seed: scenario i has seed SEED + i. At least 2, because the shipped banks have seeds 0 and 1."""
+    """First scenario seed: scenario i has seed SEED + i. At least 2, because the included banks have seeds 0 and 1."""
     recoveries: int = 0
     """Number of recoveries per scenario: demonstrations from states pushed off the optimum."""
     noise: float = 0.0

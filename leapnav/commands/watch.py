@@ -18,12 +18,12 @@ class Watch:
     """Watch a policy drive beside the optimum (the orange line), in a window or as a video."""
 
     policy: str = "expert"
-    """Policy: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of a shipped
+    """Policy: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of an included
     policy."""
     family: str = "clutter"
     """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
     split: Literal["train", "test", "fresh"] = "test"
-    """Split of the shipped banks, or "fresh" for newly sampled scenarios."""
+    """Split of the included banks, or "fresh" for newly sampled scenarios."""
     index: int | None = None
     """Index of the first scenario in the bank; the next episodes play the next ones. By default random scenarios."""
     episodes: int = 3

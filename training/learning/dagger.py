@@ -4,8 +4,8 @@ S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning and struct
 learning" (AISTATS 2011), with two changes. First, control passes from the learner to the expert once per episode
 instead of at random in each step, as in S. Ross and D. Bagnell, "Reinforcement and imitation learning via interactive
 no-regret learning" (2014). The expert then needs one search per takeover instead of one per state, and its actions are
-optimal from the state of the takeover. Second, since rollouts of the learner are cheap, it drives many scenarios, and
-most takeovers are in the episodes in which it failed. In a failed episode the expert takes over at several times,
+optimal from the state of the takeover. Second, since rollouts of the learner are inexpensive, it drives many scenarios,
+and most takeovers are in the episodes in which it failed. In a failed episode the expert takes over at several times,
 because most collisions are decided seconds before.
 """
 

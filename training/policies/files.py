@@ -1,4 +1,4 @@
-"""Files of policies: saving, loading, and the policies that ship with leapnav."""
+"""Files of policies: saving, loading, and the policies included in leapnav."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
 
     Args:
         folder: the directory of the policy or of the run that trained it; or the name of a family ("clutter", ...) or
-            "all" for a shipped policy (actor only, in half precision).
+            "all" for an included policy (actor only, in half precision).
         env: an environment for the policy, single or vector; its observations are checked.
 
     Returns:
@@ -216,12 +216,12 @@ def _check_environment(folder: Path, description: dict[str, Any], space: spaces.
 
 
 def shipped_policies() -> list[str]:
-    """Return the names of the policies that ship with leapnav: families, and "all" for a policy for all families."""
+    """Return the names of the policies included in leapnav: families, and "all" for a policy for all families."""
     return [name for name in (*FAMILIES, ALL) if (SHIPPED / name / "policy.json").is_file()]
 
 
 def policy_folder(folder: str | Path) -> Path:
-    """Return the directory of a policy, given as a directory or as the name of a shipped policy."""
+    """Return the directory of a policy, given as a directory or as the name of an included policy."""
     path = Path(folder)
     return SHIPPED / path if str(folder) in shipped_policies() and not path.exists() else path
 

@@ -25,11 +25,11 @@ class JumpStart(VecEnvWrapper):
 
     Args:
         venv: the training environment.
-        banks: scenario banks with references. An episode with a jump-start plays one of their scenarios, any other
+        banks: scenario banks with references. An episode with a jump start plays one of their scenarios, any other
             episode a scenario of the environment.
         max_fraction: maximum fraction of an episode that the expert drives. The fraction of an episode is drawn
             uniformly from 0 to this maximum, which may be changed at any time, for example by a callback.
-        probability: probability that an episode has a jump-start.
+        probability: probability that an episode has a jump start.
         seed: random seed.
 
     """
@@ -48,11 +48,11 @@ class JumpStart(VecEnvWrapper):
         self._rng = np.random.default_rng(seed)
 
     def reset(self) -> VecEnvObs:
-        """Start an episode of each robot, without a jump-start."""
+        """Start an episode of each robot, without a jump start."""
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all robots; some of the episodes that start in this step get a jump-start."""
+        """Step all robots; some of the episodes that start in this step get a jump start."""
         observations, rewards, dones, infos = self.venv.step_wait()
         jumping = dones & (self._rng.random(self.num_envs) < self.probability)
         if self.max_fraction > 0 and jumping.any():
@@ -78,7 +78,7 @@ class JumpStart(VecEnvWrapper):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state that determines the following jump-starts."""
+        """Return the state that determines the following jump starts."""
         return {"generator": self._rng.bit_generator.state, "max_fraction": self.max_fraction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

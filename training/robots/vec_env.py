@@ -68,7 +68,7 @@ def environment_seed(seed: int, stream: int = 0) -> int:
     """Derive the seed of a training environment from the seed of a run.
 
     Robot i uses the derived seed plus i. Used directly, consecutive seeds of runs would give the robots mostly the same
-    scenarios, and small seeds the first scenarios of the shipped banks.
+    scenarios, and small seeds the first scenarios of the included banks.
 
     Args:
         seed: seed of the run.

@@ -33,7 +33,7 @@ DEMONSTRATION_STREAM = 1_000_000  # stream of the run's seed, larger than those 
 def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> list[Evaluation]:
     """Clone the expert.
 
-    With `config.resume` the run resumes after any interruption, with bit-identical results.
+    With `config.resume` the run resumes after any interruption, with bitwise identical results.
 
     Args:
         config: settings.

@@ -44,7 +44,7 @@ Config = PPOConfig | SACConfig
 def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
     """Train a policy by proximal policy optimisation.
 
-    With `config.resume` the run resumes after any interruption, with bit-identical results.
+    With `config.resume` the run resumes after any interruption, with bitwise identical results.
 
     Args:
         config: settings.

@@ -23,7 +23,7 @@ class PolicySpec:
     """Specification of a policy to evaluate.
 
     Attributes:
-        name: the name without the label: a baseline, a directory or a shipped policy.
+        name: the name without the label: a baseline, a directory or an included policy.
         label: name of the row in the table; None if not given.
         method: text that is identical for runs that differ only in their seed; None if unknown.
         policy: the policy, or a function that makes it for an environment.
@@ -42,7 +42,7 @@ def load_policy_spec(name: str, *, seed: int = 0) -> PolicySpec:
     """Load a policy by its name.
 
     Args:
-        name: "expert", "random", "go-to-goal", the directory of a policy or a run, or the name of a shipped policy.
+        name: "expert", "random", "go-to-goal", the directory of a policy or a run, or the name of an included policy.
             With the prefix "LABEL=", policies with the same label are treated as runs of one method.
         seed: random seed of the random policy.
 

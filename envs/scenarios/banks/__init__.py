@@ -1,1 +1,1 @@
-"""Banks of scenarios that ship with leapnav (data)."""
+"""Banks of scenarios included in leapnav (data)."""
