@@ -31,6 +31,7 @@ from leapnav.training.config import CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.actors import actor_parameters, mean_action, policy_of, set_noise, update_target
+from leapnav.training.threads import limit_threads
 
 WARM_UP_STEPS = 200  # gradient steps of the linear warm-up of the learning rate
 MIN_STD = 0.01  # lower bound of the fitted standard deviation of the actions
@@ -56,6 +57,7 @@ class EpochLoss:
     validation: float
 
 
+@limit_threads
 def behaviour_clone(
     model: BaseAlgorithm | BasePolicy,
     dataset: Dataset | str | os.PathLike[str] | Sequence[Demonstration],
@@ -142,6 +144,7 @@ class Cloning:
         validation = [loss.validation for loss in self.losses]
         return bool(patience and done > patience and min(validation[:-patience]) <= min(validation[-patience:]))
 
+    @limit_threads
     def run_epoch(self, on_batch: Callable[[], Any] = lambda: None) -> EpochLoss:
         """Run one pass over the training samples.
 

@@ -35,6 +35,7 @@ from leapnav.training.learning.cloning import Cloning, check_observations
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import policy_of
 from leapnav.training.robots.vec_env import NavigateVecEnv, environment_seed
+from leapnav.training.threads import limit_threads
 
 EPISODES_PER_TASK = 16  # episodes labelled in one task of a worker
 # Times of the takeovers before a collision (s), denser shortly before it. In an episode that misses its goal the number
@@ -155,6 +156,7 @@ class DAgger:
                 on_round(done)
         return self.rounds
 
+    @limit_threads
     def run_round(self, *, progress: bool = True) -> Round:
         """Run one round: rollouts of the learner, labelling by the expert, and a fit to all samples."""
         number, config = len(self.rounds), self.config

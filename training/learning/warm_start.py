@@ -31,6 +31,7 @@ from leapnav.training.learning.cloning import (
 )
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import copy_actor, policy_of
+from leapnav.training.threads import limit_threads
 
 # Standard deviations (m, m, rad) of the random state offsets over which the slope of the cost-to-go is fitted: small
 # compared with the curvature radius of the cost-to-go, large compared with the discontinuities of the lidar ranges.
@@ -57,6 +58,7 @@ class WarmStart:
     slope_error: float
 
 
+@limit_threads
 def warm_start(
     model: BaseAlgorithm,
     dataset: Dataset | str | os.PathLike[str] | Sequence[Any],

@@ -26,10 +26,12 @@ from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.evaluation import Evaluation
+from leapnav.training.threads import limit_threads
 
 DEMONSTRATION_STREAM = 1_000_000  # stream of the run's seed, larger than those of the rounds of DAgger
 
 
+@limit_threads
 def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> list[Evaluation]:
     """Clone the expert.
 
@@ -85,6 +87,7 @@ def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConf
     return evaluations
 
 
+@limit_threads
 def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = True) -> list[Evaluation]:
     """Train a policy by dataset aggregation.
 

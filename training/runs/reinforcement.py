@@ -37,10 +37,12 @@ from leapnav.training.runs.checks import check_config
 from leapnav.training.runs.imitation import make_env, observed_settings, show_scores
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.evaluation import Evaluation
+from leapnav.training.threads import limit_threads
 
 Config = PPOConfig | SACConfig
 
 
+@limit_threads
 def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
     """Train a policy by proximal policy optimisation.
 
@@ -86,6 +88,7 @@ def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
     return _train("ppo", config, make, progress)
 
 
+@limit_threads
 def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
     """Train a policy by soft actor-critic or truncated quantile critics.
 

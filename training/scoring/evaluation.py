@@ -20,6 +20,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.experts.solve import solve
+from leapnav.training.threads import limit_threads
 
 BATCH_SIZE = 256  # episodes simulated in parallel
 MAX_TIMED_ACTIONS = 100
@@ -134,6 +135,7 @@ class Evaluation:
         return float(np.nanmedian(values)) if values else math.nan
 
 
+@limit_threads
 def evaluate(
     policy: PolicyOrFactory,
     bank: ScenarioBank | str = "clutter",
