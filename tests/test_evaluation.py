@@ -159,6 +159,20 @@ def test_the_score_is_what_its_definition_says():
     assert found.milliseconds == 0.5
 
 
+def test_an_evaluation_is_one_line_and_one_data_frame():
+    found = run(episode(cost=1), episode(cost=2), episode(False, True))
+    text = repr(found)
+    assert "\n" not in text
+    for part in ("3 episodes", "success 66.7 %", "collision 33.3 %", "SOC 0.500", "median regret 50.00 %"):
+        assert part in text
+    frame = found.to_dataframe()
+    assert len(frame) == 3
+    assert frame["success"].mean() == found.success
+    assert frame["soc"].mean() == found.soc
+    assert frame[frame["success"]]["regret"].median() == found.regret
+    assert list(frame["index"]) == [0, 1, 2]
+
+
 def test_bootstrap_intervals_cover_the_truth():
     rng = np.random.default_rng(0)
     hits = 0

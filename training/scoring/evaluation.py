@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -21,6 +21,9 @@ from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.experts.solve import solve
 from leapnav.training.threads import limit_threads
+
+if TYPE_CHECKING:
+    import pandas
 
 BATCH_SIZE = 256  # episodes simulated in parallel
 MAX_TIMED_ACTIONS = 100
@@ -93,6 +96,11 @@ class Episode:
         """Regret (J - J*) / J*, with J* for the reached pose."""
         return (self.cost - self.reached_reference) / self.reached_reference
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes without the states, and SOC and regret."""
+        record = {name: value for name, value in vars(self).items() if name not in ("states", "episode_return")}
+        return {**record, "return": self.episode_return, "soc": self.soc, "regret": self.regret}
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -106,6 +114,26 @@ class Evaluation:
 
     episodes: tuple[Episode, ...]
     milliseconds: float
+
+    def __repr__(self) -> str:
+        families = ", ".join(dict.fromkeys(episode.family for episode in self.episodes))
+        return (
+            f"<Evaluation: {len(self)} episodes ({families}), success {100 * self.success:.1f} %, collision "
+            f"{100 * self.collision:.1f} %, SOC {self.soc:.3f}, median regret {100 * self.regret:.2f} %>"
+        )
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas data frame with one row per episode and the columns of `Episode.to_dict`.
+
+        Raises:
+            ImportError: pandas is not installed.
+
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError('to_dataframe needs pandas: pip install "leapnav[pandas]"') from error
+        return pandas.DataFrame([episode.to_dict() for episode in self.episodes])
 
     def __len__(self) -> int:
         return len(self.episodes)

@@ -97,8 +97,7 @@ def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
         "scores": [asdict(row) for row in comparison.scores()],
         "families": {family: [asdict(row) for row in comparison.of(family).scores()] for family in comparison.families},
         "episodes": {
-            name: [[_episode_record(episode) for episode in run] for run in runs]
-            for name, runs in comparison.runs.items()
+            name: [[episode.to_dict() for episode in run] for run in runs] for name, runs in comparison.runs.items()
         },
     }
     return plain(content)
@@ -107,11 +106,6 @@ def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
 def write_scores(comparison: Comparison, path: str | os.PathLike[str]) -> None:
     """Write `scores_to_dict` to a JSON file."""
     write_text(path, encode(scores_to_dict(comparison), indent=1) + "\n")
-
-
-def _episode_record(episode: Episode) -> dict[str, Any]:
-    record = {name: value for name, value in vars(episode).items() if name not in ("states", "episode_return")}
-    return {**record, "return": episode.episode_return, "soc": episode.soc, "regret": episode.regret}
 
 
 def plot_scores(comparison: Comparison, path: str | os.PathLike[str]) -> None:
