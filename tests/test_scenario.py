@@ -32,6 +32,22 @@ def test_a_scenario_is_read_from_and_written_to_a_file(tmp_path):
     assert Scenario.from_json(str(path)) == scenario
 
 
+@pytest.mark.parametrize("field", ["start", "goal"])
+def test_a_heading_in_degrees_is_refused_in_a_file(field, tmp_path):
+    pose = [8.0, 8.0, 90] if field == "goal" else [1.0, 1.0, 90]
+    path = tmp_path / "scenario.json"
+    path.write_text(json.dumps(scenario_fields(**{field: pose})))
+    with pytest.raises(
+        ScenarioError, match=rf"{field}: expected a heading in radians, .* got 90; did you mean 1\.571\?"
+    ):
+        Scenario.from_json(path)
+    # In Python a heading may be unwrapped, as poses of the environment are.
+    assert Scenario.from_dict(scenario_fields(**{field: pose}))
+    pose[2] = -2 * math.pi
+    path.write_text(json.dumps(scenario_fields(**{field: pose})))
+    assert Scenario.from_json(path)
+
+
 def test_a_scenario_cannot_be_changed():
     scenario = Scenario.from_dict(scenario_fields())
     with pytest.raises(Exception, match="frozen"):

@@ -227,7 +227,7 @@ class Scenario(_Frozen):
         """Read a scenario from a file, or from JSON text (recognised by its opening brace).
 
         Raises:
-            ScenarioError: the text is not JSON, or see the class.
+            ScenarioError: the text is not JSON, a heading in a file is beyond +-2 pi, or see the class.
             OSError: the file cannot be read.
 
         """
@@ -240,7 +240,10 @@ class Scenario(_Frozen):
             raise
         except (ValueError, RecursionError) as error:  # syntax, encoding, numbers with too many digits, nesting
             raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
-        return cls.from_dict(fields)
+        scenario = cls.from_dict(fields)
+        if not is_text:  # written by hand, perhaps in degrees
+            _check_headings(scenario)
+        return scenario
 
     @classmethod
     def from_discs(
@@ -336,6 +339,15 @@ def _tuples(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return tuple(_tuples(item) for item in value)
     return value
+
+
+def _check_headings(scenario: Scenario) -> None:
+    for field, (_, _, heading) in (("start", scenario.start), ("goal", scenario.goal)):
+        if heading is not None and abs(heading) > 2 * math.pi:
+            raise ScenarioError(
+                f"Scenario {scenario.name!r}: {field}: expected a heading in radians, at most 2 pi, got {heading:g}; "
+                f"did you mean {math.radians(heading):.4g}?"
+            )
 
 
 def _shorten(value: Any) -> str:
