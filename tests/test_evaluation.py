@@ -1,8 +1,10 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
@@ -22,7 +24,14 @@ from leapnav.training import (
 )
 from leapnav.training.scoring.comparison import compare_policies
 from leapnav.training.scoring.policy_specs import group_by_row, load_policy_spec, make_policy_from_spec
-from leapnav.training.scoring.reports import extremes, plot_episodes, plot_scores, print_scores, write_scores
+from leapnav.training.scoring.reports import (
+    draw_episode,
+    extremes,
+    plot_episodes,
+    plot_scores,
+    print_scores,
+    write_scores,
+)
 
 
 class Planned:
@@ -270,6 +279,16 @@ def test_a_comparison_is_printed_written_and_plotted(policies, tmp_path, capsys)
     plot_episodes(banks, found.runs["random"][0].episodes, tmp_path / "episodes.png")
     for name in ("scores.png", "episodes.png"):
         assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("reached", "title"), [(0.98, "regret 1.0 %"), (0.99001, "regret 0.0 %"), (math.nan, "regret unknown")]
+)
+def test_the_picture_of_an_episode_shows_the_regret_for_the_pose_reached(reached, title):
+    stopped_short = replace(episode(cost=0.99), reached_reference=reached)
+    axes = Figure().subplots()
+    draw_episode(axes, [ScenarioBank.shipped("open", "test")], stopped_short)
+    assert axes.get_title() == f"open-0: {title}"
 
 
 def test_extremes_are_the_best_the_median_and_the_worst():

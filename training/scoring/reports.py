@@ -177,20 +177,24 @@ def plot_episodes(
 def extremes(episodes: Sequence[Episode], count: int) -> dict[str, list[Episode]]:
     """Select the best, median and worst episodes, without empty groups.
 
-    Best and median refer to the cost ratio J / J* of the successful episodes. The worst are unsuccessful episodes,
-    collisions first, followed by the successful episodes with the highest cost ratio.
+    Best and median refer to the regret of the successful episodes. The worst are unsuccessful episodes, collisions
+    first, followed by the successful episodes with the highest regret.
 
     Args:
         episodes: the episodes.
         count: maximum number of episodes in each group.
 
     """
-    successes = sorted((e for e in episodes if e.success), key=lambda e: e.cost / e.reference_cost)
+    successes = sorted((e for e in episodes if e.success), key=_regret_or_infinity)
     failures = sorted((e for e in episodes if not e.success), key=lambda e: not e.collision)
     middle = max(0, len(successes) // 2 - count // 2)
     worst = failures[:count] + successes[::-1][: max(0, count - len(failures))]
     rows = {"best": successes[:count], "median": successes[middle : middle + count], "worst": worst}
     return {title: chosen for title, chosen in rows.items() if chosen}
+
+
+def _regret_or_infinity(episode: Episode) -> float:
+    return math.inf if math.isnan(episode.regret) else episode.regret
 
 
 def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) -> None:
@@ -201,5 +205,6 @@ def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) ->
     axes.plot(*episode.states[:, :2].T, color=POLICY_COLOR if episode.success else FAILURE_COLOR, linewidth=1.8)
     outcome = "collision" if episode.collision else "missed"
     if episode.success:
-        outcome = f"cost {100 * (episode.cost / episode.reference_cost - 1):+.1f} %"
+        # The regret, because the cost of a policy that stops short of the goal can be lower than J*.
+        outcome = "regret unknown" if math.isnan(episode.regret) else f"regret {100 * episode.regret:z.1f} %"
     axes.set_title(f"{episode.scenario}: {outcome}", fontsize=9)
