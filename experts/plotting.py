@@ -112,7 +112,7 @@ def plot_extremal(
         plane = figure.add_subplot(grid[:3, 0] if sweeps else grid[:, 0])
         if in_plane:
             if isinstance(extremal, Optimum):
-                _draw_alternatives(plane, extremal)
+                _draw_alternatives(plane, extremal, legend_top=-0.09 if scenario is None else 0.0)
             _draw_plane(plane, extremal, scenario, sweeps)
         else:
             _draw_state_space(plane, extremal, sweeps)
@@ -234,8 +234,11 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
     axes.grid(alpha=0.3)
 
 
-def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
-    """Draw the best other local optima, with costs and path classes in the legend."""
+def _draw_alternatives(axes: Axes, optimum: Optimum, legend_top: float) -> None:
+    """Draw the best other local optima, with costs and path classes in a legend below the axes.
+
+    Its upper edge is at `legend_top`, in units of the height of the axes: below the labels of the ticks.
+    """
     shown = optimum.alternatives[:MAX_ALTERNATIVES]
     if not shown:
         return
@@ -245,14 +248,14 @@ def _draw_alternatives(axes: Axes, optimum: Optimum) -> None:
         label = f"J = {other.cost:.4g}"
         if other is not optimum and optimum.cost > 0:
             label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
-        label += f", {', '.join(other.driving_modes) or 'rotation in project'}"
+        label += f", {', '.join(other.driving_modes) or 'rotation in place'}"
         if other.heading_winding:
             label += f", winding {other.heading_winding:+d}"
         axes.plot(*positions.T, color=color, linewidth=width, zorder=2.5, label=label)
     hidden = len(optimum.alternatives) - len(shown)
     axes.legend(
         loc="upper center",
-        bbox_to_anchor=(0.5, 0.0),
+        bbox_to_anchor=(0.5, legend_top),
         frameon=False,
         fontsize=9,
         title=f"the best of {hidden + len(entries)} local optima" if hidden else None,
