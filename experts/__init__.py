@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from leapnav.deprecated import deprecated_names
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.continuation import continuation
-from leapnav.experts.optimum import Optimum, find_optimum
+from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum
 from leapnav.experts.problem.certificate import certify, verify
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -39,6 +39,7 @@ __all__ = [
     "continuation",
     "differential_drive",
     "find_optimum",
+    "find_reached_optimum",
     "load_demonstrations",
     "plot_extremal",
     "rollout",

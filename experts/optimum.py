@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from itertools import islice
@@ -24,6 +25,7 @@ from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.shortest_paths import LATTICE_KERNELS
+from leapnav.experts.solve import solve
 from leapnav.experts.solvers.newton import solve_nodes
 
 N_ELSEWHERE = 4  # additional candidates far from the others: inexpensive, and the most distinct alternatives
@@ -146,6 +148,38 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
         search.reopen_places()
         failed = _search(search, grids, candidates, thorough)
     return _result(search) if failed is None else as_optimum(failure(problem, failed))
+
+
+def find_reached_optimum(
+    scenario: Scenario, pose: Sequence[float] | np.ndarray, cost: float, guess: Trajectory | Extremal | None = None
+) -> Extremal:
+    """Find the optimum to the pose that an episode has reached, with which the cost of the episode is compared.
+
+    An episode that stops short of the goal, within the tolerances, can cost less than the optimum of the scenario.
+    Multiple shooting from the guess solves the problem with the reached pose as the goal. If it fails, or if the
+    episode costs less than its result (the episode is then in a better path class), the full search follows.
+
+    Args:
+        scenario: the scenario of the episode.
+        pose: the last pose of the episode: x, y (m), heading (rad, in any turn).
+        cost: the cost of the episode.
+        guess: the optimum of the scenario; without it the full search is made.
+
+    Returns:
+        The optimum; without `success` if nothing is certified.
+
+    Raises:
+        ScenarioError: the robot is in contact with an obstacle at the pose.
+
+    """
+    x, y, heading = (float(value) for value in pose)
+    goal = (x, y, None if scenario.goal[2] is None else math.remainder(heading, 2 * math.pi))
+    reached = scenario.model_copy(update={"goal": goal})
+    if guess is not None:
+        extremal = solve(reached, "multiple_shooting", guess=guess)
+        if extremal.success and extremal.cost <= cost:
+            return extremal
+    return find_optimum(reached)
 
 
 def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) -> Status | None:

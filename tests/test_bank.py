@@ -86,7 +86,7 @@ def test_other_programs_can_read_it(bank):
     """Any HDF5 reader can read the format that the module describes."""
     with h5py.File(bank.path) as file:
         assert file.attrs["format"] == "leapnav-bank"
-        assert file.attrs["version"] == 3
+        assert file.attrs["version"] == 4
         ends = file["scenario_ends"][:]
         text = file["scenarios"][ends[0] : ends[1]].tobytes().decode()
         assert json.loads(text) == bank[1].to_dict()
@@ -154,11 +154,11 @@ def test_a_build_directory_left_beside_a_complete_bank_is_removed(bank):
     assert not store.directory.exists()
 
 
-def test_the_error_for_a_damaged_scenario_names_file_and_index(bank, tmp_path):
+def test_the_error_for_a_damaged_scenario_names_file_and_dataset(bank, tmp_path):
     path = tmp_path / "damaged.bank"
     path.write_bytes(bank.path.read_bytes().replace(bank[1].to_json().encode()[:20], b"\xff" * 20))
-    with pytest.raises(BankError, match=r"damaged\.bank: scenario 1: damaged"):
-        ScenarioBank(path)[1]
+    with pytest.raises(BankError, match=r"damaged\.bank: damaged: the checksum of scenarios differs"):
+        ScenarioBank(path)
 
 
 def test_a_complete_bank_is_not_rebuilt_and_no_other_file_is_overwritten(bank):
@@ -217,6 +217,16 @@ def with_attribute(name, value):
     return change
 
 
+def with_bytes(place):
+    def change(path):
+        content = bytearray(path.read_bytes())
+        start = int(place * len(content))
+        content[start : start + 400] = bytes(range(200)) * 2
+        path.write_bytes(content)
+
+    return change
+
+
 def without_costs(path):
     with h5py.File(path, "a") as file:
         del file["costs"]
@@ -228,8 +238,10 @@ def without_costs(path):
         (lambda path: path.write_text("text"), "not a scenario bank, or damaged"),
         (lambda path: path.write_bytes(path.read_bytes()[:-5000]), "not a scenario bank, or damaged"),
         (lambda path: path.write_bytes(b""), "not a scenario bank, or damaged"),
-        (with_attribute("version", 1), "version 1 of the format; this leapnav reads 3"),
+        (with_attribute("version", 1), "version 1 of the format; this leapnav reads 4"),
         (with_attribute("format", "other"), "an HDF5 file, but not a scenario bank"),
+        (with_attribute("seed", 8), "damaged: the checksum of attributes differs"),
+        *((with_bytes(place / 10), r"damaged: the checksum of \w+ differs") for place in range(3, 10)),
         (without_costs, "not a scenario bank, or damaged: .*costs"),
     ],
 )
@@ -238,6 +250,18 @@ def test_the_error_for_an_invalid_bank_names_the_file(bank, change, message, tmp
     with pytest.raises(BankError, match=message) as caught:
         ScenarioBank(path)
     assert "damaged.bank" in str(caught.value)
+
+
+def test_a_large_dataset_is_verified_when_it_is_first_read(bank, tmp_path, monkeypatch):
+    path = damaged(bank, tmp_path, with_bytes(0.9))
+    monkeypatch.setattr("leapnav.envs.scenarios.bank.MAX_VERIFIED_ON_OPENING", 500)
+    opened = ScenarioBank(path)
+    assert opened[0].name == bank[0].name
+    with pytest.raises(BankError, match=r"damaged\.bank: damaged: the checksum of \w+ differs"):
+        opened.reference(0)
+    with pytest.raises(BankError, match="the checksum"):
+        opened.verify_checksums()
+    bank.verify_checksums()
 
 
 def test_the_error_for_a_missing_bank_names_the_file(tmp_path):

@@ -7,8 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 
-from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
-from leapnav.experts import ExpertPolicy, find_optimum
+from leapnav.envs import NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
+from leapnav.experts import ExpertPolicy, find_optimum, find_reached_optimum
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.training import (
     Episode,
@@ -116,8 +116,21 @@ def test_regret_is_measured_against_the_pose_that_was_reached():
         assert episode.cost < episode.reference_cost
         assert abs(episode.cost - episode.reference_cost) > 1e-3
         assert 0 <= episode.regret < 2e-3
+        assert episode.soc == pytest.approx(1 / (1 + episode.regret), rel=1e-12) and episode.soc < 1
+        assert episode.ratio == pytest.approx(1 + episode.regret, rel=1e-12)
         reached = BANK[episode.index].model_copy(update={"goal": tuple(episode.states[-1].tolist())})
         assert episode.reached_reference == pytest.approx(find_optimum(reached).cost, rel=1e-5)
+
+
+def test_an_episode_that_is_cheaper_than_the_guess_is_compared_with_the_optimum_of_its_own_path_class():
+    scenario = Scenario.from_discs([[4, 2.4, 0.5]], start=(1, 2.5, 0), goal=(7, 2.5, 0), horizon=8)
+    optimum = find_optimum(scenario)
+    worse = optimum.alternatives[0]
+    found = find_reached_optimum(scenario, scenario.goal, cost=0.5 * (optimum.cost + worse.cost), guess=worse)
+    assert found.cost == pytest.approx(optimum.cost, rel=1e-9)
+    # An episode that costs more than the guess is compared with that, in one solve.
+    found = find_reached_optimum(scenario, scenario.goal, cost=worse.cost * (1 + 1e-6), guess=worse)
+    assert found.cost == pytest.approx(worse.cost, rel=1e-9)
 
 
 def test_bad_arguments_are_named():

@@ -19,13 +19,15 @@ it into memory. With n scenarios and N_i points of the i-th optimum, evenly spac
 | `controls` | (sum of N_i, 2) float32 | speed (m/s), turn rate (rad/s) |
 | `costates` | (sum of N_i, 3) float32 | lambda, the gradient of the cost-to-go |
 
-Attributes of the file: `format` ("leapnav-bank"), `version` (3), `family`, `seed`, `drawn` (number of scenarios drawn,
-of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason) and `software` (the version of
-leapnav that built the bank).
+Attributes of the file: `format` ("leapnav-bank"), `version` (4), `family`, `seed`, `drawn` (number of scenarios drawn,
+of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
+leapnav that built the bank) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that of
+the other attributes).
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -41,7 +43,9 @@ from leapnav.envs.scenarios.scenario import TASK_COLUMNS, Scenario
 from leapnav.envs.utils.files import atomic_path
 from leapnav.envs.utils.validation import check_choice, is_integer
 
-FORMAT, VERSION = "leapnav-bank", 3
+FORMAT, VERSION = "leapnav-bank", 4
+# Bytes. A larger dataset is verified when it is first read, because that takes 1 s per GB; the others on opening.
+MAX_VERIFIED_ON_OPENING = 32_000_000
 MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
 SPLITS = ("train", "test")
 BANK_DIRECTORY = Path(__file__).parent / "banks"  # of the included banks
@@ -149,7 +153,8 @@ class ScenarioBank(Sequence[Scenario]):
                     raise BankError(f"{self.path}: an HDF5 file, but not a scenario bank")
                 if attributes.get("version") != VERSION:
                     raise BankError(
-                        f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads {VERSION}"
+                        f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads "
+                        f"{VERSION}; build the bank again with `leapnav bank build`"
                     )
                 locations = {name: _locate(file[name], name) for name in _TYPES}
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
@@ -160,16 +165,49 @@ class ScenarioBank(Sequence[Scenario]):
                 name: content[start : start + size].view(_TYPES[name]).reshape(shape)
                 for name, (start, size, shape) in locations.items()
             }
+            self._checksums: dict[str, str] = dict(json.loads(attributes.pop("checksums")))
+            self._verify("attributes", _attribute_bytes(attributes))
+            for name, array in arrays.items():
+                if array.nbytes <= MAX_VERIFIED_ON_OPENING:
+                    self._verify(name, array)
             _check_lengths(arrays)
         except BankError:
             raise
         except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
             raise BankError(f"{self.path}: not a scenario bank, or damaged: {' '.join(str(error).split())}") from None
-        self._arrays = arrays
+        self._stored = arrays
+        self._verified = {name for name, array in arrays.items() if array.nbytes <= MAX_VERIFIED_ON_OPENING}
         self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
         self.tasks = arrays["tasks"]
         self._scenarios: dict[int, Scenario] = {}
+
+    def _verify(self, name: str, content: np.ndarray | bytes) -> None:
+        """Compare the content of a dataset, or the attributes, with the stored checksum.
+
+        Raises:
+            BankError: they differ.
+
+        """
+        if _digest(content) != self._checksums.get(name):
+            raise BankError(f"{self.path}: damaged: the checksum of {name} differs; copy or build the bank again")
+
+    def _array(self, name: str) -> np.ndarray:
+        """Return a dataset, which is verified when it is first read."""
+        if name not in self._verified:
+            self._verify(name, self._stored[name])
+            self._verified.add(name)
+        return self._stored[name]
+
+    def verify_checksums(self) -> None:
+        """Verify all datasets, also the large ones that would be verified when they are first read.
+
+        Raises:
+            BankError: a dataset is damaged.
+
+        """
+        for name in self._stored:
+            self._array(name)
 
     @classmethod
     def shipped(cls, family: str, split: str) -> ScenarioBank:
@@ -202,7 +240,7 @@ class ScenarioBank(Sequence[Scenario]):
         if i not in self._scenarios:
             start, end = self._span("scenario_ends", i)
             try:
-                self._scenarios[i] = Scenario.from_json(self._arrays["scenarios"][start:end].tobytes().decode())
+                self._scenarios[i] = Scenario.from_json(self._array("scenarios")[start:end].tobytes().decode())
             except ValueError as error:  # the encoding or the scenario is invalid
                 raise BankError(f"{self.path}: scenario {i}: damaged: {error}") from None
         return self._scenarios[i]
@@ -227,8 +265,8 @@ class ScenarioBank(Sequence[Scenario]):
             certificate=(residual, defect, drift, clearance),
             times=np.linspace(0.0, self[i].horizon, end - start),
             states=self.states(i),
-            controls=self._arrays["controls"][start:end],
-            costates=self._arrays["costates"][start:end],
+            controls=self._array("controls")[start:end],
+            costates=self._array("costates")[start:end],
         )
 
     def field(self, index: int) -> np.ndarray:
@@ -239,7 +277,7 @@ class ScenarioBank(Sequence[Scenario]):
 
         """
         start, end = self._span("field_ends", self._check_index(index))
-        return self._arrays["fields"][start:end]
+        return self._array("fields")[start:end]
 
     def states(self, index: int) -> np.ndarray:
         """Return the states (N, 3) of the optimum of a scenario, see `Reference`.
@@ -249,7 +287,7 @@ class ScenarioBank(Sequence[Scenario]):
 
         """
         start, end = self._span("path_ends", self._check_index(index))
-        return self._arrays["states"][start:end]
+        return self._array("states")[start:end]
 
     def _check_index(self, index: int) -> int:
         """Return the index counted from the start."""
@@ -262,7 +300,7 @@ class ScenarioBank(Sequence[Scenario]):
 
     def _span(self, ends: str, i: int) -> tuple[int, int]:
         """Return start and end of the i-th entry of a concatenated dataset."""
-        return (0 if i == 0 else int(self._arrays[ends][i - 1])), int(self._arrays[ends][i])
+        return (0 if i == 0 else int(self._array(ends)[i - 1])), int(self._array(ends)[i])
 
     def __repr__(self) -> str:
         return f"ScenarioBank({str(self.path)!r}, {len(self)} scenarios of {self.family})"
@@ -279,6 +317,17 @@ class ScenarioBank(Sequence[Scenario]):
 @cache
 def _shipped(family: str, split: str) -> ScenarioBank:
     return ScenarioBank(BANK_DIRECTORY / f"{family}-{split}.bank")
+
+
+def _digest(content: np.ndarray | bytes) -> str:
+    """Return the BLAKE2b digest (16 bytes) of the bytes of an array."""
+    data = content if isinstance(content, bytes) else np.ascontiguousarray(content).reshape(-1).view("u1").data
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def _attribute_bytes(attributes: Mapping[str, Any]) -> bytes:
+    """Return the attributes of a file, except the checksums, in a form that does not depend on their types in HDF5."""
+    return json.dumps({name: str(value) for name, value in sorted(attributes.items())}).encode()
 
 
 def _locate(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
@@ -332,7 +381,7 @@ def write_bank(
 
     texts = [entry.scenario.encode() for entry in entries]
     scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
-    arrays = {
+    columns: dict[str, Any] = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
         "scenario_ends": np.cumsum([len(text) for text in texts]),
         "tasks": np.array([scenario.task for scenario in scenarios]).reshape(-1, TASK_COLUMNS),
@@ -347,14 +396,24 @@ def write_bank(
         "controls": np.concatenate([np.empty((0, 2)), *(entry.controls for entry in entries)]),
         "costates": np.concatenate([np.empty((0, 3)), *(entry.costates for entry in entries)]),
     }
+    arrays = {name: np.asarray(values, dtype=_TYPES[name]) for name, values in columns.items()}
+    attributes = {
+        "format": FORMAT,
+        "version": VERSION,
+        "family": family,
+        "seed": seed,
+        "drawn": drawn,
+        "rejected": json.dumps(dict(sorted(rejected.items()))),
+        "software": software,
+    }
+    checksums = {name: _digest(array) for name, array in arrays.items()}
     # Alignment in the file makes the memory-mapped arrays aligned.
     with (
         atomic_path(path) as partial,
         h5py.File(partial, "w", alignment_threshold=1, alignment_interval=64) as file,
     ):
-        file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-        file.attrs["family"], file.attrs["seed"] = family, seed
-        file.attrs["drawn"], file.attrs["rejected"] = drawn, json.dumps(dict(sorted(rejected.items())))
-        file.attrs["software"] = software
-        for dataset, values in arrays.items():
-            file.create_dataset(dataset, data=np.asarray(values, dtype=_TYPES[dataset]))
+        for name, value in attributes.items():
+            file.attrs[name] = value
+        file.attrs["checksums"] = json.dumps({**checksums, "attributes": _digest(_attribute_bytes(attributes))})
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)

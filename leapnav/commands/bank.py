@@ -83,6 +83,7 @@ class Show:
         plot = self.plot or Path(bank.path.with_suffix(".png").name)
         check_at_least("count", self.count, 0)
         check_outputs(self.json, plot)
+        bank.verify_checksums()
         _print_summary(bank)
         if self.count > 0:
             plot_bank(bank, plot, self.count)
@@ -147,6 +148,7 @@ def _print_summary(bank: ScenarioBank) -> None:
     horizons = np.array([scenario.horizon for scenario in bank])
     excess = bank.second_costs / bank.costs - 1
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}, seed {bank.seed}, leapnav {bank.software}")
+    print("  checksums          verified")
     print(f"  sampled            {bank.drawn}")
     for reason, count in bank.rejected.items():
         print(f"  rejected           {count} ({reason})")

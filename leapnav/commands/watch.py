@@ -106,6 +106,7 @@ class Watch:
         from leapnav.envs.episodes import act_with, play_episode
         from leapnav.envs.navigation import NavigateEnv
         from leapnav.envs.unwrapping import unwrap
+        from leapnav.experts.optimum import find_reached_optimum
         from leapnav.training.scoring.policy_specs import make_policy_from_spec
 
         (inner,) = unwrap(env)
@@ -126,8 +127,13 @@ class Watch:
             if inner.window_closed:
                 break
             result = "success" if info["is_success"] else "collision" if info["collision"] else "missed the goal"
-            optimum = "" if reference is None else f", optimum {reference:.3f}"
-            print(f"{scenario}: {result} after {info['time']:.1f} s, cost {info['cost']:.3f}{optimum}")
-            measured = {name: float(info[name]) for name in ("time", "cost")}
+            measured: dict[str, Any] = {name: float(info[name]) for name in ("time", "cost")}
+            text = f"{scenario}: {result} after {info['time']:.1f} s, cost {info['cost']:.3f}"
+            if info["is_success"]:
+                optimum = find_reached_optimum(inner.scenario, info["pose"], measured["cost"])
+                measured["optimal_cost"] = optimum.cost if optimum.success else None
+                if optimum.success:
+                    text += f", optimum for the pose reached {optimum.cost:.3f}"
+            print(text)
             results.append({"scenario": scenario, "result": result, **measured, "reference_cost": reference})
         write_json(results, self.json)

@@ -18,8 +18,8 @@ from leapnav.envs.scenarios.bank import Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
+from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.problem.problem import Trajectory
-from leapnav.experts.solve import solve
 from leapnav.training.threads import limit_threads
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ class Episode:
         cost: cost J of the episode.
         episode_return: sum of the rewards.
         reference_cost: optimal cost J* of the scenario.
-        reached_reference: optimal cost J* for the pose that a successful episode has reached, solved with the reference
-            as the initial guess; NaN for other episodes, and if no certified extremal was found.
+        reached_reference: optimal cost J* for the pose that a successful episode has reached, see
+            `find_reached_optimum`; NaN for other episodes, and if no certified extremal was found.
         clearance: minimum clearance of the episode (m).
         reference_clearance: minimum clearance of the optimum (m).
         reversing: whether the optimum contains backward driving.
@@ -82,18 +82,32 @@ class Episode:
     states: np.ndarray
 
     @property
+    def optimal_cost(self) -> float:
+        """J* for the pose that a successful episode has reached, else J* of the scenario."""
+        return self.reference_cost if math.isnan(self.reached_reference) else self.reached_reference
+
+    @property
     def soc(self) -> float:
-        """Success weighted by optimal cost: S J* / max(J, J*)."""
-        return float(self.success) * self.reference_cost / max(self.cost, self.reference_cost)
+        """Success weighted by optimal cost: S J* / max(J, J*), with J* for the reached pose.
+
+        If that is not known, J* of the scenario is used.
+        """
+        if not self.success:
+            return 0.0
+        return self.optimal_cost / max(self.cost, self.optimal_cost)
 
     @property
     def ratio(self) -> float:
-        """Cost ratio J / J* of the performance profile; infinite for an unsuccessful episode."""
-        return self.cost / self.reference_cost if self.success else math.inf
+        """Cost ratio J / J* of the performance profile, with J* as in `soc`; infinite for an unsuccessful episode."""
+        return self.cost / self.optimal_cost if self.success else math.inf
 
     @property
     def regret(self) -> float:
-        """Regret (J - J*) / J*, with J* for the reached pose."""
+        """Regret (J - J*) / J* of a successful episode, with J* for the reached pose; NaN if that is not known.
+
+        It is negative only if the episode is cheaper than the best optimum that the search found, or if the robot
+        slips: its path is then none of the unicycle.
+        """
         return (self.cost - self.reached_reference) / self.reached_reference
 
     def to_dict(self) -> dict[str, Any]:
@@ -258,7 +272,9 @@ def _play_batch(
     return [episode for episode in episodes if episode is not None]
 
 
-def _make_episode(bank: ScenarioBank, index: int, states: np.ndarray, *, success: bool, **outcome: Any) -> Episode:
+def _make_episode(
+    bank: ScenarioBank, index: int, states: np.ndarray, *, success: bool, cost: float, **outcome: Any
+) -> Episode:
     """Combine the outcome of an episode with the reference of its scenario."""
     scenario, reference = bank[index], bank.reference(index)
     return Episode(
@@ -266,8 +282,9 @@ def _make_episode(bank: ScenarioBank, index: int, states: np.ndarray, *, success
         index=index,
         scenario=scenario.name,
         success=success,
+        cost=cost,
         reference_cost=reference.cost,
-        reached_reference=_optimal_cost_to(states[-1], scenario, reference) if success else math.nan,
+        reached_reference=_optimal_cost_to(states[-1], scenario, reference, cost) if success else math.nan,
         reference_clearance=reference.certificate[3],
         reversing=bool(reference.controls[:, 0].min() < -MIN_REVERSE_SPEED),
         states=states,
@@ -275,13 +292,11 @@ def _make_episode(bank: ScenarioBank, index: int, states: np.ndarray, *, success
     )
 
 
-def _optimal_cost_to(pose: np.ndarray, scenario: Scenario, reference: Reference) -> float:
-    """Return J* for a goal pose within the tolerances of the scenario's goal; NaN if no certified extremal is found."""
-    heading = None if scenario.goal[2] is None else math.remainder(float(pose[2]), 2 * math.pi)
-    reached = scenario.model_copy(update={"goal": (float(pose[0]), float(pose[1]), heading)})
+def _optimal_cost_to(pose: np.ndarray, scenario: Scenario, reference: Reference, cost: float) -> float:
+    """Return J* for the pose that a successful episode has reached; NaN if no certified extremal is found."""
     guess = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
-    extremal = solve(reached, "multiple_shooting", guess=guess)
-    return extremal.cost if extremal.success else math.nan
+    optimum = find_reached_optimum(scenario, pose, cost, guess)
+    return optimum.cost if optimum.success else math.nan
 
 
 def _median_milliseconds(policy_or_factory: PolicyOrFactory, bank: ScenarioBank, arguments: Mapping[str, Any]) -> float:

@@ -31,7 +31,7 @@ from leapnav.training.config import RunConfig, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies
 from leapnav.training.scoring.evaluation import Episode, Evaluation
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
-from leapnav.training.scoring.reports import COLUMNS, cell, draw_profiles, plot_episodes, row_name
+from leapnav.training.scoring.reports import COLUMNS, NEGATIVE_REGRET, cell, draw_profiles, plot_episodes, row_name
 
 BASELINES = ("expert", "go-to-goal", "random")  # in the order of the table
 CLEARANCE_BINS = (0.0, 0.05, 0.1, 0.2, math.inf)  # bin edges of the optimum's clearance (m)
@@ -116,6 +116,7 @@ def write_report(
         curves=_learning_curves(by_row, families),
         profiles=_profiles(comparison),
         failures=_success_tables(comparison),
+        negative_regret=NEGATIVE_REGRET if any(row.regret.value < 0 for row in scores) else "",
         galleries=[{"name": row, "png": _gallery(banks, comparison.runs[row][0])} for row in by_row],
         runs=[_summary(record) for record in records],
     )

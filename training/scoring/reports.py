@@ -36,6 +36,10 @@ COLUMNS = (
     ("regret\n%, median", "regret", 100, 2, 2),
     ("clearance\nm, median", "clearance", 1, 2, 2),
 )
+NEGATIVE_REGRET = (
+    "A negative regret: the episodes cost less than the best known optimum for the pose reached. A robot that slips "
+    "leaves the paths of the unicycle, whose optimum it is; otherwise the search has missed a better path."
+)
 N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal; the other outputs have all
 
 
@@ -58,6 +62,8 @@ def print_scores(comparison: Comparison, console: Console | None = None) -> None
         cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS[:N_TERMINAL_COLUMNS]]
         table.add_row(row_name(row), *cells, f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-")
     console.print(table)
+    if any(row.regret.value < 0 for row in scores):
+        console.print(NEGATIVE_REGRET)
     if len(comparison.families) > 1:
         console.print(_family_table(comparison))
 
@@ -84,8 +90,8 @@ def cell(interval: Interval, factor: float, digits: int, interval_digits: int) -
     """Format a value and, on the next line, its interval."""
     if math.isnan(interval.value):
         return "-"
-    low, high = (f"{factor * bound:.{interval_digits}f}" for bound in (interval.low, interval.high))
-    return f"{factor * interval.value:.{digits}f}\n[{low}, {high}]"
+    low, high = (f"{factor * bound:z.{interval_digits}f}" for bound in (interval.low, interval.high))
+    return f"{factor * interval.value:z.{digits}f}\n[{low}, {high}]"
 
 
 def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
@@ -205,6 +211,5 @@ def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) ->
     axes.plot(*episode.states[:, :2].T, color=POLICY_COLOR if episode.success else FAILURE_COLOR, linewidth=1.8)
     outcome = "collision" if episode.collision else "missed"
     if episode.success:
-        # The regret, because the cost of a policy that stops short of the goal can be lower than J*.
         outcome = "regret unknown" if math.isnan(episode.regret) else f"regret {100 * episode.regret:z.1f} %"
     axes.set_title(f"{episode.scenario}: {outcome}", fontsize=9)
