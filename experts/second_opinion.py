@@ -11,10 +11,10 @@ from typing import cast
 
 import numpy as np
 from joblib import Parallel, delayed
-from tqdm.auto import tqdm
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -132,8 +132,12 @@ def verify_bank(bank: ScenarioBank, workers: int = 1, progress: bool = True) -> 
     check_at_least("workers", workers, 1)
     pool = Parallel(n_jobs=workers, return_as="generator", pre_dispatch="4 * n_jobs")
     results = pool(delayed(_opinion)(bank, index) for index in range(len(bank)))
-    bar = tqdm(results, total=len(bank), desc=f"Verifying {bank.path.stem}", unit="scenario", disable=not progress)
-    return list(cast(Iterator[Opinion], bar))
+    opinions: list[Opinion] = []
+    with progress_bar(total=len(bank), label=f"Verifying {bank.path.stem}", unit="scenarios", show=progress) as bar:
+        for opinion in cast(Iterator[Opinion], results):
+            opinions.append(opinion)
+            bar.update()
+    return opinions
 
 
 def _opinion(bank: ScenarioBank, index: int) -> Opinion:

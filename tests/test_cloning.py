@@ -85,9 +85,25 @@ def test_cloning_stops_early_and_keeps_the_best_epoch(dataset, env):
         fit.run_epoch()
     validation = [loss.validation for loss in fit.losses]
     assert len(validation) < 50
+    assert f"stopped after {len(validation)} of 50 epochs" in str(fit.stopped_early)
     assert min(validation[:-2]) <= min(validation[-2:])
     fit.finish()
     assert fit._validation_loss() == pytest.approx(min(validation), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("n_samples", "batch_size", "batches", "epochs"),
+    [(5_000, 64, 79, 32), (40_000, 192, 209, 12), (2_000_000, 2048, 977, 12)],
+)
+def test_little_data_gives_smaller_batches_and_more_epochs(
+    n_samples, batch_size, batches, epochs, dataset, env, monkeypatch
+):
+    monkeypatch.setattr("leapnav.training.learning.cloning._Samples.__len__", lambda samples: n_samples)
+    fit = Cloning(fresh(env), dataset, CloningConfig())
+    assert (fit.batch_size, fit.batches, fit.epochs) == (batch_size, batches, epochs)
+    assert fit.epochs * fit.batches >= 2500
+    fit = Cloning(fresh(env), dataset, CloningConfig(epochs=2, batch_size=1024))  # given values are not changed
+    assert (fit.batch_size, fit.epochs) == (1024, 2)
 
 
 def test_a_resumed_fit_has_the_same_bits_as_an_uninterrupted_one(dataset, env, tmp_path):

@@ -374,3 +374,18 @@ def test_no_path_has_its_own_status():
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         solve(SCENARIOS["clutter-0"][0], **arguments)
+
+
+def test_a_diverging_collocation_is_reported_and_nothing_is_printed_below(capfd):
+    """SuperLU overflows for the Jacobians of a diverging iteration, and the BLAS then prints to standard output."""
+    theta, phi = sp.symbols("theta phi")
+    car = ControlAffineSystem(
+        state=(x, y, theta, phi),
+        drift=(0, 0, 0, 0),
+        fields=((sp.cos(theta), sp.sin(theta), 2 * sp.tan(phi), 0), (0, 0, 0, 1)),
+        position=(x, y),
+    )
+    goal = (5.433850416929541, 7.6235428761024515, -1.4032183662462445, 0)
+    extremal = solve(OptimalControlProblem(car, (0, 0, 0, 0), goal, 0.5, (1, 0.3)), method="collocation")
+    assert extremal.status is Status.DIVERGED
+    assert "On entry to" not in "".join(capfd.readouterr())

@@ -20,13 +20,14 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(files("leapnav.training").joinpath("de
 class CloningConfig:
     """Settings of behaviour cloning."""
 
-    epochs: int = 12
-    """Maximum number of passes over the samples."""
+    epochs: int | None = None
+    """Maximum number of passes over the samples; by default 12, and with few samples more: at least 2,500 gradient
+    steps."""
     patience: int = 5
     """Epochs without a lower validation loss before the fit stops; 0: no early stopping. The weights of the best epoch
     are kept."""
-    batch_size: int = 2048
-    """Samples per gradient step."""
+    batch_size: int | None = None
+    """Samples per gradient step; by default 2,048, and with few samples fewer, down to 64."""
     learning_rate: float = 2e-3
     """Peak learning rate (cosine decay to zero)."""
     weight_decay: float = 1e-4

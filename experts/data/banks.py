@@ -12,11 +12,11 @@ from typing import Any, cast
 
 import numpy as np
 from joblib import Parallel
-from tqdm.auto import tqdm
 
 import leapnav
 from leapnav.envs.scenarios.bank import VERSION, BankEntry, BankError, ScenarioBank, point_times, write_bank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
+from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.store import Arrays, ResumableStore, discard
 from leapnav.experts.optimum import Optimum, find_optimum
@@ -142,13 +142,13 @@ def _solve(store: ResumableStore, pool: Parallel, family: str, count: int, seed:
     """Complete the draws until `count` scenarios are admitted; return each draw's reason of rejection, in order."""
     reasons: dict[int, str] = {}
     n_admitted = 0
-    with tqdm(total=count, desc=f"Building {family}", unit="scenario", disable=not progress) as bar:
+    with progress_bar(total=count, label=f"Building {family}", unit="scenarios", show=progress) as bar:
         while n_admitted < count:
             # As many draws as scenarios are missing, so that the bank holds the first `count` admitted scenarios.
             numbers = range(len(reasons), len(reasons) + count - n_admitted)
             for number, arrays in store.complete(numbers, partial(draw, family=family, seed=seed), pool, bar):
                 reasons[number] = str(arrays["rejected"])
-                bar.update(not reasons[number])
+                advance(bar, not reasons[number])
             n_admitted = sum(not reason for reason in reasons.values())
     return dict(sorted(reasons.items()))
 

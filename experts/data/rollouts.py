@@ -15,7 +15,6 @@ from typing import Any, cast
 
 import numpy as np
 from joblib import Parallel, parallel_config
-from tqdm.auto import tqdm
 
 import leapnav
 from leapnav.envs.episodes import play_episode, replay
@@ -24,6 +23,7 @@ from leapnav.envs.scenarios.families import check_family, sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
+from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.data.demonstrations import (
     Demonstration,
@@ -183,13 +183,13 @@ def check_dataset(folder: str | os.PathLike[str], *, progress: bool = True) -> R
     total = open_dataset(folder).total_episodes
     env = NavigateEnv(split="fresh")
     largest, worst, episodes = np.zeros(3), None, 0
-    for number, demonstration in enumerate(
-        tqdm(iterate_demonstrations(folder), total=total, desc="Replaying", unit="episode", disable=not progress)
-    ):
-        deviations = _replay(env, demonstration)
-        if worst is None or deviations.max() > largest.max():
-            worst = number
-        largest, episodes = np.maximum(largest, deviations), number + 1
+    with progress_bar(total=total, label="Replaying", unit="episodes", show=progress) as bar:
+        for number, demonstration in enumerate(iterate_demonstrations(folder)):
+            deviations = _replay(env, demonstration)
+            if worst is None or deviations.max() > largest.max():
+                worst = number
+            largest, episodes = np.maximum(largest, deviations), number + 1
+            bar.update()
     observation, reward, state = largest.tolist()
     return Replay(episodes, observation, reward, state, worst)
 
@@ -267,13 +267,13 @@ def _solve(
 ) -> int:
     """Complete shards until they hold `count` solved scenarios, and return the number of shards."""
     n_shards = n_solved = 0
-    with tqdm(total=count, desc=f"Solving {family}", unit="scenario", disable=not progress) as bar:
+    with progress_bar(total=count, label=f"Solving {family}", unit="scenarios", show=progress) as bar:
         while n_solved < count:  # repeated for the scenarios that had no certified optimum
             numbers = range(n_shards, n_shards + math.ceil((count - n_solved) / SHARD_SIZE))
             for _, arrays in store.complete(numbers, compute, pool, bar):
                 solved = int(arrays["solved"].sum())
                 n_solved += solved
-                bar.update(solved)
+                advance(bar, solved)
             n_shards = numbers.stop
     return n_shards
 

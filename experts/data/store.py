@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 from joblib import Parallel, delayed
-from tqdm.auto import tqdm
+from tqdm.std import tqdm
 
 from leapnav.envs.utils.files import atomic_path, exclusive, write_text
 

@@ -24,9 +24,16 @@ from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start
 # tight tolerance would need a fine mesh.
 COARSE_TOLERANCE = 1e-4
 MAX_NODES = 5_000
+# Entries of the Jacobian beyond which the iteration has diverged. SuperLU, which solve_bvp uses, overflows for matrices
+# with larger entries, and the BLAS then prints messages about illegal arguments.
+MAX_ENTRY = 1e30
 MAX_POLISHED_SEGMENTS = 128
 # Exit codes of solve_bvp.
 STATUS = {0: Status.SUCCESS, 1: Status.MAX_ITERATIONS, 2: Status.SINGULAR, 3: Status.STALLED}
+
+
+class _DivergedError(Exception):
+    """Newton's method inside `solve_bvp` has diverged."""
 
 
 def collocation(problem: OptimalControlProblem, path: Trajectory, options: SolverOptions) -> Extremal:
@@ -51,23 +58,28 @@ def collocation(problem: OptimalControlProblem, path: Trajectory, options: Solve
         nonlocal evaluations
         out = np.empty((z.shape[1], 2 * n, 2 * n))
         evaluations += _jacobians(arrays.flow, np.ascontiguousarray(z.T), out)
+        if not np.abs(out).max() < MAX_ENTRY:  # also if there are NaN
+            raise _DivergedError
         return out.transpose(1, 2, 0)
 
     def ends(first: np.ndarray, last: np.ndarray) -> np.ndarray:
         return np.concatenate([first[:n] - arrays.start, last[end] - goal])
 
     tolerance = max(options.tol, COARSE_TOLERANCE) if options.polish else options.tol
-    with np.errstate(all="ignore"):  # solve_bvp detects diverging Newton steps itself
-        found = solve_bvp(
-            rates,
-            ends,
-            times,
-            nodes.T,
-            fun_jac=jacobians,
-            bc_jac=lambda *_: (at_start, at_end),
-            tol=tolerance,
-            max_nodes=MAX_NODES,
-        )
+    try:
+        with np.errstate(all="ignore"):  # solve_bvp detects singular matrices itself
+            found = solve_bvp(
+                rates,
+                ends,
+                times,
+                nodes.T,
+                fun_jac=jacobians,
+                bc_jac=lambda *_: (at_start, at_end),
+                tol=tolerance,
+                max_nodes=MAX_NODES,
+            )
+    except _DivergedError:
+        return certify(problem, times, nodes, Status.DIVERGED, (), evaluations)
     nodes = np.ascontiguousarray(found.y.T)
     status = STATUS.get(found.status, Status.STALLED)
     if not np.isfinite(nodes).all():

@@ -16,9 +16,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from torch.optim.lr_scheduler import LambdaLR
-from tqdm.auto import tqdm
 
 from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.envs.utils.validation import (
     check_choice,
     check_fraction,
@@ -33,6 +33,10 @@ from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.actors import actor_parameters, mean_action, policy_of, set_noise, update_target
 from leapnav.training.threads import limit_threads
 
+# Defaults of the epochs and the batch size. A network that has learned from a few hundred gradient steps only is worse
+# than the demonstrations allow: 200 demonstrations of "open" gave 51 % success after 180 steps, 100 % after 2,700.
+DEFAULT_EPOCHS, MIN_STEPS = 12, 2_500
+MIN_BATCH_SIZE, MAX_BATCH_SIZE = 64, 2048
 WARM_UP_STEPS = 200  # gradient steps of the linear warm-up of the learning rate
 MIN_STD = 0.01  # lower bound of the fitted standard deviation of the actions
 MAX_GRADIENT_NORM = 1.0
@@ -87,13 +91,14 @@ def behaviour_clone(
 
     """
     fit = Cloning(policy_of(model), Dataset.of(dataset), config or CloningConfig())
-    total = fit.config.epochs * fit.batches
-    with tqdm(total=total, desc="Cloning", unit="batch", disable=not progress) as bar:
+    with progress_bar(total=fit.epochs * fit.batches, label="Cloning", unit="batches", show=progress) as bar:
         while not fit.finished:
             loss = fit.run_epoch(bar.update)
             bar.set_postfix(training=f"{loss.training:.4f}", validation=f"{loss.validation:.4f}")
             if on_epoch is not None:
                 on_epoch(loss)
+        if fit.stopped_early is not None:
+            stop_early(bar, fit.stopped_early)
     fit.finish()
     return fit.losses
 
@@ -109,6 +114,8 @@ class Cloning:
             the seed alone.
 
     Attributes:
+        epochs: maximum number of epochs.
+        batch_size: samples per gradient step.
         batches: gradient steps per epoch.
         losses: losses of the epochs so far.
 
@@ -129,20 +136,30 @@ class Cloning:
         train, held_out = _split(dataset, config.validation_share, config.seed)
         self._train, self._held_out = (_Samples(dataset, chosen, policy.device) for chosen in (train, held_out))
         self._scale = _scale(self._train, config.loss)
-        self.batches = math.ceil(len(self._train) / config.batch_size)
+        self.batch_size = config.batch_size or _default_batch_size(len(self._train))
+        self.batches = math.ceil(len(self._train) / self.batch_size)
+        self.epochs = config.epochs or max(DEFAULT_EPOCHS, math.ceil(MIN_STEPS / self.batches))
         parameters = actor_parameters(policy)
         self._optimiser = th.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
-        self._scheduler = LambdaLR(self._optimiser, warm_up_and_cosine(config.epochs * self.batches))
+        self._scheduler = LambdaLR(self._optimiser, warm_up_and_cosine(self.epochs * self.batches))
         self._best: tuple[float, dict[str, th.Tensor]] | None = None
 
     @property
     def finished(self) -> bool:
         """Whether all epochs have run, or the validation loss has not decreased for `patience` epochs."""
         done, patience = len(self.losses), self.config.patience
-        if done >= self.config.epochs:
+        if done >= self.epochs:
             return True
         validation = [loss.validation for loss in self.losses]
         return bool(patience and done > patience and min(validation[:-patience]) <= min(validation[-patience:]))
+
+    @property
+    def stopped_early(self) -> str | None:
+        """The reason why the fit has ended before its last epoch, or None."""
+        done = len(self.losses)
+        if not self.finished or done >= self.epochs:
+            return None
+        return f"stopped after {done} of {self.epochs} epochs, validation loss not lower for {self.config.patience}"
 
     @limit_threads
     def run_epoch(self, on_batch: Callable[[], Any] = lambda: None) -> EpochLoss:
@@ -161,7 +178,7 @@ class Cloning:
         config, total = self.config, 0.0
         self._policy.set_training_mode(True)
         order = th.randperm(len(self._train), generator=self._rng)
-        for chosen in order.split(config.batch_size):
+        for chosen in order.split(self.batch_size):
             loss = self._loss(self._train.augmented(chosen, self._rng) if config.augment else self._train.at(chosen))
             if not th.isfinite(loss):
                 raise ValueError(
@@ -231,6 +248,11 @@ class Cloning:
             batches = self._held_out.batches(EVALUATION_BATCH_SIZE)
             losses = [float(self._loss(batch)) * len(batch[0]) for batch in batches]
         return sum(losses) / len(self._held_out)
+
+
+def _default_batch_size(n_samples: int) -> int:
+    """Return the batch size with which `DEFAULT_EPOCHS` epochs have about `MIN_STEPS` gradient steps, or more."""
+    return min(max(n_samples * DEFAULT_EPOCHS // MIN_STEPS, MIN_BATCH_SIZE), MAX_BATCH_SIZE)
 
 
 class _Samples:
@@ -339,8 +361,10 @@ def check_observations(policy: BasePolicy, dataset: Dataset) -> None:
 
 def check_cloning(config: CloningConfig) -> None:
     """Raise ValueError unless the settings of a fit are valid; the message names the setting and its value."""
-    for name in ("epochs", "batch_size", "learning_rate"):
-        check_positive(name, getattr(config, name))
+    for name in ("epochs", "batch_size"):
+        if getattr(config, name) is not None:
+            check_positive(name, getattr(config, name))
+    check_positive("learning_rate", config.learning_rate)
     for name in ("weight_decay", "patience"):
         check_not_negative(name, getattr(config, name))
     check_integer("seed", config.seed, 0, 2**63 - 1)

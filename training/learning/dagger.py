@@ -22,12 +22,12 @@ from joblib import Parallel, delayed
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
-from tqdm.auto import tqdm
 
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.utils.progress import advance, progress_bar, stop_early
 from leapnav.envs.utils.validation import check_at_least, check_not_negative, check_positive
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.training.config import CloningConfig, DAggerConfig
@@ -165,7 +165,7 @@ class DAgger:
         self._venv.seed(environment_seed(config.seed, number))
         episodes = self._drive(name, progress)
         takeovers = self._choose_takeovers(episodes, rng)
-        with tqdm(total=len(takeovers), desc=f"{name}: labelling", unit="episode", disable=not progress) as bar:
+        with progress_bar(total=len(takeovers), label=f"{name}: labelling", unit="episodes", show=progress) as bar:
             samples = self._label(takeovers, bar)
         if samples is not None:
             if self._folder is not None:
@@ -209,7 +209,8 @@ class DAgger:
         paths: list[list[np.ndarray]] = [[] for _ in range(count)]
         episodes: list[_Episode] = []
         failures = 0
-        with tqdm(total=self.config.max_failures, desc=f"{name}: driving", unit="failure", disable=not progress) as bar:
+        driving = f"{name}: driving"
+        with progress_bar(total=self.config.max_failures, label=driving, unit="failures", show=progress) as bar:
             while failures < self.config.max_failures and len(episodes) < self.config.max_episodes:
                 for path, pose in zip(paths, self._venv.venv.poses, strict=True):
                     path.append(pose)
@@ -221,9 +222,11 @@ class DAgger:
                     episodes.append(_Episode(playing[i], np.array(paths[i]), success, collision))
                     paths[i] = []
                     failures += not success
-                    bar.update(not success)
+                    advance(bar, not success)
                 if dones.any():
                     playing = self._venv.get_attr("scenario")
+            if failures < self.config.max_failures:
+                stop_early(bar, f"{len(episodes)} episodes with {failures} failures")
         return episodes
 
     def _choose_takeovers(self, episodes: Sequence[_Episode], rng: np.random.Generator) -> list[list[Scenario]]:
@@ -254,7 +257,7 @@ class DAgger:
         epochs = config.epochs if number + 1 < config.rounds else config.last_epochs
         settings = replace(self._cloning, epochs=epochs, learning_rate=config.learning_rate, patience=0)
         fit = Cloning(self._policy, self.dataset, settings, stream=number + 1)
-        with tqdm(total=settings.epochs * fit.batches, desc="Fitting", unit="batch", disable=not progress) as bar:
+        with progress_bar(total=fit.epochs * fit.batches, label="Fitting", unit="batches", show=progress) as bar:
             while not fit.finished:
                 fit.run_epoch(bar.update)
         fit.finish()

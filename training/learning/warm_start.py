@@ -14,11 +14,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
-from tqdm.auto import tqdm
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
+from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_not_negative, check_positive
 from leapnav.experts.data.demonstrations import CONTROL_PERIOD
 from leapnav.training.config import CloningConfig, WarmStartConfig
@@ -153,7 +153,7 @@ def _fit_critic(
     optimiser = th.optim.AdamW(critic.parameters, lr=config.critic_learning_rate)
     scheduler = LambdaLR(optimiser, cosine_decay(total_steps))
     errors = np.zeros(2)
-    with tqdm(total=total_steps, desc="Critic", unit="batch", disable=not progress) as bar:
+    with progress_bar(total=total_steps, label="Critic", unit="batches", show=progress) as bar:
         for _ in range(config.critic_epochs):
             errors[:] = 0.0
             for chosen in th.randperm(len(samples), generator=generator).split(config.critic_batch_size):

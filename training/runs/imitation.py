@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training.config import BCConfig, DAggerRunConfig, RunConfig
@@ -68,11 +69,11 @@ def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConf
         fit.load_state_dict(state["fit"])
         run.restore_generators()
     done = len(fit.losses) * fit.batches
-    with tqdm(total=fit.config.epochs * fit.batches, initial=done, unit="batch", disable=not progress) as bar:
-        bar.set_description(f"Cloning {config.family}")
+    label = f"Cloning {config.family}"
+    with progress_bar(total=fit.epochs * fit.batches, label=label, unit="batches", initial=done, show=progress) as bar:
         while not fit.finished:
             loss = fit.run_epoch(bar.update)
-            samples = loss.epoch * fit.batches * config.cloning.batch_size
+            samples = loss.epoch * fit.batches * fit.batch_size
             run.logger.record("loss/training", loss.training)
             run.logger.record("loss/validation", loss.validation)
             evaluations = run.evaluate(policy, samples)
@@ -80,8 +81,10 @@ def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConf
             run.save_policy(policy)
             state = {"policy": policy.state_dict(), "fit": fit.state_dict()}
             run.save_checkpoint(lambda folder, state=state: th.save(state, folder / "fit.pt"), {"epochs": loss.epoch})
+        if fit.stopped_early is not None:
+            stop_early(bar, fit.stopped_early)
     fit.finish()
-    samples = len(fit.losses) * fit.batches * config.cloning.batch_size
+    samples = len(fit.losses) * fit.batches * fit.batch_size
     evaluations = run.evaluate(policy, samples, final=True)
     run.save_policy(policy)
     return evaluations

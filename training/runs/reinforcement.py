@@ -17,10 +17,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
-from tqdm.auto import tqdm
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_choice
 from leapnav.training.config import PPOConfig, SACConfig
 from leapnav.training.learning.dataset import Dataset
@@ -297,16 +297,16 @@ class _RunCallback(BaseCallback):
         self._run, self._config, self._venv = run, config, venv
         self._evaluated_step = -1 if progress is None else int(progress["evaluated"])
         self._checkpoint_step = 0 if progress is None else int(progress["step"])
-        self.bar = tqdm(
+        self.bar = progress_bar(
             total=config.total_timesteps,
+            label=run.algorithm.upper(),
+            unit="steps",
             initial=self._checkpoint_step,
-            desc=run.algorithm.upper(),
-            unit="step",
-            disable=not show_bar,
+            show=show_bar,
         )
 
     def _on_step(self) -> bool:
-        self.bar.update(self._config.n_envs)
+        advance(self.bar, self._config.n_envs)  # the last rollout may exceed the total
         return True
 
     def _on_rollout_start(self) -> None:

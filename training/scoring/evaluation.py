@@ -10,13 +10,13 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.problem.problem import Trajectory
@@ -224,7 +224,7 @@ def evaluate(
     arguments = dict(environment or {})
     indices = list(range(len(bank) if count is None else min(count, len(bank))))
     episodes: list[Episode] = []
-    with tqdm(total=len(indices), desc=label, unit="episode", disable=not progress) as bar:
+    with progress_bar(total=len(indices), label=label, unit="episodes", show=progress) as bar:
         for first in range(0, len(indices), BATCH_SIZE):
             batch = indices[first : first + BATCH_SIZE]
             episodes += _play_batch(policy, bank, batch, arguments, seed, bar.update)
