@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from leapnav.deprecated import deprecated_names
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.continuation import continuation
-from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum
+from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum, shortest_horizon
 from leapnav.experts.problem.certificate import certify, verify
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -43,6 +43,7 @@ __all__ = [
     "load_demonstrations",
     "plot_extremal",
     "rollout",
+    "shortest_horizon",
     "solve",
     "unicycle",
     "unicycle_with_inertia",

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from leapnav.envs.kernels import prepare
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.scenario import MAX_MAGNITUDE, Scenario
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.shapes.sampling import sample_grid
 from leapnav.envs.utils.validation import check_integer
@@ -39,6 +39,8 @@ LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, Fals
 # Most families need 1/15 of it, slalom occasionally 4/3; among hundreds of obstacles one candidate takes 1/3. With
 # 10,000, one scenario of the included banks would lose its second-best optimum.
 ALTERNATIVES_BUDGET = 12_000
+# `shortest_horizon`: candidates of each search, relative tolerance, and largest multiple of the scenario's horizon.
+N_BISECTED, HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 6, 0.02, 1000.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -180,6 +182,32 @@ def find_reached_optimum(
         if extremal.success and extremal.cost <= cost:
             return extremal
     return find_optimum(reached)
+
+
+def shortest_horizon(scenario: Scenario) -> float | None:
+    """Find the shortest horizon with which the scenario has a certified optimum, by bisection.
+
+    Args:
+        scenario: the scenario, for example one with the status HORIZON_TOO_SHORT.
+
+    Returns:
+        The horizon (s), rounded up to 0.1 s; the search before the rounding is accurate to 2 %. None if no horizon up
+        to 1,000 times that of the scenario suffices.
+
+    """
+
+    def suffices(horizon: float) -> bool:
+        return find_optimum(scenario.model_copy(update={"horizon": horizon}), N_BISECTED, thorough=False).success
+
+    low, high = 0.0, scenario.horizon
+    while not suffices(high):
+        low, high = high, 2 * high
+        if high > MAX_HORIZON_FACTOR * scenario.horizon or high > MAX_MAGNITUDE:
+            return None
+    while high - low > HORIZON_TOLERANCE * high:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if suffices(middle) else (middle, high)
+    return min(math.ceil(10 * high) / 10, MAX_MAGNITUDE)
 
 
 def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) -> Status | None:
