@@ -19,17 +19,15 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.utils.colors import ALTERNATIVES, CURVES, EDGE, GOAL, OBSTACLE, OPTIMUM, START, WALL
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import Optimum
 from leapnav.experts.problem.extremal import Extremal, Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
+from leapnav.experts.problem.system import ControlAffineSystem
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
 
-OBSTACLE, EDGE, WALL, START, GOAL, OPTIMUM = "#c3c8d1", "#7a8190", "#3c4048", "#2662ab", "#22804f", "#1a1a1a"
-# The curves also differ in lightness, for readers with a colour vision deficiency.
-CURVES = (START, "#e08a00", GOAL, "#cc79a7", "#56b4e9", OPTIMUM)
-ALTERNATIVE_COLORS = ("#e08a00", "#56b4e9", "#cc79a7", "#22804f")
-MAX_ALTERNATIVES = len(ALTERNATIVE_COLORS)
+MAX_ALTERNATIVES = len(ALTERNATIVES)
 N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
 N_POINTS = 400  # points of a dense path
 N_FIELD_POINTS = 200  # sample points per side of an obstacle field
@@ -137,19 +135,26 @@ def _dense_times(extremal: Extremal) -> np.ndarray:
     return np.union1d(extremal.times, np.linspace(0.0, extremal.problem.horizon, N_POINTS))
 
 
+def _labels(system: ControlAffineSystem) -> list[str]:
+    """Labels of the states and controls (n + m)."""
+    states = [f"${sp.latex(symbol)}$" for symbol in system.state]
+    return list(system.labels) or [*states, *(f"$u_{{{j + 1}}}$" for j in range(system.m))]
+
+
 def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> None:
     """Draw states, controls, costates and Hamiltonian on four axes."""
     problem, horizon = extremal.problem, extremal.problem.horizon
-    names = [sp.latex(symbol) for symbol in problem.system.state]
+    system = problem.system
+    names, known = [sp.latex(symbol) for symbol in system.state], _labels(system)
     times = _dense_times(extremal)
     states, controls, costates = extremal.evaluate(times)
     for axes, values, name, labels in (
-        (panels[0], states, "states", names),
-        (panels[1], controls, "controls", [f"u_{{{j + 1}}}" for j in range(problem.system.m)]),
-        (panels[2], costates, "costates", [rf"\lambda_{{{name}}}" for name in names]),
+        (panels[0], states, "states", known[: system.n]),
+        (panels[1], controls, "controls", known[system.n :]),
+        (panels[2], costates, "costates", [rf"$\lambda_{{{name}}}$" for name in names]),
     ):
         for color, column, symbol in zip(cycle(CURVES), values.T, labels, strict=False):
-            axes.plot(times, column, color=color, linewidth=1.5, label=f"${symbol}$")
+            axes.plot(times, column, color=color, linewidth=1.5, label=symbol)
         axes.set_ylabel(name)
     if problem.control_bounds is not None:
         _draw_bounds(panels[1], controls, problem.control_bounds)
@@ -187,7 +192,7 @@ def _draw_hamiltonian(axes: Axes, extremal: Extremal) -> None:
     axes.plot(
         extremal.times,
         deviation,
-        color=START,
+        color=CURVES[0],
         linewidth=1.0,
         marker=".",
         markersize=3,
@@ -228,8 +233,8 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
         xlim=(center[0] - reach, center[0] + reach),
         ylim=(center[1] - reach, center[1] + reach),
         aspect="equal",
-        xlabel=f"${sp.latex(system.position[0])}$",
-        ylabel=f"${sp.latex(system.position[1])}$",
+        xlabel=_labels(system)[ix],
+        ylabel=_labels(system)[iy],
     )
     axes.grid(alpha=0.3)
 
@@ -242,7 +247,7 @@ def _draw_alternatives(axes: Axes, optimum: Optimum, legend_top: float) -> None:
     shown = optimum.alternatives[:MAX_ALTERNATIVES]
     if not shown:
         return
-    entries = [(optimum, OPTIMUM, 1.8), *((other, ALTERNATIVE_COLORS[k], 1.3) for k, other in enumerate(shown))]
+    entries = [(optimum, OPTIMUM, 1.8), *((other, ALTERNATIVES[k], 1.3) for k, other in enumerate(shown))]
     for other, color, width in entries:
         positions = other.evaluate(_dense_times(other))[0][:, :2]
         label = f"J = {other.cost:.4g}"
@@ -304,7 +309,7 @@ def _draw_state_space(axes: Axes, extremal: Extremal, sweeps: Sequence[Iteration
     """Draw the first two states against each other, or a single state over time."""
     times = _dense_times(extremal)
     states = extremal.evaluate(times)[0]
-    names = [f"${sp.latex(symbol)}$" for symbol in extremal.problem.system.state]
+    names = _labels(extremal.problem.system)[: extremal.problem.system.n]
 
     def project(times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return (times, states[:, 0]) if states.shape[1] == 1 else (states[:, 0], states[:, 1])

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from leapnav.envs import NavigateEnv, Scenario, ScenarioBank
 from leapnav.envs.episodes import act_with, play_episode
+from leapnav.envs.utils.colors import OPTIMUM, POLICY
 from leapnav.experts import Trajectory, find_optimum, solve
 from leapnav.experts.plotting import draw_robot, draw_scenario
 from leapnav.experts.solvers.feasible_path import dense_path
@@ -63,7 +64,7 @@ def main() -> None:
         plane.plot(states[:, 0], states[:, 1], color=color, linewidth=1.2, label=f"Leapfrog, sweep {k}")
         plane.plot(nodes[:, 0], nodes[:, 1], ".", color=color, markersize=3)
     path = optimum.interpolate(np.linspace(0.0, scenario.horizon, 400))
-    plane.plot(path[:, 0], path[:, 1], color="#d9730d", linewidth=2.5, label=f"optimum, J* = {optimum.cost:.3f}")
+    plane.plot(path[:, 0], path[:, 1], color=OPTIMUM, linewidth=2.5, label=f"optimum, J* = {optimum.cost:.3f}")
     env = NavigateEnv(scenario=scenario, **policy_environment("clutter"))
     _, info, steps = play_episode(env, act_with(load_policy("clutter")), seed=0)
     poses = [scenario.start]
@@ -72,14 +73,14 @@ def main() -> None:
         poses.append(info["pose"])
     driven = np.array(poses)
     label = f"learned policy, J = {info['cost']:.3f}"
-    plane.plot(driven[:, 0], driven[:, 1], "--", color="#2662ab", linewidth=1.8, label=label)
+    plane.plot(driven[:, 0], driven[:, 1], "--", color=POLICY, linewidth=1.8, label=label)
     for fraction in np.linspace(0.0, 1.0, 9):
         pose = path[round(fraction * 399), :3]
-        draw_robot(plane, pose, scenario.robot.radius, "#d9730d", alpha=0.5)
+        draw_robot(plane, pose, scenario.robot.radius, OPTIMUM, alpha=0.5)
     plane.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)
     plane.set_title("Feasible paths converge to the certified optimum", fontsize=10)
     names = list(SCORES)
-    colors = ["#b9bec6"] * (len(names) - 1) + ["#d9730d"]
+    colors = ["#b9bec6"] * (len(names) - 1) + [OPTIMUM]
     drawn = bars.barh(names, list(SCORES.values()), color=colors)
     bars.bar_label(drawn, fmt="%.3g", padding=4, fontsize=9)
     bars.set_xlim(0.0, 1.15)

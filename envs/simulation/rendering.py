@@ -15,14 +15,11 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
+from leapnav.envs.utils.colors import EDGE, FAILURE, GOAL, OBSTACLE, OPTIMUM, POLICY, WALL
 
 SIZE, STATUS_HEIGHT = 600, 40  # pixels: longer side of the arena, and height of the status line below it
 SUPERSAMPLING = 2  # frames are drawn at this multiple of their size and scaled down, which smooths the edges
-BACKGROUND, FLOOR, WALL = (255, 255, 255), (250, 250, 248), (60, 64, 72)
-OBSTACLE, EDGE = (184, 190, 200), (120, 126, 138)
-ROBOT, CRASHED, WHEEL, NOSE = (38, 98, 171), (192, 57, 43), (20, 30, 50), (255, 255, 255)
-GOAL, TRAIL, OPTIMUM, RAY = (34, 139, 84), (38, 98, 171), (236, 164, 92), (236, 200, 194)
-LIDAR, TEXT, OPTIMUM_TEXT = (222, 120, 120), (60, 64, 72), (186, 108, 34)
+WHITE, FLOOR, WHEEL, RAY, BEAM_END = "#ffffff", "#fafaf8", "#141e32", "#ecc8c2", "#de7878"
 
 ToPixels = Callable[[float, float], tuple[float, float]]
 
@@ -92,7 +89,7 @@ def draw_scene(scene: Scene) -> np.ndarray:
     width = 2 * SUPERSAMPLING * math.ceil((x_max - x_min + 2 * margin) * scale / (2 * SUPERSAMPLING) - 1e-6)
     height = 2 * SUPERSAMPLING * math.ceil((y_max - y_min + 2 * margin) * scale / (2 * SUPERSAMPLING) - 1e-6)
     canvas = pygame.Surface((width, height))
-    canvas.fill(BACKGROUND)
+    canvas.fill(WHITE)
 
     def to_pixels(x: float, y: float) -> tuple[float, float]:
         return (x - x_min + margin) * scale, height - (y - y_min + margin) * scale
@@ -116,7 +113,7 @@ def draw_scene(scene: Scene) -> np.ndarray:
     pygame.draw.rect(canvas, WALL, frame, 2 * line)
     for end, hit in beams:
         if hit:
-            pygame.draw.circle(canvas, LIDAR, end, 1.5 * line)
+            pygame.draw.circle(canvas, BEAM_END, end, 1.5 * line)
 
     if scene.optimum is not None:
         _draw_path(canvas, OPTIMUM, [to_pixels(x, y) for x, y in scene.optimum[:, :2].tolist()], 2 * line)
@@ -125,11 +122,11 @@ def draw_scene(scene: Scene) -> np.ndarray:
     pygame.draw.circle(canvas, GOAL, to_pixels(goal[0], goal[1]), radius * scale, 2 * line)
     if goal[2] is not None:
         _draw_arrow(canvas, GOAL, to_pixels, (goal[0], goal[1], goal[2]), radius, 2 * line)
-    _draw_path(canvas, TRAIL, [to_pixels(x, y) for x, y, _ in scene.trail], 2 * line)
-    _draw_robot(canvas, CRASHED if scene.collided else ROBOT, to_pixels, scene.pose, radius, scale)
+    _draw_path(canvas, POLICY, [to_pixels(x, y) for x, y, _ in scene.trail], 2 * line)
+    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.pose, radius, scale)
     small = pygame.transform.smoothscale(canvas, (width // SUPERSAMPLING, height // SUPERSAMPLING))
     whole = pygame.Surface((small.get_width(), small.get_height() + STATUS_HEIGHT))
-    whole.fill(BACKGROUND)
+    whole.fill(WHITE)
     whole.blit(small, (0, 0))
     _draw_status(whole, scene, small.get_height())
     return np.ascontiguousarray(np.transpose(pygame.surfarray.array3d(whole), (1, 0, 2)))
@@ -145,9 +142,7 @@ def _lidar_ends(to_pixels: ToPixels, scene: Scene) -> list[tuple[tuple[float, fl
     ]
 
 
-def _draw_path(
-    canvas: pygame.Surface, color: tuple[int, int, int], points: list[tuple[float, float]], width: int
-) -> None:
+def _draw_path(canvas: pygame.Surface, color: str, points: list[tuple[float, float]], width: int) -> None:
     if len(points) > 1:
         pygame.draw.lines(canvas, color, False, points, width)
         for point in points:  # rounds the joints, which pygame leaves open
@@ -156,7 +151,7 @@ def _draw_path(
 
 def _draw_arrow(
     canvas: pygame.Surface,
-    color: tuple[int, int, int],
+    color: str,
     to_pixels: ToPixels,
     pose: tuple[float, float, float],
     length: float,
@@ -174,7 +169,7 @@ def _draw_arrow(
 
 def _draw_robot(
     canvas: pygame.Surface,
-    color: tuple[int, int, int],
+    color: str,
     to_pixels: ToPixels,
     pose: tuple[float, float, float],
     radius: float,
@@ -190,7 +185,7 @@ def _draw_robot(
     for side in (-0.75, 0.75):  # wheels
         wheel = [(a, side + b) for a, b in ((-0.4, -0.12), (0.4, -0.12), (0.4, 0.12), (-0.4, 0.12))]
         pygame.draw.polygon(canvas, WHEEL, outline(wheel))
-    pygame.draw.polygon(canvas, NOSE, outline([(0.9, 0.0), (0.35, 0.3), (0.35, -0.3)]))
+    pygame.draw.polygon(canvas, WHITE, outline([(0.9, 0.0), (0.35, 0.3), (0.35, -0.3)]))
 
 
 def _draw_status(canvas: pygame.Surface, scene: Scene, top: int) -> None:
@@ -201,7 +196,7 @@ def _draw_status(canvas: pygame.Surface, scene: Scene, top: int) -> None:
     font = _font(max(10, min(20, canvas.get_width() // 28)))
     column = canvas.get_width() / len(texts)
     for number, text in enumerate(texts):
-        image = font.render(text, True, OPTIMUM_TEXT if number == 2 else TEXT)
+        image = font.render(text, True, OPTIMUM if number == 2 else WALL)
         position = column * (number + 0.5) - image.get_width() / 2, top + (STATUS_HEIGHT - image.get_height()) / 2
         canvas.blit(image, position)
 

@@ -26,6 +26,8 @@ class ControlAffineSystem:
         position: the two state symbols that are the position in the plane, for systems that move among obstacles.
         parameters: symbols in `drift`, `fields` and the state cost whose values belong to the problem
             (`OptimalControlProblem.parameters`). A new value needs no compilation.
+        labels: names of the n states and the m controls with their units, in Matplotlib's mathtext, for plots; by
+            default the symbols of the states, and u_1, ..., u_m.
 
     Attributes:
         n: number of states.
@@ -48,6 +50,7 @@ class ControlAffineSystem:
     angles: tuple[sp.Symbol, ...] = field(default=())
     position: tuple[sp.Symbol, sp.Symbol] | None = None
     parameters: tuple[sp.Symbol, ...] = field(default=())
+    labels: tuple[str, ...] = field(default=(), compare=False)
 
     def __init__(
         self,
@@ -57,6 +60,8 @@ class ControlAffineSystem:
         angles: Sequence[sp.Symbol] = (),
         position: Sequence[sp.Symbol] | None = None,
         parameters: Sequence[sp.Symbol] = (),
+        *,
+        labels: Sequence[str] = (),
     ) -> None:
         import sympy as sp
 
@@ -74,7 +79,10 @@ class ControlAffineSystem:
         for j, column in enumerate(fields):
             if len(column) != n:
                 raise ValueError(f"fields[{j}]: expected {n} expressions, one per state, got {len(column)}")
+        if labels and len(labels) != n + len(fields):
+            raise ValueError(f"labels: expected {n + len(fields)}, one per state and control, got {len(labels)}")
         values = {
+            "labels": tuple(labels),
             "state": tuple(state),
             "drift": tuple(as_expression("drift", e) for e in drift),
             "fields": tuple(tuple(as_expression(f"fields[{j}]", e) for e in c) for j, c in enumerate(fields)),
@@ -131,6 +139,9 @@ def as_expression(where: str, value: Any) -> sp.Expr:
     return expression
 
 
+POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
+
+
 @cache
 def unicycle() -> ControlAffineSystem:
     """Return the unicycle: q = (x, y, theta), u = (v, omega) in m/s and rad/s."""
@@ -143,6 +154,7 @@ def unicycle() -> ControlAffineSystem:
         fields=((sp.cos(theta), sp.sin(theta), 0), (0, 0, 1)),
         angles=(theta,),
         position=(x, y),
+        labels=(*POSE_LABELS, "$v$ (m/s)", r"$\omega$ (rad/s)"),
     )
 
 
@@ -163,6 +175,7 @@ def differential_drive() -> ControlAffineSystem:
         ),
         angles=(theta,),
         position=(x, y),
+        labels=(*POSE_LABELS, "left wheel (m/s)", "right wheel (m/s)"),
         parameters=(track,),
     )
 
@@ -178,4 +191,5 @@ def unicycle_with_inertia() -> ControlAffineSystem:
         fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
         angles=(theta,),
         position=(x, y),
+        labels=(*POSE_LABELS, "$v$ (m/s)", r"$\omega$ (rad/s)", r"$\dot v$ (m/s$^2$)", r"$\dot\omega$ (rad/s$^2$)"),
     )

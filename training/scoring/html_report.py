@@ -24,9 +24,9 @@ from matplotlib.ticker import EngFormatter
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
-from leapnav.experts.plotting import CURVES
 from leapnav.training.config import RunConfig, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies
 from leapnav.training.scoring.evaluation import Episode, Evaluation

@@ -17,15 +17,15 @@ from rich.table import Table
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.utils.colors import CURVES, FAILURE, OPTIMUM, POLICY
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.demonstrations import ENVIRONMENT
-from leapnav.experts.plotting import CURVES, OPTIMUM, draw_scenario
+from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.comparison import Comparison
 from leapnav.training.scoring.evaluation import Episode
 from leapnav.training.scoring.scores import Interval, Score, profile
 
-POLICY_COLOR, FAILURE_COLOR = "#2662ab", "#c0392b"
 RATIOS = np.concatenate([np.linspace(1.0, 1.2, 81), np.linspace(1.2, 2.0, 41)[1:]])  # of the profiles
 # Columns of the table: title, attribute of `Score`, factor, decimals of the value and of its interval.
 COLUMNS = (
@@ -208,7 +208,7 @@ def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) ->
     bank = next(bank for bank in banks if bank.family == episode.family)
     draw_scenario(axes, bank[episode.index])
     axes.plot(*bank.states(episode.index)[:, :2].T, color=OPTIMUM, linewidth=1.2, linestyle="--")
-    axes.plot(*episode.states[:, :2].T, color=POLICY_COLOR if episode.success else FAILURE_COLOR, linewidth=1.8)
+    axes.plot(*episode.states[:, :2].T, color=POLICY if episode.success else FAILURE, linewidth=1.8)
     outcome = "collision" if episode.collision else "missed"
     if episode.success:
         outcome = "regret unknown" if math.isnan(episode.regret) else f"regret {100 * episode.regret:z.1f} %"
