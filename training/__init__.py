@@ -25,13 +25,16 @@ if TYPE_CHECKING:
     from leapnav.training.robots.vec_env import NavigateVecEnv, make_vec_env
     from leapnav.training.runs.imitation import train_bc, train_dagger
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
+    from leapnav.training.scoring.comparison import Comparison, compare
     from leapnav.training.scoring.evaluation import Episode, Evaluation, Policy, evaluate
     from leapnav.training.scoring.html_report import write_report
+    from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores
     from leapnav.training.scoring.scores import Interval, Score, profile, score
 
 __all__ = [
     "BCConfig",
     "CloningConfig",
+    "Comparison",
     "DAgger",
     "DAggerConfig",
     "DAggerRunConfig",
@@ -52,13 +55,17 @@ __all__ = [
     "WarmStart",
     "WarmStartConfig",
     "behaviour_clone",
+    "compare",
     "evaluate",
     "imitate",
     "load_policy",
     "make_policy",
     "make_vec_env",
     "network",
+    "plot_episodes",
+    "plot_scores",
     "policy_environment",
+    "print_scores",
     "profile",
     "save_policy",
     "score",
@@ -85,8 +92,10 @@ _LAZY = {
     "robots.vec_env": ("NavigateVecEnv", "make_vec_env"),
     "runs.imitation": ("train_bc", "train_dagger"),
     "runs.reinforcement": ("train_ppo", "train_sac"),
+    "scoring.comparison": ("Comparison", "compare"),
     "scoring.evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
     "scoring.html_report": ("write_report",),
+    "scoring.reports": ("plot_episodes", "plot_scores", "print_scores"),
     "scoring.scores": ("Interval", "Score", "profile", "score"),
 }
 

@@ -17,15 +17,25 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils import colors
 from leapnav.experts.acting.policy import NoOptimumError
 from leapnav.play.solving import PlaySolver, bank_scenario
 
 MAX_REQUEST_SIZE = 1_000_000  # bytes
+SCRIPTS = (
+    "state.js",
+    "canvas.js",
+    "plots.js",
+    "editing.js",
+    "link.js",
+    "driving.js",
+    "lessons.js",
+    "page.js",
+)
 FILES = {
     "/": ("page.html", "text/html"),
     "/page.css": ("page.css", "text/css"),
-    "/canvas.js": ("canvas.js", "text/javascript"),
-    "/page.js": ("page.js", "text/javascript"),
+    **{f"/{name}": (name, "text/javascript") for name in SCRIPTS},
 }
 # The page loads only what this server delivers, and cannot be embedded in another page.
 HEADERS = {
@@ -34,6 +44,20 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
+# The colours of the page, by name; see `leapnav.envs.utils.colors`.
+COLORS = {
+    "start": colors.START,
+    "goal": colors.GOAL,
+    "optimum": colors.OPTIMUM,
+    "policy": colors.POLICY,
+    "failure": colors.FAILURE,
+    "alternatives": colors.ALTERNATIVES,
+    "sweep": colors.SWEEP,
+    "obstacle": colors.OBSTACLE,
+    "edge": colors.EDGE,
+    "wall": colors.WALL,
+    "curves": colors.CURVES,
+}
 Endpoint = Callable[[Request], Awaitable[Response]]
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -50,7 +74,7 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
     """
 
     async def initial(request: Request) -> Response:
-        return JSONResponse({"scenario": scenario.to_dict(), "policies": solver.policies})
+        return JSONResponse({"scenario": scenario.to_dict(), "policies": solver.policies, "colors": COLORS})
 
     async def bank(request: Request) -> Response:
         index = request.query_params.get("index", "0")
@@ -77,6 +101,8 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
         "/search": lambda content: solver.search(_scenario(content)),
         "/sweeps": lambda content: solver.sweeps(_scenario(content)),
         "/drive": lambda content: solver.drive(_scenario(content), str(content.get("policy"))),
+        "/replay": lambda content: solver.replay(_scenario(content), content.get("actions")),
+        "/lesson": lambda content: solver.lesson(str(content.get("lesson"))),
     }
     is_public = host in ("0.0.0.0", "::")
     allowed = ["*"] if is_public else [host, *LOCAL_HOSTS]

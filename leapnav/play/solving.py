@@ -1,4 +1,4 @@
-"""The computations behind the page of `leapnav play`, with results as plain numbers: optima, sweeps, policy paths."""
+"""The computations behind the page of `leapnav play`, with results as plain numbers: optima, sweeps, episodes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from leapnav.envs.scenarios.families import check_family
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.utils.validation import check_choice, check_integer
-from leapnav.experts.optimum import Optimum, as_optimum, find_optimum
-from leapnav.experts.problem.extremal import Extremal
+from leapnav.experts.optimum import Optimum, as_optimum, find_optimum, shortest_horizon
+from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
+from leapnav.play.episodes import play_policy, replay_actions
+from leapnav.play.lessons import LESSONS
 
 OPTIMUM_POINTS, OTHER_POINTS = 201, 101  # of the optimum, and of each alternative and sweep
 MAX_STORED = 64  # optima that can be initial guesses of a request
-MAX_DRIVE_HORIZON = 300.0  # s
 FOLLOW_CANDIDATES = 6  # of the short search while the user drags
 MAX_SWEEPS, FIRST_SWEEPS = 40, 16  # sent to the page; the first ones are sent without omissions
 
@@ -61,10 +62,18 @@ class PlaySolver:
             return {**self._describe(scenario, found, start), "searched": True}
 
     def search(self, scenario: Scenario) -> dict[str, Any]:
-        """Return the optimum and its alternatives, from the full search."""
+        """Return the optimum and its alternatives, from the full search, with their values over time for the plots.
+
+        If the horizon is too short, `needed_horizon` is the shortest horizon (s) with a certified optimum, or None.
+        """
         with self._lock:
             start = perf_counter()
-            return {**self._describe(scenario, find_optimum(scenario), start), "searched": True}
+            optimum = find_optimum(scenario)
+            result = {**self._describe(scenario, optimum, start), "searched": True}
+            result["alternatives"] = [_path(scenario, other, OTHER_POINTS) for other in optimum.alternatives]
+            if optimum.status is Status.HORIZON_TOO_SHORT:
+                result["needed_horizon"] = shortest_horizon(scenario)
+            return result
 
     def sweeps(self, scenario: Scenario) -> dict[str, Any]:
         """Return Leapfrog's feasible paths, from the best path of the lattice search to the extremal."""
@@ -82,39 +91,36 @@ class PlaySolver:
         return {"status": extremal.status.name, "advice": extremal.status.value, "sweeps": sweeps}
 
     def drive(self, scenario: Scenario, policy: str) -> dict[str, Any]:
-        """Play an episode of a policy and return its path.
+        """Play an episode of a policy and return its path and regret, see `leapnav.play.episodes`.
 
         Raises:
             ValueError: the policy is not one of `policies`, or the horizon is too long.
 
         """
-        from leapnav.envs.episodes import act_with, play_episode
-        from leapnav.envs.navigation import NavigateEnv
-        from leapnav.training.policies.files import policy_environment
-        from leapnav.training.scoring.policy_specs import BASELINES, make_policy_from_spec
-
         check_choice("policy", policy, self.policies)
-        if scenario.horizon > MAX_DRIVE_HORIZON:
-            raise ValueError(
-                f"horizon: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {scenario.horizon:g}"
-            )
         with self._lock:
-            env = NavigateEnv(scenario=scenario, **({} if policy in BASELINES else policy_environment(policy)))
-            act = act_with(make_policy_from_spec(policy, env))
-            _, info, steps = play_episode(env, act, seed=0)
-            states = [_pose(info)]
-            for step in steps:
-                info = step.info
-                states.append(_pose(info))
-            env.close()
-        return {
-            "policy": policy,
-            "states": states,
-            "period": env.settings.control_period,
-            "success": bool(info["is_success"]),
-            "collision": bool(info["collision"]),
-            "cost": float(info["cost"]),
-        }
+            return play_policy(scenario, policy)
+
+    def replay(self, scenario: Scenario, actions: Any) -> dict[str, Any]:
+        """Replay a person's actions and return the path and the regret, see `leapnav.play.episodes`.
+
+        Raises:
+            ValueError: the actions are invalid, or the horizon is too long.
+
+        """
+        with self._lock:
+            return replay_actions(scenario, actions)
+
+    def lesson(self, name: str) -> dict[str, Any]:
+        """Return the content of a lesson, see `leapnav.play.lessons`; it is computed at the first request.
+
+        Raises:
+            ValueError: there is no such lesson.
+
+        """
+        check_choice("lesson", name, LESSONS)
+        with self._lock:
+            return LESSONS[name]()
 
     def _describe(self, scenario: Scenario, extremal: Extremal, start: float) -> dict[str, Any]:
         """Return the result of a solve, and store it as an initial guess if it is certified."""
@@ -151,13 +157,13 @@ def bank_scenario(family: str, index: int) -> Scenario:
     return bank[check_integer("index", index, 0, len(bank) - 1)]
 
 
-def _path(scenario: Scenario, optimum: Optimum) -> dict[str, Any]:
-    """The optimum over time, for the plots."""
-    times = np.linspace(0.0, optimum.problem.horizon, OPTIMUM_POINTS)
+def _path(scenario: Scenario, optimum: Optimum, points: int = OPTIMUM_POINTS) -> dict[str, Any]:
+    """A local optimum over time, for the plots."""
+    times = np.linspace(0.0, optimum.problem.horizon, points)
     _, controls, costates = optimum.evaluate(times)
     certificate = optimum.certificate
     return {
-        **_summary(optimum, OPTIMUM_POINTS),
+        **_summary(optimum, points),
         "times": np.round(times, 6).tolist(),
         "controls": _rows(controls),
         "costates": _rows(costates),
@@ -178,10 +184,6 @@ def _summary(optimum: Optimum, points: int) -> dict[str, Any]:
         "sides": "".join(side[0].upper() for side in optimum.path_class),
         "clearance": None if certificate is None else certificate.clearance,
     }
-
-
-def _pose(info: dict[str, Any]) -> list[float]:
-    return [float(value) for value in info["pose"]]
 
 
 def _rows(array: np.ndarray) -> list[list[float]]:

@@ -6,8 +6,7 @@ import errno
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
-from importlib.util import find_spec
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
+from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
@@ -26,13 +25,13 @@ from leapnav.envs.utils.files import atomic_path, digest, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.training.policies.actors import policy_of
-from leapnav.training.policies.network import NavigationFeatures, check_spaces, network
+from leapnav.training.policies.architecture import KINDS, Architecture, is_actor_weight
+from leapnav.training.policies.zips import is_zip, load_zip
 
-FORMAT = 2  # version of policy.json
+FORMAT, READ_FORMATS = 3, (2, 3)  # version of policy.json; in version 2 every network is that of `network`
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
 OBSERVED = (*SENSORS, "actuation", "dict_observation")
-KINDS = ("actor-critic", "sac", "tqc")
 # Fields of policy.json with their types, besides `format` and `environment`.
 FIELDS = {"kind": str, "hidden": list, "critic": list, "actor_only": bool, "training": dict, "sha256": str}
 
@@ -48,7 +47,8 @@ def save_policy(
     """Save a policy as `policy.json` (description) and `weights.pt` (tensors only) in a directory.
 
     Args:
-        model: an algorithm with the network of `leapnav.training.network` (PPO, A2C, SAC or TQC), or its policy.
+        model: a Stable-Baselines3 algorithm with an "MlpPolicy" (PPO, A2C, SAC, TD3, DDPG or TQC), with the default
+            network or that of `leapnav.training.network`, or its policy.
         folder: the directory; created if it does not exist.
         environment: the arguments of `gym.make` for which the policy was trained, except the family.
         training: description of the training, as JSON.
@@ -56,36 +56,37 @@ def save_policy(
 
     Raises:
         TypeError: the model is not a Stable-Baselines3 algorithm or policy with an actor.
-        ValueError: the policy has another network, or an argument of the environment is invalid.
+        ValueError: the policy has another network, an argument of the environment is invalid, or the environment has
+            other observations than the policy.
 
     """
     policy, folder = policy_of(model), Path(folder)
-    kind = next((name for name, type_ in _policy_classes().items() if isinstance(policy, type_)), None)
-    if kind is None or policy.features_extractor_class is not NavigationFeatures:
+    architecture = Architecture.of(policy)
+    assert isinstance(policy.observation_space, spaces.Box)  # checked above
+    space = NavigateEnv(split="fresh", **(environment or {})).observation_space
+    if space != policy.observation_space:
         raise ValueError(
-            f"model: expected a policy made with policy_kwargs=leapnav.training.network(), got {type(policy).__name__}"
+            f"environment: has observations {space.shape or 'in a dict'}, the policy's are "
+            f"{policy.observation_space.shape} or have other bounds; pass the arguments of gym.make that it was "
+            "trained with"
         )
-    assert isinstance(policy.observation_space, spaces.Box)
     folder.mkdir(parents=True, exist_ok=True)
     # The reference of the KL divergence is part of the run, not of the policy.
     weights = {name: value for name, value in policy.state_dict().items() if not name.startswith("reference_")}
     if half:
-        weights = {name: value.half() for name, value in weights.items() if _is_actor_weight(name)}
+        weights = {name: value.half() for name, value in weights.items() if is_actor_weight(name)}
     # Torch stores the name of the file in the file; that of a buffer is always the same.
     buffer = io.BytesIO()
     th.save(weights, buffer)
     with atomic_path(folder / "weights.pt") as partial:
         partial.write_bytes(buffer.getvalue())
-    widths: Any = policy.net_arch
     description = {
         "format": FORMAT,
         "leapnav": leapnav.__version__,
         "environment": {"id": ENVIRONMENT, **_as_dict(EnvironmentSettings(**(environment or {})))},
         "observation_low": policy.observation_space.low.tolist(),
         "observation_high": policy.observation_space.high.tolist(),
-        "kind": kind,
-        "hidden": widths["pi"],
-        "critic": widths["vf"],
+        **asdict(architecture),
         "actor_only": half,
         "training": dict(training or {}),
         "sha256": digest(folder / "weights.pt"),
@@ -114,7 +115,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         found = description["format"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
-    if found != FORMAT:
+    if found not in READ_FORMATS:
         raise ValueError(f"{path}: format: expected {FORMAT}, got {found!r}; train the policy again")
     try:
         environment = description["environment"]["id"]
@@ -133,6 +134,8 @@ def read_description(folder: str | Path) -> dict[str, Any]:
 def policy_environment(folder: str | Path) -> dict[str, Any]:
     """Return the arguments of `gym.make` for an environment with the observations that a policy was trained with.
 
+    Those of a model saved by Stable-Baselines3 are derived from its observation space, for a lidar.
+
     Args:
         folder: see `load_policy`.
 
@@ -140,16 +143,20 @@ def policy_environment(folder: str | Path) -> dict[str, Any]:
         FileNotFoundError, ValueError: see `load_policy`.
 
     """
+    if is_zip(folder):
+        return load_zip(folder)[1]
     environment = read_description(folder)["environment"]
     return {name: environment[name] for name in OBSERVED if name in environment}
 
 
 def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
-    """Load a policy saved by `save_policy`. No code from the files is executed.
+    """Load a policy saved by `save_policy`, or the policy of a model saved by Stable-Baselines3.
+
+    No code from the files is executed; see `leapnav.training.policies.zips.load_zip` for models that need that.
 
     Args:
-        folder: the directory of the policy or of the run that trained it; or the name of a family ("clutter", ...) or
-            "all" for an included policy (actor only, in half precision).
+        folder: the directory of the policy or of the run that trained it; the file of a model (`.zip`); or the name of
+            a family ("clutter", ...) or "all" for an included policy (actor only, in half precision).
         env: an environment for the policy, single or vector; its observations are checked.
 
     Returns:
@@ -161,19 +168,18 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         ValueError: the files are damaged, or have another format or other observations; the message contains the cause.
 
     """
+    if is_zip(folder):
+        return _load_model(Path(folder), env)
     description = read_description(folder)
     folder = policy_folder(folder)
     try:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
         observation_space = spaces.Box(low, high, dtype=np.float32)
         action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        check_spaces(observation_space, action_space)
-        policy = _policy_class(description["kind"])(
-            observation_space,
-            action_space,
-            lambda _: 3e-4,
-            **network(description["hidden"], description["critic"]),
+        architecture = Architecture(
+            **{field.name: description[field.name] for field in fields(Architecture) if field.name in description}
         )
+        policy = architecture.make(observation_space, action_space)
     except ModuleNotFoundError:
         raise
     except Exception as error:  # a damaged description may raise any error in gymnasium or torch
@@ -187,7 +193,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         weights = th.load(path, weights_only=True, map_location="cpu")
         if description["actor_only"]:
             initial = policy.state_dict()
-            differing = sorted({name for name in initial if _is_actor_weight(name)} ^ set(weights))
+            differing = sorted({name for name in initial if is_actor_weight(name)} ^ set(weights))
             if differing:
                 raise ValueError(f"{differing[0]} is missing or unknown")
             weights = {**initial, **{name: value.float() for name, value in weights.items()}}
@@ -198,6 +204,14 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         raise ValueError(f"{path}: not the weights of this policy: {str(error).splitlines()[0]}") from None
     policy.set_training_mode(False)
     return policy
+
+
+def _load_model(path: Path, env: Any) -> BasePolicy:
+    """Load the policy of a model saved by Stable-Baselines3, for the environment if one is given."""
+    if env is None:
+        return load_zip(path)[0]
+    arguments = {name: value for name, value in _as_dict(unwrap(env)[0].settings).items() if name in OBSERVED}
+    return load_zip(path, arguments)[0]
 
 
 def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
@@ -229,22 +243,3 @@ def policy_folder(folder: str | Path) -> Path:
 def _as_dict(settings: EnvironmentSettings) -> dict[str, Any]:
     """Return the settings that are not None as a dictionary."""
     return {name: value for name, value in asdict(settings).items() if value is not None}
-
-
-def _policy_class(kind: str) -> Any:
-    """Return the class of a kind of policies."""
-    if kind == "tqc":
-        from sb3_contrib.tqc.policies import TQCPolicy  # from the extra `contrib`
-
-        return TQCPolicy
-    return {"actor-critic": ActorCriticPolicy, "sac": SACPolicy}[kind]
-
-
-def _policy_classes() -> dict[str, Any]:
-    """Return the installed classes of policies, by kind."""
-    return {kind: _policy_class(kind) for kind in KINDS if kind != "tqc" or find_spec("sb3_contrib") is not None}
-
-
-def _is_actor_weight(name: str) -> bool:
-    """Return whether a weight belongs to the mean action or its noise."""
-    return name.startswith(("actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.training.scoring.evaluation import Evaluation, evaluate
-from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row
+from leapnav.envs.scenarios.families import ALL, FAMILIES, check_family
+from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, evaluate
+from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.scores import Score, score
 
+if TYPE_CHECKING:
+    import pandas
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """The results of several policies on the same banks.
 
@@ -33,6 +39,28 @@ class Comparison:
         """The families of the banks."""
         return tuple(dict.fromkeys(bank.family for bank in self.banks))
 
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas data frame with one row per episode: policy, run, and the columns of `Episode.to_dict`.
+
+        Raises:
+            ImportError: pandas is not installed.
+
+        """
+        frames = []
+        for name, runs in self.runs.items():
+            for number, run in enumerate(runs):
+                frame = run.to_dataframe()
+                frame.insert(0, "policy", name)
+                frame.insert(1, "run", number)
+                frames.append(frame)
+        import pandas  # `Evaluation.to_dataframe` has reported if it is missing
+
+        return pandas.concat(frames, ignore_index=True)
+
+    def __repr__(self) -> str:
+        rows = ", ".join(f"{row.policy} {row.soc.value:.3f}" for row in self.scores())
+        return f"<Comparison: {', '.join(self.families)}; SOC: {rows}>"
+
     def scores(self) -> list[Score]:
         """Compute the rows of the table."""
         return [score(name, runs, self.seed) for name, runs in self.runs.items()]
@@ -44,6 +72,72 @@ class Comparison:
             for name, evaluations in self.runs.items()
         }
         return Comparison(tuple(bank for bank in self.banks if bank.family == family), runs, self.seed)
+
+
+# A policy to compare: a name, an object or a function (see `evaluate`), one of these with the arguments of its
+# environment, or a list of them, which are runs of one method.
+PolicyToCompare = str | PolicyOrFactory | tuple[PolicyOrFactory, Mapping[str, Any]] | list[Any]
+
+
+def compare(
+    policies: Mapping[str, PolicyToCompare],
+    bank: ScenarioBank | str | Sequence[ScenarioBank] = "clutter",
+    *,
+    count: int | None = None,
+    environment: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> Comparison:
+    """Evaluate policies on the same scenarios, against the optimum.
+
+    The functions `print_scores`, `plot_scores`, `plot_episodes` and `write_report` present the result.
+
+    Args:
+        policies: the policies by the names of their rows. A policy is one of the following, or a list of them (runs of
+            one method with other seeds, in one row):
+
+            - the name of a baseline or of an included policy, the directory of a policy or a run, or a model saved by
+              Stable-Baselines3 (`.zip`), see `leapnav evaluate --help`;
+            - an object, a function or a class, see `evaluate`;
+            - a tuple of one of these and the arguments of its environment.
+        bank: a bank, several banks, the name of a family for its test split, or "all" for those of all families.
+        count: number of scenarios of each bank, from the first; None: all.
+        environment: arguments of the environment, such as `observation`, for the policies without their own.
+        seed: random seed of the bootstrap intervals, the disturbances and the random policy.
+        progress: show progress bars.
+
+    Raises:
+        FileNotFoundError: there is no policy of this name.
+        TypeError: a policy is of no supported type.
+        ValueError: an argument is invalid, or a policy expects other observations.
+
+    """
+    if not policies:
+        raise ValueError("policies: expected at least one, got none")
+    specs = []
+    for label, given in policies.items():
+        for number, member in enumerate(given if isinstance(given, list) else [given]):
+            specs.append(_spec(label, f"{label}[{number}]", member, environment, seed))
+    return compare_policies(specs, _as_banks(bank), count=count, seed=seed, progress=progress)
+
+
+def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | None, seed: int) -> PolicySpec:
+    """Return the specification of a policy to compare."""
+    own: Mapping[str, Any] | None = None
+    if isinstance(given, tuple):
+        given, own = given
+    if isinstance(given, (str, Path)):
+        return replace(load_policy_spec(str(given), seed=seed, environment=own), name=name, label=label)
+    return PolicySpec(name, label, None, given, (environment or {}) if own is None else own)
+
+
+def _as_banks(bank: ScenarioBank | str | Sequence[ScenarioBank]) -> list[ScenarioBank]:
+    if isinstance(bank, ScenarioBank):
+        return [bank]
+    if not isinstance(bank, str):
+        return list(bank)
+    check_family(bank)
+    return [ScenarioBank.shipped(family, "test") for family in (FAMILIES if bank == ALL else (bank,))]
 
 
 def compare_policies(

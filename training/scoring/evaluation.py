@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
+import gymnasium as gym
 import numpy as np
 
 from leapnav.envs.episodes import act_with, play_episode
@@ -44,8 +46,46 @@ class Policy(Protocol):
         ...
 
 
-# A policy that depends on the environment, such as `ExpertPolicy`, is given as a function of the environment.
-PolicyOrFactory = Policy | Callable[[Any], Policy]
+# A policy that depends on the environment, such as `ExpertPolicy`, is given as a class, or as a function whose parameter
+# is named `env`. Any other function is a policy itself: it maps an observation to an action.
+PolicyOrFactory = Policy | Callable[[Any], Any]
+
+
+class FunctionPolicy:
+    """A policy from a function of one observation, called for each robot.
+
+    Args:
+        function: maps an observation (d,), or a dictionary, to an action (2,).
+        observation_space: the space of one observation, to recognise batches.
+
+    """
+
+    def __init__(self, function: Callable[[Any], Any], observation_space: gym.spaces.Space) -> None:
+        self._function, self._space = function, observation_space
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions (2,) or (N, 2) for an observation or a batch of them."""
+        if isinstance(observation, Mapping):
+            assert isinstance(self._space, gym.spaces.Dict)
+            name, values = next(iter(observation.items()))
+            is_batch, count = np.ndim(values) > len(self._space[name].shape or ()), len(values)
+            rows = [{key: value[i] for key, value in observation.items()} for i in range(count)] if is_batch else []
+        else:
+            is_batch = np.ndim(observation) > len(self._space.shape or ())
+            rows = list(observation) if is_batch else []
+        return np.array([self._action(row) for row in rows]) if is_batch else self._action(observation), state
+
+    def _action(self, observation: Any) -> np.ndarray:
+        action = np.asarray(self._function(observation), dtype=np.float32)
+        if action.shape != (2,) or not np.isfinite(action).all():
+            raise ValueError(f"policy: expected two finite numbers from the function, got {action!r}")
+        return action
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +234,9 @@ def evaluate(
     The same policy, bank and seed give the same episodes.
 
     Args:
-        policy: an object with the `predict` method of Stable-Baselines3 for batches of observations, or a function that
-            returns one for an environment, such as `ExpertPolicy`.
+        policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class or a
+            function of an environment, with a parameter `env`, that returns one, such as `ExpertPolicy`; or any other
+            function, which maps one observation to an action.
         bank: a bank, or the name of a family for its test split.
         count: number of scenarios, from the first of the bank; None: all.
         environment: arguments of the environment, such as `observation`.
@@ -211,8 +252,8 @@ def evaluate(
     """
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
-            "policy: expected one with `predict`, or a function that makes one for an environment, got "
-            f"{type(policy).__name__}"
+            "policy: expected an object with `predict`, a function of an observation, or a function of `env` that "
+            f"returns a policy, got {type(policy).__name__}"
         )
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str) or bank not in FAMILIES:
@@ -318,10 +359,25 @@ def _median_milliseconds(policy_or_factory: PolicyOrFactory, bank: ScenarioBank,
     return 1e3 * float(np.median(seconds))
 
 
+def _is_factory(given: Callable[..., Any]) -> bool:
+    """Return whether a callable makes a policy for an environment."""
+    if isinstance(given, type):
+        return True
+    try:
+        return "env" in inspect.signature(given).parameters
+    except (TypeError, ValueError):  # some functions in C have no signature
+        return False
+
+
 def _policy_for(policy_or_factory: PolicyOrFactory, env: Any, observation_space: Any) -> Policy:
     """Return the policy for an environment, after a check of its observation space."""
     given: Any = policy_or_factory
-    policy: Policy = given if hasattr(given, "predict") and not isinstance(given, type) else given(env)
+    if hasattr(given, "predict") and not isinstance(given, type):
+        policy: Policy = given
+    elif _is_factory(given):
+        policy = given(env)
+    else:
+        policy = FunctionPolicy(given, observation_space)
     if not hasattr(policy, "predict"):
         raise TypeError(f"policy: expected one with `predict`, got {type(policy).__name__}")
     expected = getattr(policy, "observation_space", None)

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.resources import files
@@ -23,7 +23,7 @@ from matplotlib.ticker import EngFormatter
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.scenarios.families import ALL, FAMILIES, check_family
 from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
@@ -57,20 +57,26 @@ class _RunRecord:
 
 
 def write_report(
-    runs: Sequence[str | os.PathLike[str]],
+    runs: Sequence[str | os.PathLike[str]] | Comparison,
     path: str | os.PathLike[str],
     *,
+    family: str | None = None,
     count: int | None = None,
+    environment: Mapping[str, Any] | None = None,
+    trust: bool = False,
     seed: int = 0,
     progress: bool = True,
 ) -> Comparison:
-    """Evaluate runs, the expert and the baselines, and write the page.
+    """Evaluate runs or policies, the expert and the baselines, and write the page; or write that of a comparison.
 
     Args:
-        runs: run directories. Runs that differ only in their seed share a row and a curve, as do runs with the same
-            label ("LABEL=DIRECTORY").
+        runs: run directories, or other policies as in `leapnav evaluate`, which have no learning curves. Runs that
+            differ only in their seed share a row and a curve, as do runs with the same label ("LABEL=DIRECTORY"). A
+            result of `compare` is written as it is, without another evaluation.
         path: file of the page.
+        family: family of the scenarios, or "all"; None: those of the runs, or "clutter" without runs.
         count: number of scenarios of each family; None: all.
+        environment, trust: of models saved by Stable-Baselines3, see `load_zip`.
         seed: random seed of the bootstrap intervals.
         progress: show progress bars.
 
@@ -82,23 +88,57 @@ def write_report(
         ValueError: there are no runs, or a run is damaged.
 
     """
+    if isinstance(runs, Comparison):
+        _write_page(path, runs, {}, list(runs.runs))
+        return runs
     if not runs:
         raise ValueError("runs: expected at least one, got none")
-    records = [_read_run(os.fspath(run)) for run in runs]
-    trained = {family for record in records for family in _families(record.config)}
-    families = [family for family in FAMILIES if family in trained]
-    banks = [ScenarioBank.shipped(family, "test") for family in families]
-    specs = [record.spec for record in records] + [load_policy_spec(name) for name in BASELINES]
-    comparison = compare_policies(specs, banks, count=count, seed=seed, progress=progress)
+    specs = [load_policy_spec(os.fspath(run), environment=environment, trust=trust) for run in runs]
+    records = [_read_run(spec) for spec in specs if (Path(spec.name) / "config.json").is_file()]
+    banks = [ScenarioBank.shipped(name, "test") for name in _report_families(family, records)]
+    baselines = [load_policy_spec(name) for name in BASELINES if name not in {spec.name for spec in specs}]
+    comparison = compare_policies([*specs, *baselines], banks, count=count, seed=seed, progress=progress)
+    groups = group_by_row(specs)
     by_row = {
-        row: [record for record in records if any(record.spec is member for member in members)]
-        for row, members in group_by_row([record.spec for record in records]).items()
+        row: found
+        for row, members in groups.items()
+        if (found := [record for record in records if any(record.spec is member for member in members)])
     }
+    _write_page(path, comparison, by_row, list(groups))
+    return comparison
+
+
+def _report_families(family: str | None, records: Sequence[_RunRecord]) -> list[str]:
+    """Return the families of a report, in the order of `FAMILIES`."""
+    if family is not None:
+        check_family(family)
+    chosen = {family or "clutter"} if family is not None or not records else set()
+    chosen |= set() if family is not None else {name for record in records for name in _families(record.config)}
+    return [name for name in FAMILIES if name in chosen or ALL in chosen]
+
+
+def _write_page(
+    path: str | os.PathLike[str],
+    comparison: Comparison,
+    by_row: dict[str, list[_RunRecord]],
+    galleries: Sequence[str],
+) -> None:
+    """Write the page.
+
+    Args:
+        path: its file.
+        comparison: the results.
+        by_row: the training runs of the rows that have any.
+        galleries: the rows whose episodes are drawn.
+
+    """
+    records = [record for members in by_row.values() for record in members]
+    families = comparison.families
     scores = comparison.scores()
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     template = environment.from_string(files("leapnav.training.scoring").joinpath("report.html.jinja").read_text())
     page = template.render(
-        title="Training runs" if len(records) > 1 else f"Training run {records[0].spec.name}",
+        title=_title(records),
         version=leapnav.__version__,
         date=datetime.now().astimezone().strftime("%Y-%m-%d"),
         episodes=scores[0].episodes,
@@ -113,15 +153,20 @@ def write_report(
             }
             for row in scores
         ],
-        curves=_learning_curves(by_row, families),
+        curves=_learning_curves(by_row, families) if by_row else [],
         profiles=_profiles(comparison),
         failures=_success_tables(comparison),
         negative_regret=NEGATIVE_REGRET if any(row.regret.value < 0 for row in scores) else "",
-        galleries=[{"name": row, "png": _gallery(banks, comparison.runs[row][0])} for row in by_row],
+        galleries=[{"name": row, "png": _gallery(comparison.banks, comparison.runs[row][0])} for row in galleries],
         runs=[_summary(record) for record in records],
     )
     write_text(path, page)
-    return comparison
+
+
+def _title(records: Sequence[_RunRecord]) -> str:
+    if not records:
+        return "Comparison of policies"
+    return "Training runs" if len(records) > 1 else f"Training run {records[0].spec.name}"
 
 
 def _families(config: RunConfig) -> tuple[str, ...]:
@@ -135,9 +180,8 @@ def _split_cell(text: str) -> tuple[str, str]:
     return value, interval
 
 
-def _read_run(name: str) -> _RunRecord:
-    """Read the files of a run, given as DIRECTORY or LABEL=DIRECTORY."""
-    spec = load_policy_spec(name)
+def _read_run(spec: PolicySpec) -> _RunRecord:
+    """Read the files of a run."""
     folder = Path(spec.name)
     _, config = read_config(folder)
     try:

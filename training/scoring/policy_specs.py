@@ -13,6 +13,7 @@ import gymnasium as gym
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
 from leapnav.training.policies.files import load_policy, policy_environment, read_description
+from leapnav.training.policies.zips import is_zip, load_zip
 from leapnav.training.scoring.evaluation import Policy, PolicyOrFactory
 
 BASELINES = ("expert", "random", "go-to-goal")
@@ -38,13 +39,18 @@ class PolicySpec:
     environment: Mapping[str, Any]
 
 
-def load_policy_spec(name: str, *, seed: int = 0) -> PolicySpec:
+def load_policy_spec(
+    name: str, *, seed: int = 0, environment: Mapping[str, Any] | None = None, trust: bool = False
+) -> PolicySpec:
     """Load a policy by its name.
 
     Args:
-        name: "expert", "random", "go-to-goal", the directory of a policy or a run, or the name of an included policy.
-            With the prefix "LABEL=", policies with the same label are treated as runs of one method.
+        name: "expert", "random", "go-to-goal", the directory of a policy or a run, a model saved by Stable-Baselines3
+            (`.zip`), or the name of an included policy. With the prefix "LABEL=", policies with the same label are
+            treated as runs of one method.
         seed: random seed of the random policy.
+        environment: arguments of the environment of a `.zip`, see `load_zip`.
+        trust: load a `.zip` with Stable-Baselines3, which executes code from the file.
 
     Raises:
         FileNotFoundError: there is no such policy.
@@ -59,6 +65,9 @@ def load_policy_spec(name: str, *, seed: int = 0) -> PolicySpec:
             "go-to-goal": GoToGoal,
         }
         return PolicySpec(place, label, None, factories[place], {})
+    if is_zip(place):
+        model, arguments = load_zip(place, environment, trust=trust)
+        return PolicySpec(place, label, None, model, arguments)
     policy, description = load_policy(place), read_description(place)
     # The method is the configuration of the run without the seed and the directory.
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}

@@ -1,0 +1,144 @@
+"""Episodes on the page of `leapnav play`: a policy or a person drives, and the regret compares it with the optimum."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
+from leapnav.envs.utils.validation import is_finite_number
+from leapnav.experts.optimum import find_reached_optimum
+
+MAX_DRIVE_HORIZON = 300.0  # s
+CONTROL_PERIOD = 0.05  # s, of a person's actions: the default of the environment
+MAX_ACTION = 1.0
+
+
+def play_policy(scenario: Scenario, policy: str) -> dict[str, Any]:
+    """Play an episode of a policy.
+
+    Args:
+        scenario: the scenario.
+        policy: name or directory of the policy, see `leapnav.training.scoring.policy_specs`.
+
+    Returns:
+        The path and the outcome, see `_describe`.
+
+    Raises:
+        ValueError: the horizon is too long.
+
+    """
+    from leapnav.envs.episodes import act_with
+    from leapnav.envs.navigation import NavigateEnv
+    from leapnav.training.policies.files import policy_environment
+    from leapnav.training.scoring.policy_specs import BASELINES, make_policy_from_spec
+
+    check_horizon(scenario)
+    env = NavigateEnv(scenario=scenario, **({} if policy in BASELINES else policy_environment(policy)))
+    return {"policy": policy, **_play(scenario, env, act_with(make_policy_from_spec(policy, env)))}
+
+
+def replay_actions(scenario: Scenario, actions: Any) -> dict[str, Any]:
+    """Replay the actions of a person.
+
+    Args:
+        scenario: the scenario.
+        actions: a list of pairs (speed, turn rate) as fractions of the robot's limits, one per control period. A list
+            that ends before the horizon ends the episode as `stopped`.
+
+    Returns:
+        The path and the outcome, see `_describe`.
+
+    Raises:
+        ValueError: the horizon is too long, or the actions are invalid.
+
+    """
+    from leapnav.envs.episodes import replay
+    from leapnav.envs.navigation import NavigateEnv
+
+    check_horizon(scenario)
+    array = check_actions(actions, math.ceil(scenario.horizon / CONTROL_PERIOD - 1e-9))
+    env = NavigateEnv(scenario=scenario, observation="state", control_period=CONTROL_PERIOD)
+    return {"policy": "you", **_play(scenario, env, replay(array))}
+
+
+def check_horizon(scenario: Scenario) -> None:
+    """Raise ValueError if the horizon is too long for an episode on the page."""
+    if scenario.horizon > MAX_DRIVE_HORIZON:
+        raise ValueError(f"horizon: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {scenario.horizon:g}")
+
+
+def check_actions(actions: Any, max_count: int) -> np.ndarray:
+    """Return a request's actions as an array (N, 2).
+
+    Raises:
+        ValueError: they are not 1 to `max_count` pairs of numbers from -1 to 1.
+
+    """
+    if not isinstance(actions, list) or not 1 <= len(actions) <= max_count:
+        count = len(actions) if isinstance(actions, list) else type(actions).__name__
+        raise ValueError(f"actions: expected 1 to {max_count} pairs of numbers, got {count}")
+    for i, action in enumerate(actions):
+        is_pair = isinstance(action, list) and len(action) == 2 and all(is_finite_number(value) for value in action)
+        if not is_pair or max(map(abs, action)) > MAX_ACTION:
+            raise ValueError(f"actions[{i}]: expected two numbers from -1 to 1, got {str(action)[:40]}")
+    return np.array(actions, dtype=np.float32)
+
+
+def _play(scenario: Scenario, env: Any, act: Any) -> dict[str, Any]:
+    """Play an episode, close the environment and describe the episode."""
+    from leapnav.envs.episodes import play_episode
+
+    try:
+        _, info, steps = play_episode(env, act, seed=0)
+        states, done = [_pose(info)], False
+        for step in steps:
+            info, done = step.info, step.done
+            states.append(_pose(info))
+    finally:
+        env.close()
+    return _describe(scenario, info, states, done, env.settings.control_period)
+
+
+def _describe(
+    scenario: Scenario, info: dict[str, Any], states: list[list[float]], done: bool, period: float
+) -> dict[str, Any]:
+    """Return the path (`states`, one per `period` (s)), `success`, `collision`, `stopped`, `cost` and `regret`."""
+    success = done and bool(info["is_success"])
+    return {
+        "states": states,
+        "period": period,
+        "time": float(info["time"]),
+        "success": success,
+        "collision": bool(info["collision"]),
+        "stopped": not done,
+        "cost": float(info["cost"]),
+        "regret": regret(scenario, info["pose"], float(info["cost"])) if success else None,
+    }
+
+
+def regret(scenario: Scenario, pose: Sequence[float] | np.ndarray, cost: float) -> float | None:
+    """Return (J - J*)/J* of a successful episode, with the optimum J* for the pose that it reached.
+
+    Args:
+        scenario: the scenario of the episode.
+        pose: the last pose: x, y (m), heading (rad).
+        cost: J of the episode.
+
+    Returns:
+        The regret. It is negative if the search did not find an optimum as good as the episode. None if no optimum for
+        the pose is certified.
+
+    """
+    try:
+        optimum = find_reached_optimum(scenario, pose, cost)
+    except ScenarioError:  # the pose is in contact with an obstacle, up to rounding
+        return None
+    return (cost - optimum.cost) / optimum.cost if optimum.success and optimum.cost > 0 else None
+
+
+def _pose(info: dict[str, Any]) -> list[float]:
+    return [float(value) for value in info["pose"]]
