@@ -1,4 +1,4 @@
-"""Additional steps of the site's build: formulas as MathML, and the help texts of the command line."""
+"""Additional steps of the site's build: formulas, help texts of the command line, and files of the repository."""
 
 import io
 import os
@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from latex2mathml.converter import convert
+from formulas import draw_formulas
 
 from leapnav.cli import main
 
-_FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 _HELP = re.compile(r"^::help (.*)$", re.MULTILINE)
 _WIDTH = "100"  # characters
+_INCLUDE = re.compile(r"^::include (.*)$", re.MULTILINE)
+_LINK = re.compile(r"(?<=\]\()(?!https?:|#)([^)#]*)")
+# Pages of the site by the paths of the files of the repository that they show.
+_PAGES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "SECURITY.md": "security.md"}
 _ROOT = Path(__file__).parent.parent
 _PACKAGE = _ROOT / "build" / "package" / "leapnav"
 
@@ -30,8 +33,13 @@ def on_startup(**_: Any) -> None:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace lines such as "::help solve" by the output of `leapnav solve --help`."""
-    return _HELP.sub(_help, markdown)
+    """Replace "::help solve" by the output of `leapnav solve --help`, and "::include FILE" by a file."""
+    return _HELP.sub(_help, _INCLUDE.sub(_include, markdown))
+
+
+def _include(found: re.Match[str]) -> str:
+    """Return a file of the repository, with links for the site."""
+    return _LINK.sub(lambda link: _PAGES.get(link[1], link[1].removeprefix("docs/")), (_ROOT / found[1]).read_text())
 
 
 def _help(found: re.Match[str]) -> str:
@@ -53,10 +61,5 @@ def _help(found: re.Match[str]) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Replace the formulas that the extension arithmatex has marked; browsers draw MathML without a script."""
-    return _FORMULA.sub(_mathml, html)
-
-
-def _mathml(found: re.Match[str]) -> str:
-    text = found[3].replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
-    return convert(text, display="block" if found[2] == "[" else "inline")
+    """Draw the formulas."""
+    return draw_formulas(html)

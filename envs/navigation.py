@@ -129,7 +129,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     ## Arguments
     | Argument | Default | Meaning |
     |---|---|---|
-    | `family` | `"clutter"` | family of the scenarios, see `leapnav.envs.FAMILIES`; `"all"` samples the family for each episode, with `split="fresh"` only |
+    | `family` | None | family of the scenarios, `"clutter"` unless `scenario` or `bank` is given, see `leapnav.envs.FAMILIES`; `"all"` samples the family for each episode, with `split="fresh"` only |
     | `scenario` | None | the scenario of all episodes |
     | `split` | `"train"` | the family's included bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
@@ -164,7 +164,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
 
     def __init__(
         self,
-        family: str = "clutter",
+        family: str | None = None,
         scenario: Scenario | Mapping[str, Any] | str | None = None,
         *,
         split: str | None = None,

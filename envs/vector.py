@@ -66,7 +66,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def __init__(
         self,
         num_envs: int = 1,
-        family: str = "clutter",
+        family: str | None = None,
         scenario: Any = None,
         *,
         split: str | None = None,

@@ -5,6 +5,7 @@ Importing this module is quick, so that help appears at once: a command imports 
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from typing import Any
@@ -13,9 +14,11 @@ import tyro
 
 from leapnav.commands.bank import Bank
 from leapnav.commands.compile import Compile
+from leapnav.commands.completion import Completion
 from leapnav.commands.demo import Demo
 from leapnav.commands.doctor import Doctor
 from leapnav.commands.evaluate import Evaluate
+from leapnav.commands.export import Export
 from leapnav.commands.play import Play
 from leapnav.commands.report import Report
 from leapnav.commands.rollout import Rollout
@@ -23,6 +26,7 @@ from leapnav.commands.solve import Solve
 from leapnav.commands.train import TrainCommand, train_command
 from leapnav.commands.watch import Watch
 from leapnav.outputs import FAILED, json_on_stdout
+from leapnav.usage import parse_or_explain
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
@@ -33,11 +37,13 @@ COMMANDS = {
     "train": TrainCommand,  # `parse` replaces it by a class whose defaults are those of the family
     "evaluate": Evaluate,
     "report": Report,
+    "export": Export,
     "watch": Watch,
     "play": Play,
     "demo": Demo,
     "compile": Compile,
     "doctor": Doctor,
+    "completion": Completion,
 }
 
 
@@ -69,8 +75,10 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: the words after `leapnav`; None takes those of the process.
 
     """
+    command = None
     try:
-        command = parse(sys.argv[1:] if arguments is None else arguments)
+        words = sys.argv[1:] if arguments is None else arguments
+        command = parse_or_explain(parse, words, tuple(COMMANDS))
         with json_on_stdout(getattr(command, "json", None)):
             return command.run()
     except BrokenPipeError:  # the process that read the output has ended, as in `leapnav bank show ... | head`
@@ -80,11 +88,14 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("leapnav: interrupted", file=sys.stderr)
+        resumption = getattr(command, "resumption", None)
+        print(f"leapnav: interrupted{f'; {resumption}' if resumption else ''}", file=sys.stderr)
         return INTERRUPTED
 
 
 def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+        known = {errno.ENOENT: "no such file", errno.EISDIR: "is a directory", errno.EACCES: "permission denied"}
+        text = known.get(error.errno or 0, str(error.strerror))
+        return f"{error.filename}: {text if str(error.strerror) == os.strerror(error.errno or 0) else error.strerror}"
     return str(error)

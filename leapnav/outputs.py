@@ -16,7 +16,11 @@ _json_stream: ContextVar[TextIO | None] = ContextVar("json_stream", default=None
 
 
 def check_outputs(
-    json: Path | None = None, plot: Path | None = None, video: Path | None = None, page: Path | None = None
+    json: Path | None = None,
+    plot: Path | None = None,
+    video: Path | None = None,
+    page: Path | None = None,
+    onnx: Path | None = None,
 ) -> None:
     """Check that the output files of a command can be written, before its work begins.
 
@@ -25,6 +29,7 @@ def check_outputs(
         plot: picture.
         video: video.
         page: HTML page.
+        onnx: ONNX file.
 
     Raises:
         FileNotFoundError: the directory of a file does not exist.
@@ -32,12 +37,12 @@ def check_outputs(
         ValueError: the suffix of a file is not one of the supported formats.
 
     """
-    for path in (None if json == STDOUT else json, plot, video, page):
+    for path in (None if json == STDOUT else json, plot, video, page, onnx):
         if path is not None and not path.parent.is_dir():
             raise FileNotFoundError(f"{path}: the directory does not exist")
         if path is not None and path.is_dir():
             raise IsADirectoryError(f"{path}: is a directory")
-    for path, formats in ((plot, PICTURES), (video, VIDEOS), (page, PAGES)):
+    for path, formats in ((plot, PICTURES), (video, VIDEOS), (page, PAGES), (onnx, (".onnx",))):
         if path is not None and path.suffix not in formats:
             raise ValueError(f"{path}: expected a name that ends in {', '.join(formats)}")
 

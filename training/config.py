@@ -7,13 +7,17 @@ import tomllib
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, cast
 
 from leapnav.deprecated import renamed_fields
 
 # Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start; a sub-table
 # with the name of a family contains the changes for this family.
 _DEFAULTS: dict[str, Any] = tomllib.loads(files("leapnav.training").joinpath("defaults.toml").read_text())
+
+
+# A literal, so that the command line shows and completes the choices; a test compares it with `FAMILIES`.
+FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
 
 
 @dataclass(frozen=True)
@@ -99,8 +103,8 @@ class RunConfig:
 
     out: Path
     """Run directory: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
-    family: str = "clutter"
-    """Family of the scenarios: open, clutter, polygons, rooms, slalom or all."""
+    family: FamilyName = "clutter"
+    """Family of the scenarios."""
     seed: int = 0
     """Random seed."""
     resume: bool = False
@@ -137,7 +141,7 @@ class RunConfig:
             check_family(family)
         if warm is None:
             warm = bool(changes.get("warm_start"))
-        config = cls(out=Path(), family=family)
+        config = cls(out=Path(), family=cast(FamilyName, family))
         for section in ("RunConfig", cls.__name__, f"{cls.__name__}-warm")[: 3 if warm else 2]:
             table = _DEFAULTS.get(section, {})
             names = {setting.name for setting in fields(config)}

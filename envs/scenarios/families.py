@@ -14,6 +14,7 @@ import numpy as np
 from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.shapes.field import pack_field
+from leapnav.envs.utils.validation import suggestion
 
 ARENA = (0.0, 0.0, 10.0, 10.0)
 REFERENCE_SPEED = 0.8  # m/s: the horizon is the length of the shortest path divided by this speed
@@ -128,7 +129,8 @@ def check_family(family: object) -> None:
 
     """
     if not isinstance(family, str) or family not in (*FAMILIES, ALL):
-        raise ValueError(f"family: expected one of {', '.join(FAMILIES)} or {ALL}, got {family!r}")
+        hint = suggestion(family, (*FAMILIES, ALL))
+        raise ValueError(f"family: expected one of {', '.join(FAMILIES)} or {ALL}, got {family!r}{hint}")
 
 
 def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:

@@ -57,6 +57,8 @@ def read_movingai(path: str | os.PathLike[str]) -> np.ndarray:
         ValueError: it is not a valid map; the message names the file and the line.
 
     """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file")
     try:
         lines = Path(path).read_text(encoding="ascii").splitlines()
     except UnicodeDecodeError:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -21,7 +21,7 @@ from pydantic_core import ErrorDetails
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
 from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.validation import check_positive
+from leapnav.envs.utils.validation import check_positive, suggestion
 
 # Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
 MAX_MAGNITUDE = 1e6
@@ -32,8 +32,25 @@ Positive = Annotated[float, Field(gt=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
 Point = tuple[Finite, Finite]
 
 
+MAX_FAULTS = 8  # faults in one message
+# Messages for the types of pydantic's errors.
+EXPECTED = {
+    "greater_than": "expected a number > {gt:g}",
+    "greater_than_equal": "expected a number >= {ge:g}",
+    "less_than_equal": "expected a number <= {le:g}",
+    "finite_number": "expected a finite number",
+    "float_type": "expected a number",
+    "float_parsing": "expected a number",
+    "string_type": "expected text",
+    "literal_error": "expected {expected}",
+    "tuple_type": "expected a list",
+    "model_type": "expected an object",
+    "model_attributes_type": "expected an object",
+}
+
+
 class ScenarioError(ValueError):
-    """A scenario is invalid. The message is one line with the scenario, the field and the value."""
+    """A scenario is invalid. The message is one line with the scenario and, for each fault, the field and the value."""
 
 
 class _Frozen(BaseModel):
@@ -151,12 +168,15 @@ class Scenario(_Frozen):
     @model_validator(mode="after")
     def _check_poses_are_free(self) -> Self:
         names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
+        faults = []
         for field, pose in (("start", self.start), ("goal", self.goal)):
             distance, nearest = clearance(pose[0], pose[1], self.field)
             if not distance > 0:
-                raise ValueError(
+                faults.append(
                     f"{field}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
                 )
+        if faults:
+            raise ValueError("; ".join(faults))
         return self
 
     @cached_property
@@ -234,7 +254,7 @@ class Scenario(_Frozen):
         is_text = isinstance(path_or_text, str) and path_or_text.lstrip().startswith("{")
         source, text = ("text", str(path_or_text)) if is_text else (str(path_or_text), None)
         try:
-            text = Path(path_or_text).read_text(encoding="utf-8-sig") if text is None else text
+            text = _read(Path(path_or_text)) if text is None else text
             fields = json.loads(text, object_pairs_hook=_unique_keys)
         except ScenarioError:
             raise
@@ -341,13 +361,25 @@ def _tuples(value: Any) -> Any:
     return value
 
 
+def _read(path: Path) -> str:
+    """Return the text of a file."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected a scenario file (JSON), got a directory")
+    if not path.exists():
+        others = os.listdir(path.parent) if path.parent.is_dir() else []
+        raise FileNotFoundError(f"{path}: no such file{suggestion(path.name, others)}")
+    return path.read_text(encoding="utf-8-sig")
+
+
 def _check_headings(scenario: Scenario) -> None:
-    for field, (_, _, heading) in (("start", scenario.start), ("goal", scenario.goal)):
-        if heading is not None and abs(heading) > 2 * math.pi:
-            raise ScenarioError(
-                f"Scenario {scenario.name!r}: {field}: expected a heading in radians, at most 2 pi, got {heading:g}; "
-                f"did you mean {math.radians(heading):.4g}?"
-            )
+    faults = [
+        f"{field}: expected a heading in radians, at most 2 pi, got {heading:g}; "
+        f"did you mean {math.radians(heading):.4g}?"
+        for field, (_, _, heading) in (("start", scenario.start), ("goal", scenario.goal))
+        if heading is not None and abs(heading) > 2 * math.pi
+    ]
+    if faults:
+        raise ScenarioError(f"Scenario {scenario.name!r}: {' '.join(faults)}")
 
 
 def _shorten(value: Any) -> str:
@@ -356,14 +388,33 @@ def _shorten(value: Any) -> str:
 
 
 def _one_line(name: Any, error: ValidationError) -> str:
-    """Return the first fault of a pydantic error as one line: scenario, field, fault and value."""
-    faults = error.errors(include_url=False)
-    first: ErrorDetails = faults[0]
-    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in first["loc"]).lstrip(".")
-    message = first["msg"].removeprefix("Value error, ")
-    message = message[:1].lower() + message[1:]
-    # The messages of whole-scenario checks contain field and value; a missing field has no value.
-    value = "" if not path or first["type"] == "missing" else f", got {_shorten(first['input'])}"
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    line = f"Scenario {_shorten(name)}: {path}{': ' if path else ''}{message}{value}{more}"
-    return " ".join(line.splitlines())  # an unknown key may contain line breaks
+    """Return all faults of a pydantic error as one line: scenario, then field, fault and value of each."""
+    faults = [_fault(details) for details in error.errors(include_url=False)]
+    hidden = len(faults) - MAX_FAULTS
+    text = "; ".join(faults[:MAX_FAULTS]) + (f"; and {hidden} more faults" if hidden > 0 else "")
+    return " ".join(f"Scenario {_shorten(name)}: {text}".splitlines())  # an unknown key may contain line breaks
+
+
+def _fault(details: ErrorDetails) -> str:
+    """Return one fault: field, what is expected, and the value."""
+    location, context, kind = details["loc"], details.get("ctx", {}), details["type"]
+    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".")
+    if kind == "extra_forbidden":
+        return f"{path}: unknown field{suggestion(location[-1], _known_fields(location[:-1]))}"
+    if kind == "missing":
+        return f"{path}: missing"
+    if kind in ("too_long", "tuple_too_long"):
+        message = f"expected {context.get('max_length')} numbers"
+    elif kind == "value_error":
+        message = details["msg"].removeprefix("Value error, ")
+    else:
+        message = EXPECTED.get(kind, details["msg"]).format(**context)
+    # The messages of whole-scenario checks contain field and value.
+    return f"{path}: {message}, got {_shorten(details['input'])}" if path else message
+
+
+def _known_fields(location: Sequence[Any]) -> tuple[str, ...]:
+    """Return the fields of the part of a scenario at a location."""
+    parts: dict[Any, type[BaseModel]] = {"robot": Robot, "cost": Cost, "circle": Circle, "polygon": Polygon}
+    model = parts.get(location[-1], Obstacle) if location else Scenario
+    return tuple(model.model_fields)

@@ -14,6 +14,7 @@ from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 SPLITS = ("train", "test", "fresh")
+DEFAULT_FAMILY = "clutter"
 
 
 class ScenarioSource:
@@ -23,7 +24,7 @@ class ScenarioSource:
         family, scenario, split, bank: see `NavigateEnv`.
 
     Attributes:
-        family: name of the family.
+        family: name of the family; that of the bank if a bank is given.
         scenario: the fixed scenario, or None.
         bank: the scenario bank, or None.
 
@@ -36,16 +37,18 @@ class ScenarioSource:
 
     def __init__(
         self,
-        family: str = "clutter",
+        family: str | None = None,
         scenario: Scenario | Mapping[str, Any] | str | None = None,
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
     ) -> None:
-        check_family(family)
-        arguments = (("scenario", scenario), ("split", split), ("bank", bank))
+        if family is not None:
+            check_family(family)
+        arguments = (("scenario", scenario), ("bank", bank), ("split", split), ("family", family))
         given = [name for name, value in arguments if value is not None]
-        if len(given) > 1:
-            raise ValueError(f"{given[1]}: cannot be combined with {given[0]}")
+        if len(given) > 1 and given[0] in ("scenario", "bank"):
+            raise ValueError(f"{given[1]}: cannot be combined with {given[0]}; pass one of the two")
+        family = family or DEFAULT_FAMILY
         if split is not None:
             check_choice("split", split, SPLITS)
         if family == ALL and split not in (None, "fresh"):
@@ -57,6 +60,7 @@ class ScenarioSource:
             if not isinstance(bank, (ScenarioBank, str, os.PathLike)):
                 raise ValueError(f"bank: expected a ScenarioBank or its file, got {bank!r}")
             self.bank = bank if isinstance(bank, ScenarioBank) else ScenarioBank(bank)
+            self.family = self.bank.family
             if len(self.bank) == 0:
                 raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
         elif scenario is None and split != "fresh" and family != ALL:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable
 from typing import Any, TypeGuard
@@ -50,7 +51,13 @@ def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
     """Raise ValueError unless the value is one of the choices."""
     known = tuple(choices)
     if value not in known:
-        raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+        raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}{suggestion(value, known)}")
+
+
+def suggestion(value: object, known: Iterable[str]) -> str:
+    """Return "; did you mean 'x'?" if a known name is close to the value, else an empty text."""
+    close = difflib.get_close_matches(value, list(known), n=1, cutoff=0.7) if isinstance(value, str) else []
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def check_flag(name: str, value: Any) -> None:

@@ -225,7 +225,7 @@ def _finished(directory: Path, settings: dict[str, Any]) -> RolloutSummary | Non
         if record.get(name) != value:
             raise FileExistsError(
                 f"{directory}: holds a rollout whose {name} is {record.get(name)!r}, got {value!r}; choose another "
-                "directory, or replace it with force"
+                "directory, or replace it (force=True, --force)"
             )
     return summary
 

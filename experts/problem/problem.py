@@ -82,6 +82,8 @@ class OptimalControlProblem:
             ("control_weight", self.control_weight, m),
             ("parameters", self.parameters, len(self.system.parameters)),
         ):
+            if not isinstance(values, (Sequence, np.ndarray)) or isinstance(values, str):
+                raise ValueError(f"{name}: expected a sequence of {length} numbers, got {values!r}")
             if len(values) != length:
                 raise ValueError(f"{name}: expected {length} numbers, got {len(values)}: {values!r}")
             if not all((v is None and name == "goal") or _is_finite(v) for v in values):

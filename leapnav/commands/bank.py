@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from leapnav.commands.options import Family
+from leapnav.durations import SECONDS_PER_SECOND_OPINION, announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -27,8 +29,8 @@ class Build:
 
     out: Path
     """Output file of the bank."""
-    family: str = "clutter"
-    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
+    family: Family = "clutter"
+    """Family of the scenarios."""
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
@@ -43,6 +45,7 @@ class Build:
         check_outputs(self.json)
         from leapnav.experts.data.banks import build_bank
 
+        announce(of_scenarios(self.family, self.count, self.workers), "finding the optima")
         bank = build_bank(self.family, self.count, self.out, seed=self.seed, workers=self.workers)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         print(f"wrote {self.out}: {len(bank)} of {bank.drawn} sampled scenarios{f' ({rejected})' if rejected else ''}")
@@ -100,6 +103,7 @@ class Show:
         """Search again, print lower costs, and add the results to the rows."""
         from leapnav.experts.second_opinion import verify_bank
 
+        announce(SECONDS_PER_SECOND_OPINION * len(bank) / self.workers, "searching every scenario again")
         opinions = verify_bank(bank, workers=self.workers)
         improved = [opinion for opinion in opinions if opinion.improvement > MIN_IMPROVEMENT]
         for opinion in improved:
@@ -127,6 +131,11 @@ class Bank:
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Show, tyro.conf.subcommand("show")]
     ]
+
+    @property
+    def resumption(self) -> str | None:
+        """What to do after an interruption."""
+        return "the same command resumes where it stopped" if isinstance(self.action, Build) else None
 
     @property
     def json(self) -> Path | None:

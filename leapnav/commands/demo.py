@@ -23,6 +23,11 @@ class Demo:
     out: Path = Path("runs/demo")
     """Output directory; existing results in it are used again."""
 
+    @property
+    def resumption(self) -> str:
+        """What to do after an interruption."""
+        return "the same command resumes; finished steps are not repeated"
+
     def run(self) -> int:
         """Run the demo."""
         from leapnav.commands.compile import compile_missing

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from leapnav.commands.options import EnvironmentOption, FamilyOrAll, parse_environment
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
     from leapnav.envs.scenarios.bank import ScenarioBank
 
-POLICIES = """Policies: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of an
-included policy (a family, or "all"). Runs that differ only in their seed share a row, and so do policies with the same
-LABEL=."""
+POLICIES = """Policies: "expert", "random", "go-to-goal", an included policy (the name of its family), the directory
+of a policy or of a run, or a model saved by Stable-Baselines3 (.zip). Runs that differ only in their seed share a row,
+and so do policies with the same LABEL=."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class Evaluate:
     """Score policies side by side against the optimum, on scenarios that were not used for training."""
 
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
-    family: str = "clutter"
-    """Family of the scenarios: open, clutter, polygons, rooms, slalom, or all of them."""
+    family: FamilyOrAll = "clutter"
+    """Family of the scenarios."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None
@@ -33,6 +34,11 @@ class Evaluate:
     """Number of scenarios per family; by default all."""
     seed: int = 0
     """Seed of the bootstrap intervals and of the random policy."""
+    env: EnvironmentOption = ()
+    """Arguments of the environment (KEY=VALUE) with which a model of Stable-Baselines3 was trained; by default derived
+    from its observation space, for a lidar."""
+    trust: bool = False
+    """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
     json: Path | None = None
     """JSON file of the table and of every episode; "-" for standard output."""
     plot: Path | None = None
@@ -54,8 +60,11 @@ class Evaluate:
         for plot in (self.plot, self.episodes_plot):
             check_outputs(self.json, plot)
         # All are loaded before the first episode, so that a damaged file is reported at once.
-        specs = [load_policy_spec(name, seed=self.seed) for name in self.policies]
-        comparison = compare_policies(specs, self._banks(), count=self.count, seed=self.seed)
+        environment, banks = parse_environment(self.env), self._banks()
+        specs = [
+            load_policy_spec(name, seed=self.seed, environment=environment, trust=self.trust) for name in self.policies
+        ]
+        comparison = compare_policies(specs, banks, count=self.count, seed=self.seed)
         print_scores(comparison)
         if self.json is not None:
             write_json(scores_to_dict(comparison), self.json)
@@ -70,10 +79,9 @@ class Evaluate:
 
     def _banks(self) -> list[ScenarioBank]:
         from leapnav.envs.scenarios.bank import ScenarioBank
-        from leapnav.envs.scenarios.families import ALL, FAMILIES, check_family
+        from leapnav.envs.scenarios.families import ALL, FAMILIES
 
         if self.bank is not None:
             return [ScenarioBank(self.bank)]
-        check_family(self.family)
         families = FAMILIES if self.family == ALL else (self.family,)
         return [ScenarioBank.shipped(family, self.split) for family in families]

@@ -6,6 +6,8 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from leapnav.commands.options import FamilyOrAll
+from leapnav.durations import announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 # Maximum deviation of a replay: other versions of the libraries may round the last digits differently.
@@ -21,8 +23,8 @@ class Rollout:
 
     out: Path
     """Output directory of the dataset."""
-    family: str = "clutter"
-    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
+    family: FamilyOrAll = "clutter"
+    """Family of the scenarios."""
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000
@@ -42,6 +44,11 @@ class Rollout:
     json: Path | None = None
     """JSON file of the summary, or of the result of --check; "-" for standard output."""
 
+    @property
+    def resumption(self) -> str:
+        """What to do after an interruption."""
+        return "the same command resumes where it stopped"
+
     def run(self) -> int:
         """Write the dataset, or check it."""
         check_outputs(self.json)
@@ -50,6 +57,8 @@ class Rollout:
         from leapnav.experts.data.demonstrations import dataset_id
         from leapnav.experts.data.rollouts import rollout
 
+        workers = 1 if self.dask else self.workers
+        announce(of_scenarios(self.family, self.count, workers) * (1 + self.recoveries / 4), "finding the optima")
         summary = rollout(
             self.family,
             self.count,

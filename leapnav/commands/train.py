@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
+from leapnav.durations import announce, of_training
 from leapnav.training.config import ALGORITHMS, BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig, read_config
 
 if TYPE_CHECKING:
@@ -27,11 +28,19 @@ class TrainCommand:
 
     def run(self) -> int:
         """Train a policy and print its scores."""
-        config = self.config
+        config, workers = self.config, os.cpu_count() or 1
+        if not config.resume:
+            announce(of_training(config, workers), "this run")
         for evaluation in self._train():
             print(_describe(evaluation))
         print(f"wrote {config.out} (next: leapnav evaluate {config.out} expert; leapnav report {config.out})")
         return 0
+
+    @property
+    def resumption(self) -> str:
+        """What to do after an interruption."""
+        algorithm = next(name for name, kind in ALGORITHMS.items() if isinstance(self.config, kind))
+        return f"leapnav train {algorithm} --out {self.config.out} --resume continues from the last checkpoint"
 
     def _train(self) -> Sequence[Evaluation]:
         """Train, and return the final evaluation of each family."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from leapnav.commands.options import Family, PolicyName
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -17,11 +18,11 @@ if TYPE_CHECKING:
 class Watch:
     """Watch a policy drive beside the optimum (the orange line), in a window or as a video."""
 
-    policy: str = "expert"
-    """Policy: "expert", "random", "go-to-goal", the directory of a policy or of a run, or the name of an included
-    policy."""
-    family: str = "clutter"
-    """Family of the scenarios: open, clutter, polygons, rooms or slalom."""
+    policy: PolicyName = "expert"
+    """Policy: a baseline, an included policy, the directory of a policy or of a run, or a model of Stable-Baselines3
+    (.zip)."""
+    family: Family = "clutter"
+    """Family of the scenarios."""
     split: Literal["train", "test", "fresh"] = "test"
     """Split of the included banks, or "fresh" for newly sampled scenarios."""
     index: int | None = None
@@ -47,6 +48,7 @@ class Watch:
         if self.index is not None and self.split == "fresh":
             raise ValueError(f"index: fresh scenarios have no index, got {self.index}; use --split train or test")
         check_outputs(self.json, video=self.video)
+        self._sensors()  # reports an unknown policy before a window opens
         if self.video is not None:
             return self._record(self.video)
         import pygame
@@ -89,14 +91,17 @@ class Watch:
         print(f"wrote {video}")
         return 0
 
-    def _make(self, render_mode: str) -> gym.Env[Any, Any]:
-        import gymnasium as gym
-
+    def _sensors(self) -> dict[str, Any]:
+        """Return the arguments of the environment that determine the policy's observations."""
         from leapnav.training.policies.files import policy_environment
         from leapnav.training.scoring.policy_specs import BASELINES
 
-        sensors = {} if self.policy in BASELINES else policy_environment(self.policy)
-        arguments = {**sensors, "actuation": self.actuation, "disturbance": self.disturbance}
+        return {} if self.policy in BASELINES else policy_environment(self.policy)
+
+    def _make(self, render_mode: str) -> gym.Env[Any, Any]:
+        import gymnasium as gym
+
+        arguments = {**self._sensors(), "actuation": self.actuation, "disturbance": self.disturbance}
         return gym.make(
             "leapnav/Navigate-v0", family=self.family, split=self.split, render_mode=render_mode, **arguments
         )

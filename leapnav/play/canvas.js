@@ -1,50 +1,66 @@
 "use strict";
 
-// Drawing of the scenario and the plots. The state `play` is in page.js.
+// Drawing of the plane: scenario, paths and robots. All colours come from the server (`play.colors`).
 
-const OPTIMUM_COLOR = "#d9730d", OTHER_COLOR = "#8a8a8a", SWEEP_COLOR = "#2a9d5c", POLICY_COLOR = "#2662ab";
-const PLOT_FRACTION = 0.36; // of the width of the canvas
-const byId = (id) => document.getElementById(id);
-const canvas = byId("view"), context = canvas.getContext("2d");
+const canvas = byId("view");
+let context = canvas.getContext("2d");
 
 // ---- The plane
 
 let view = { scale: 1, left: 0, top: 0 }; // pixels per metre, and the pixel of the origin
+let unit = 1; // pixels per unit of line widths and font sizes
 const toScreen = ([x, y]) => [view.left + view.scale * x, view.top - view.scale * y];
 const toPlane = ([x, y]) => [(x - view.left) / view.scale, (view.top - y) / view.scale];
 
+// The scenario that is drawn: that of the open lesson, or the edited one.
+const shownScenario = () => (play.lesson && play.lesson.content ? lessonScenario() : play.scenario);
+
 function fitView(width, height) {
-  const [x0, y0, x1, y1] = play.scenario.arena, margin = 14;
-  const scale = Math.min((width - 2 * margin) / (x1 - x0), (height - 2 * margin) / (y1 - y0));
+  const [x0, y0, x1, y1] = shownScenario().arena, margin = 6 * unit;
+  const scale = Math.max(Math.min((width - 2 * margin) / (x1 - x0), (height - 2 * margin) / (y1 - y0)), 1e-9);
   view = { scale, left: (width - scale * (x1 - x0)) / 2 - scale * x0, top: (height + scale * (y1 - y0)) / 2 + scale * y0 };
 }
 
 function drawLine(points, color, width, dash = []) {
   context.strokeStyle = color;
-  context.lineWidth = width;
-  context.setLineDash(dash);
+  context.lineWidth = width * unit;
+  context.lineJoin = "round";
+  context.setLineDash(dash.map((length) => length * unit));
   context.beginPath();
   points.forEach((point, i) => (i ? context.lineTo(...toScreen(point)) : context.moveTo(...toScreen(point))));
   context.stroke();
   context.setLineDash([]);
 }
 
+function drawPoints(points, color, radius) {
+  context.fillStyle = color;
+  for (const point of points) {
+    context.beginPath();
+    context.arc(...toScreen(point), radius * unit, 0, 2 * Math.PI);
+    context.fill();
+  }
+}
+
+const hasHeading = (pose) => pose[2] !== null && pose[2] !== undefined;
+
 const arrowTip = ([x, y, heading]) => {
-  const length = Math.max(2.2 * play.scenario.robot.radius, 26 / view.scale);
+  const length = Math.max(2.2 * shownScenario().robot.radius, (26 * unit) / view.scale);
   return [x + length * Math.cos(heading), y + length * Math.sin(heading)];
 };
 
-function drawRobot(pose, color, hasArrow) {
-  const [x, y] = toScreen(pose), radius = view.scale * play.scenario.robot.radius;
-  context.lineWidth = 2;
+function drawRobot(pose, color, hasArrow, isSelected = false) {
+  const [x, y] = toScreen(pose), radius = Math.max(view.scale * shownScenario().robot.radius, 3 * unit);
+  context.lineWidth = (isSelected ? 4 : 2) * unit;
   context.strokeStyle = color;
   context.beginPath();
-  context.arc(x, y, Math.max(radius, 3), 0, 2 * Math.PI);
+  context.arc(x, y, radius, 0, 2 * Math.PI);
   context.fillStyle = color + "44";
   context.fill();
   context.stroke();
-  if (pose[2] === undefined || pose[2] === null) return;
+  if (isSelected) drawSelection(x, y, radius);
+  if (!hasHeading(pose)) return;
   const end = hasArrow ? toScreen(arrowTip(pose)) : [x + radius * Math.cos(pose[2]), y - radius * Math.sin(pose[2])];
+  context.lineWidth = 2 * unit;
   context.beginPath();
   context.moveTo(x, y);
   context.lineTo(...end);
@@ -52,14 +68,24 @@ function drawRobot(pose, color, hasArrow) {
   if (!hasArrow) return;
   context.fillStyle = color;
   context.beginPath();
-  context.arc(...end, 4, 0, 2 * Math.PI);
+  context.arc(...end, 4.5 * unit, 0, 2 * Math.PI);
   context.fill();
+}
+
+function drawSelection(x, y, radius) {
+  context.strokeStyle = play.colors.wall;
+  context.lineWidth = unit;
+  context.setLineDash([4 * unit, 3 * unit]);
+  context.beginPath();
+  context.arc(x, y, radius + 5 * unit, 0, 2 * Math.PI);
+  context.stroke();
+  context.setLineDash([]);
 }
 
 function traceObstacle(obstacle) {
   context.beginPath();
   if (obstacle.circle) {
-    context.arc(...toScreen(obstacle.circle.center), view.scale * obstacle.circle.radius, 0, 2 * Math.PI);
+    context.arc(...toScreen(obstacle.circle.center), Math.max(view.scale * obstacle.circle.radius, 0), 0, 2 * Math.PI);
   } else {
     const vertices = obstacle.polygon.vertices;
     vertices.forEach((point, i) => (i ? context.lineTo(...toScreen(point)) : context.moveTo(...toScreen(point))));
@@ -75,130 +101,91 @@ function poseAt(states, time, duration) {
   return states[k].map((value, i) => value + (position - k) * (states[k + 1][i] - value));
 }
 
-function drawPlane(width, height) {
-  const { scenario, solution } = play;
-  fitView(width, height);
-  const [x0, y0, x1, y1] = scenario.arena, [left, top] = toScreen([x0, y1]);
-  context.fillStyle = "#fafafa";
-  context.fillRect(left, top, view.scale * (x1 - x0), view.scale * (y1 - y0));
-  context.strokeStyle = "#444";
-  context.lineWidth = 2;
+function drawScenario(scenario, selected = null) {
+  const [x0, y0, x1, y1] = scenario.arena, [left, top] = toScreen([x0, y1]), colors = play.colors;
+  context.strokeStyle = colors.wall;
+  context.lineWidth = 2 * unit;
   context.strokeRect(left, top, view.scale * (x1 - x0), view.scale * (y1 - y0));
   (scenario.obstacles || []).forEach((obstacle, i) => {
+    const isSelected = i === selected;
     traceObstacle(obstacle);
-    context.fillStyle = i === play.selected ? "#aebfd0" : "#c9c9c9";
+    context.fillStyle = colors.obstacle;
     context.fill();
-    context.strokeStyle = i === play.selected ? "#336" : "#777";
-    context.lineWidth = i === play.selected ? 2 : 1;
+    context.strokeStyle = isSelected ? colors.wall : colors.edge;
+    context.lineWidth = (isSelected ? 3 : 1) * unit;
+    context.setLineDash(isSelected ? [6 * unit, 3 * unit] : []);
     context.stroke();
+    context.setLineDash([]);
   });
-  const isOutdated = play.error !== null;
-  if (solution && solution.path) {
-    solution.alternatives.forEach((other, i) =>
-      drawLine(other.states, play.highlighted === i + 1 ? OPTIMUM_COLOR : OTHER_COLOR, 1.2, [5, 4]));
-    if (play.sweeps && play.sweeps.length) {
-      const sweep = play.sweeps[byId("sweep-slider").value];
-      drawLine(sweep.states, SWEEP_COLOR, 2);
-      context.fillStyle = SWEEP_COLOR;
-      for (const node of sweep.nodes) {
-        context.beginPath();
-        context.arc(...toScreen(node), 2.5, 0, 2 * Math.PI);
-        context.fill();
-      }
-    }
-    drawLine(solution.path.states, isOutdated || !solution.success ? "#e9b98a" : OPTIMUM_COLOR, 2.5);
+}
+
+const drawPoses = (scenario, selected = null) => {
+  drawRobot(scenario.start, play.colors.start, true, selected === "start");
+  drawRobot(scenario.goal, play.colors.goal, true, selected === "goal");
+};
+
+const alternativeColor = (i) => play.colors.alternatives[i % play.colors.alternatives.length];
+
+function drawSolution(solution) {
+  const colors = play.colors, isOutdated = play.error !== null || !solution.success;
+  solution.alternatives.forEach((other, i) => {
+    const isShown = play.highlighted === i + 1;
+    drawLine(other.states, alternativeColor(i), isShown ? 3 : 1.4, isShown ? [] : [5, 4]);
+  });
+  if (play.sweeps && play.sweeps.length) {
+    const sweep = play.sweeps[byId("sweep-slider").value];
+    drawLine(sweep.states, colors.sweep, 2);
+    drawPoints(sweep.nodes, colors.sweep, 3);
   }
-  if (play.episode) drawLine(play.episode.states, POLICY_COLOR, 2);
-  drawRobot(scenario.start, "#1a7a3c", true);
-  drawRobot(scenario.goal, "#b03a2e", true);
-  if (play.time !== null) {
-    if (solution && solution.path) {
-      drawRobot(poseAt(solution.path.states, play.time, scenario.horizon), OPTIMUM_COLOR, false);
-    }
-    if (play.episode) {
-      const duration = play.episode.period * (play.episode.states.length - 1);
-      drawRobot(poseAt(play.episode.states, play.time, Math.min(duration, scenario.horizon)), POLICY_COLOR, false);
-    }
+  drawLine(solution.path.states, colors.optimum + (isOutdated ? "77" : ""), play.highlighted === 0 ? 3 : 2);
+}
+
+function drawPlane(width, height) {
+  const { scenario, solution, episode, driving } = play, colors = play.colors;
+  fitView(width, height);
+  if (play.lesson && play.lesson.content) {
+    drawLesson();
+    return;
+  }
+  drawScenario(scenario, driving ? null : play.selected);
+  if (solution && solution.path && (!driving || byId("show-optimum").checked)) drawSolution(solution);
+  const episodeColor = episode && (episode.success ? colors.policy : colors.failure);
+  if (episode) drawLine(episode.states, episodeColor, 2.2);
+  drawPoses(scenario, driving ? null : play.selected);
+  if (driving) {
+    drawLine(driving.states, colors.policy, 2.2);
+    drawRobot(driving.pose, colors.policy, false);
+  }
+  if (play.time === null) return;
+  if (solution && solution.path) {
+    drawRobot(poseAt(solution.path.states, play.time, scenario.horizon), colors.optimum, false);
+  }
+  if (episode) {
+    const duration = episode.period * (episode.states.length - 1);
+    drawRobot(poseAt(episode.states, play.time, Math.min(duration, scenario.horizon)), episodeColor, false);
   }
 }
 
-// ---- Plots over time
+// ---- Both canvases
 
-function drawPlots(left, width, height) {
-  const path = play.solution && play.solution.path;
-  if (!path) return;
-  const column = (rows, i) => rows.map((row) => row[i]);
-  // Title, curves (label, values, color), and the minimum range of the vertical axis.
-  const plots = [
-    ["controls", [["v (m/s)", column(path.controls, 0), "#2662ab"], ["ω (rad/s)", column(path.controls, 1), "#c0392b"]], 0.1],
-    ["costates", [["λx", column(path.costates, 0), "#2662ab"], ["λy", column(path.costates, 1), "#2a9d5c"], ["λθ", column(path.costates, 2), "#c0392b"]], 0.1],
-    ["Hamiltonian", [["H", path.hamiltonian, "#6b3fa0"]], 1e-3],
-    ["clearance", [["m", path.clearances, "#555"]], 0.1],
-  ];
-  const spacing = 30, plotHeight = (height - spacing * plots.length - 8) / plots.length;
-  plots.forEach(([title, curves, minRange], k) => {
-    const top = 20 + k * (plotHeight + spacing), all = curves.flatMap(([, values]) => values);
-    let low = Math.min(...all), high = Math.max(...all);
-    if (title === "clearance") low = Math.min(low, 0);
-    const margin = Math.max(0, minRange - (high - low)) / 2 + 0.05 * (high - low);
-    low -= margin;
-    high += margin;
-    const at = (i, value) =>
-      [left + (i / (path.times.length - 1)) * width, top + plotHeight * (1 - (value - low) / (high - low))];
-    context.strokeStyle = "#bbb";
-    context.lineWidth = 1;
-    context.strokeRect(left, top, width, plotHeight);
-    if (low < 0 && high > 0) {
-      context.beginPath();
-      context.moveTo(...at(0, 0));
-      context.lineTo(...at(path.times.length - 1, 0));
-      context.stroke();
-    }
-    context.font = "12px system-ui, sans-serif";
-    context.textAlign = "right";
-    context.fillStyle = "#777";
-    const digits = high - low < 0.01 ? 5 : 2;
-    context.fillText(high.toFixed(digits), left - 4, top + 9);
-    context.fillText(low.toFixed(digits), left - 4, top + plotHeight);
-    context.textAlign = "left";
-    let x = left;
-    context.fillStyle = "#222";
-    context.fillText(title, x, top - 6);
-    x += context.measureText(title).width + 12;
-    for (const [label, values, color] of curves) {
-      context.fillStyle = color;
-      context.fillText(label, x, top - 6);
-      x += context.measureText(label).width + 10;
-      context.strokeStyle = color;
-      context.lineWidth = 1.5;
-      context.beginPath();
-      values.forEach((value, i) => (i ? context.lineTo(...at(i, value)) : context.moveTo(...at(i, value))));
-      context.stroke();
-    }
-    if (play.time !== null) {
-      const x = left + (play.time / play.scenario.horizon) * width;
-      context.strokeStyle = OPTIMUM_COLOR;
-      context.beginPath();
-      context.moveTo(x, top);
-      context.lineTo(x, top + plotHeight);
-      context.stroke();
-    }
-  });
-  context.fillStyle = "#777";
-  context.textAlign = "right";
-  context.fillText(`${play.scenario.horizon} s`, left + width, height - 4);
+// Prepares a canvas for drawing in CSS pixels and returns its size.
+function prepareCanvas(element) {
+  const ratio = window.devicePixelRatio || 1, { clientWidth: width, clientHeight: height } = element;
+  if (element.width !== Math.round(width * ratio) || element.height !== Math.round(height * ratio)) {
+    element.width = Math.round(width * ratio);
+    element.height = Math.round(height * ratio);
+  }
+  context = element.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return [width, height];
 }
 
 function draw() {
-  const ratio = window.devicePixelRatio || 1, { clientWidth: width, clientHeight: height } = canvas;
-  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-    canvas.width = Math.round(width * ratio);
-    canvas.height = Math.round(height * ratio);
-  }
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.clearRect(0, 0, width, height);
-  if (!play.scenario) return;
-  const planeWidth = width * (1 - PLOT_FRACTION);
-  drawPlane(planeWidth, height);
-  drawPlots(planeWidth + 58, width - planeWidth - 72, height);
+  unit = parseFloat(getComputedStyle(document.documentElement).fontSize) / 14;
+  const [width, height] = prepareCanvas(canvas);
+  if (!play.scenario || !play.colors) return;
+  drawPlane(width, height);
+  const [plotWidth, plotHeight] = prepareCanvas(byId("plots"));
+  drawPlots(plotWidth, plotHeight);
 }

@@ -287,9 +287,7 @@ def conjugate_time(extremal: Extremal) -> float | None:
     ends = np.concatenate([extremal.states[[0, -1]], extremal.costates[[0, -1]]], axis=1)
     # The last node only marks the end of the integration, so it may have any value.
     nodes = np.concatenate([ends, ends[-1:]])
-    certificate = certify(
-        longer, np.array([0.0, horizon, longer.horizon]), nodes, Status.MAX_ITERATIONS
-    ).certificate
+    certificate = certify(longer, np.array([0.0, horizon, longer.horizon]), nodes, Status.MAX_ITERATIONS).certificate
     return None if certificate is None else certificate.conjugate_point
 
 

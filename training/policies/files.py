@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 from collections.abc import Mapping
@@ -23,11 +22,13 @@ from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.files import atomic_path, digest, write_text
 from leapnav.envs.utils.json_utils import encode
+from leapnav.envs.utils.validation import suggestion
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.training.policies.actors import policy_of
 from leapnav.training.policies.architecture import KINDS, Architecture, is_actor_weight
 from leapnav.training.policies.zips import is_zip, load_zip
 
+BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
 FORMAT, READ_FORMATS = 3, (2, 3)  # version of policy.json; in version 2 every network is that of `network`
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
@@ -107,8 +108,13 @@ def read_description(folder: str | Path) -> dict[str, Any]:
     """
     path = policy_folder(folder) / "policy.json"
     if not path.parent.exists():
-        shipped = ", ".join(shipped_policies())
-        raise FileNotFoundError(errno.ENOENT, f"no such policy; expected a directory or one of {shipped}", str(folder))
+        names = (*BASELINES, *shipped_policies())
+        raise FileNotFoundError(
+            f"{folder}: no such policy; expected a directory, a .zip of Stable-Baselines3 or one of {', '.join(names)}"
+            f"{suggestion(str(folder), names)}"
+        )
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; {folder} is not the directory of a policy")
     text = path.read_text()
     try:
         description = json.loads(text)

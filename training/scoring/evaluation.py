@@ -19,6 +19,7 @@ from leapnav.envs.scenarios.bank import Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
+from leapnav.envs.utils.validation import check_choice
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.problem.problem import Trajectory
@@ -46,8 +47,8 @@ class Policy(Protocol):
         ...
 
 
-# A policy that depends on the environment, such as `ExpertPolicy`, is given as a class, or as a function whose parameter
-# is named `env`. Any other function is a policy itself: it maps an observation to an action.
+# A policy that depends on the environment, such as `ExpertPolicy`, is given as a class, or as a function whose
+# parameter is named `env`. Any other function is a policy itself: it maps an observation to an action.
 PolicyOrFactory = Policy | Callable[[Any], Any]
 
 
@@ -257,8 +258,9 @@ def evaluate(
         )
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str) or bank not in FAMILIES:
-            got = repr(bank) if isinstance(bank, str) else type(bank).__name__
-            raise ValueError(f"bank: expected a ScenarioBank or one of {', '.join(FAMILIES)}, got {got}")
+            if not isinstance(bank, str):
+                raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
+            check_choice("family", bank, FAMILIES)
         bank = ScenarioBank.shipped(bank, "test")
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")

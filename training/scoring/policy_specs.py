@@ -12,11 +12,10 @@ import gymnasium as gym
 
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
+from leapnav.training.policies.files import BASELINES as BASELINES
 from leapnav.training.policies.files import load_policy, policy_environment, read_description
 from leapnav.training.policies.zips import is_zip, load_zip
 from leapnav.training.scoring.evaluation import Policy, PolicyOrFactory
-
-BASELINES = ("expert", "random", "go-to-goal")
 
 
 @dataclass(frozen=True)

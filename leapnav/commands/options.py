@@ -1,0 +1,40 @@
+"""Options that several commands have: families, policies, and the environment of a policy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from leapnav.training.config import FamilyName
+
+# Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
+Family = Literal["open", "clutter", "polygons", "rooms", "slalom"]
+FamilyOrAll = FamilyName
+PolicyName = Literal["expert", "go-to-goal", "random", "open", "clutter", "polygons", "rooms", "slalom"] | str
+EnvironmentOption = tuple[str, ...]
+
+
+def parse_environment(words: Sequence[str]) -> dict[str, Any] | None:
+    """Return the arguments of an environment given as KEY=VALUE, with values in JSON or plain text; None without any.
+
+    Raises:
+        ValueError: a word has no "=", or the argument is unknown.
+
+    """
+    from dataclasses import fields
+
+    from leapnav.envs.settings import EnvironmentSettings
+    from leapnav.envs.utils.validation import check_choice
+
+    arguments: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            raise ValueError(f"env: expected KEY=VALUE, such as observation=map, got {word!r}")
+        check_choice("env", name, [field.name for field in fields(EnvironmentSettings)])
+        try:
+            arguments[name] = json.loads(text)
+        except ValueError:
+            arguments[name] = text
+    return arguments or None

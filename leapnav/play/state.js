@@ -1,0 +1,217 @@
+"use strict";
+
+// State of the page, requests to the server, and the history of changes.
+
+const SEARCH_DELAY = 250; // ms from the last change to the start of the full search
+const MAX_HISTORY = 200; // changes that can be undone
+const MAX_LATENCIES = 500;
+
+const byId = (id) => document.getElementById(id);
+const setText = (id, value) => (byId(id).textContent = value);
+const format = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
+
+// What the page shows. It is a property of `window` so that tests and the console can read it.
+const play = (window.play = {
+  scenario: null, // as in a scenario file; replaced, never changed in place
+  solution: null, // latest response of /follow or /search
+  previousId: null, // id of the latest certified solution, the initial guess of the next one
+  highlighted: 0, // row of the table of local optima
+  sweeps: null,
+  episode: null, // response of /drive or /replay
+  selected: null, // "start", "goal" or the index of an obstacle
+  time: null, // s, during an animation
+  pending: 0, // number of open requests
+  searched: false, // whether the solution is that of the full search
+  error: null,
+  notice: null, // a line that is shown until the next change
+  colors: null, // by name, from the server
+  lesson: null, // the open lesson, see lessons.js
+  driving: null, // the person's episode in progress, see driving.js
+  undo: [], // earlier scenarios
+  redo: [],
+  latencies: [], // ms from a pointer move to the drawing of the followed optimum
+});
+let drag = null, following = false, searching = false, changed = false, searchTimer = null, revision = 0;
+let moveTime = null; // time of the pointer move whose optimum is not drawn yet (ms)
+
+// ---- Requests
+
+async function request(path, content) {
+  play.pending += 1;
+  try {
+    const options = content && {
+      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content),
+    };
+    const response = await fetch(path, options).catch(() => {
+      throw new Error("the server does not respond");
+    });
+    const isJson = (response.headers.get("content-type") || "").startsWith("application/json");
+    const result = isJson ? await response.json() : { error: `error ${response.status}; see the terminal of the server` };
+    if (!response.ok) throw new Error(result.error);
+    return result;
+  } finally {
+    play.pending -= 1;
+  }
+}
+
+function scheduleSearch() {
+  clearTimeout(searchTimer);
+  searchTimer = setTimeout(search, SEARCH_DELAY);
+}
+
+// Called after every change of the scenario: a local optimum follows at once, the full search when changes pause.
+function scenarioChanged() {
+  revision += 1;
+  changed = true;
+  play.searched = false;
+  play.sweeps = null;
+  play.episode = null;
+  play.notice = null;
+  scheduleSearch();
+  follow();
+  show();
+}
+
+async function follow() {
+  if (following) return;
+  following = true;
+  while (changed) {
+    changed = false;
+    const moved = moveTime;
+    moveTime = null;
+    try {
+      const solution = await request("/follow", { scenario: play.scenario, previous: play.previousId });
+      if (!play.searched) setSolution(solution);
+      if (moved !== null) {
+        play.latencies.push(performance.now() - moved);
+        if (play.latencies.length > MAX_LATENCIES) play.latencies.shift();
+      }
+    } catch (error) {
+      showError(error);
+    }
+  }
+  following = false;
+}
+
+async function search() {
+  // One search at a time: the server handles requests in order, and outdated ones would delay the next.
+  if (drag !== null || searching) return;
+  const searchedRevision = revision;
+  searching = true;
+  try {
+    const solution = await request("/search", { scenario: play.scenario });
+    if (searchedRevision === revision) {
+      play.searched = true;
+      setSolution(solution);
+      if (byId("policy").value && !play.driving) await drivePolicy();
+    }
+  } catch (error) {
+    if (searchedRevision === revision) showError(error);
+  } finally {
+    searching = false;
+  }
+  if (searchedRevision !== revision) scheduleSearch();
+}
+
+function setSolution(solution) {
+  play.solution = solution;
+  play.error = null;
+  play.highlighted = 0;
+  if (solution.id) play.previousId = solution.id;
+  show();
+}
+
+function showError(error) {
+  play.error = error.message;
+  show();
+}
+
+async function loadSweeps() {
+  const sweptRevision = revision;
+  byId("sweeps").disabled = true;
+  try {
+    const result = await request("/sweeps", { scenario: play.scenario });
+    if (sweptRevision !== revision) return;
+    play.sweeps = result.sweeps;
+    byId("sweep-slider").max = Math.max(0, result.sweeps.length - 1);
+    byId("sweep-slider").value = 0;
+    if (!result.sweeps.length) throw new Error(result.advice);
+  } catch (error) {
+    showError(error);
+  } finally {
+    byId("sweeps").disabled = false;
+    show();
+  }
+}
+
+// Requests an episode of the selected policy, or the replay of a person's actions.
+async function loadEpisode(path, content, isCurrent) {
+  const drivenRevision = revision;
+  play.episode = null;
+  show();
+  try {
+    const episode = await request(path, { scenario: play.scenario, ...content });
+    if (drivenRevision === revision && isCurrent()) play.episode = episode;
+  } catch (error) {
+    if (drivenRevision === revision) showError(error);
+  }
+  show();
+}
+
+async function drivePolicy() {
+  const policy = byId("policy").value;
+  if (policy) await loadEpisode("/drive", { policy }, () => byId("policy").value === policy);
+  else {
+    play.episode = null;
+    show();
+  }
+}
+
+// ---- Changes of the scenario
+
+let lastGroup = null;
+
+// Changes fields of the scenario. Successive changes with the same group, such as those of a drag, are undone together.
+function edit(fields, group = null) {
+  if (group === null || group !== lastGroup) remember();
+  lastGroup = group;
+  play.scenario = { ...play.scenario, ...fields };
+  scenarioChanged();
+}
+
+function remember() {
+  play.undo.push(play.scenario);
+  if (play.undo.length > MAX_HISTORY) play.undo.shift();
+  play.redo = [];
+  forgetLink();
+}
+
+function setScenario(scenario) {
+  if (play.scenario !== null) remember();
+  lastGroup = null;
+  replaceScenario(scenario);
+}
+
+function replaceScenario(scenario) {
+  play.scenario = scenario;
+  drag = null;
+  play.selected = null;
+  play.previousId = null;
+  play.solution = null;
+  play.time = null;
+  scenarioChanged();
+}
+
+function moveInHistory(from, to) {
+  if (!from.length || drag !== null || play.driving || play.lesson) return;
+  to.push(play.scenario);
+  lastGroup = null;
+  play.scenario = from.pop();
+  const count = (play.scenario.obstacles || []).length;
+  if (typeof play.selected === "number" && play.selected >= count) play.selected = null;
+  forgetLink();
+  scenarioChanged();
+}
+
+const undo = () => moveInHistory(play.undo, play.redo);
+const redo = () => moveInHistory(play.redo, play.undo);
