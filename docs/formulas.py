@@ -14,12 +14,14 @@ _SIZE = 1.1  # em of the text; the letters of the formulas are smaller than thos
 _COMMANDS = {0: "", 1: "M", 2: "L", 3: "Q", 4: "C", 79: "Z"}  # by the codes of matplotlib.path.Path
 # TeX that Matplotlib does not support (regular expressions), and its replacement.
 _REPLACED = {
-    r"\\[tb]?frac(\d)(\d)": r"\\frac{\1}{\2}",
+    r"\\[td]?frac(\d)(\d)": r"\\frac{\1}{\2}",
     r"\\le(?![a-z])": r"\\leq",
     r"\\[lr]vert": "|",
     r"\\big(?=[()])": "",
     r"\\Big\(": r"\\left(",
     r"\\Big\)": r"\\right)",
+    r"\^\\top": r"^{\\mathsf{T}}",  # the symbol has wide margins
+    r"\^\*": r"^{*}",  # without the margins of an operator
     r"\\min_u": r"\\underset{u}{\\min}",
 }
 
@@ -32,15 +34,17 @@ def draw_formulas(page: str) -> str:
 def _replace(found: re.Match[str]) -> str:
     tex = " ".join(html.unescape(found[3]).split())
     kind = "display" if found[2] == "[" else "inline"
-    return f'<span class="formula formula--{kind}" role="img" aria-label="{html.escape(tex)}">{_svg(tex)}</span>'
+    return f'<span class="formula formula--{kind}" role="img" aria-label="{html.escape(tex)}">{_svg(tex, kind)}</span>'
 
 
-def _svg(tex: str) -> str:
+def _svg(tex: str, kind: str) -> str:
     """Return a formula as an SVG picture whose sizes are relative to the text's."""
+    if kind == "display":
+        tex = tex.replace(r"\frac", r"\dfrac")
     for old, new in _REPLACED.items():
         tex = re.sub(old, new, tex)
     text = f"${tex}$"
-    width = text_to_path.get_text_width_height_descent(text, _FONT, ismath=True)[0] / text_to_path.FONT_SCALE
+    width = text_to_path.get_text_width_height_descent(text, _FONT, ismath=True)[0] / _FONT.get_size_in_points()
     path = TextPath((0, 0), text, size=_SCALE, prop=_FONT)
     strokes = []
     for vertices, code in path.iter_segments(curves=True, simplify=False):

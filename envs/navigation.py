@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["NavigateEnv", "NavigateGoalEnv"]
 
 NOISE_STREAM = 1  # of the environment's seed; the stream of the scenarios is the seed itself
+KEY_ACTION = 0.5  # fraction of the maximum speed and turn rate when a person drives by keys
 
 
 class NavigateEnv(gym.Env[Any, np.ndarray]):
@@ -311,6 +313,23 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         if self._window is not None:
             self._window.close()
             self._window = None
+
+    def get_keys_to_action(self) -> dict[str | tuple[str | int, ...], np.ndarray]:
+        """Return the actions of keys, with which `gymnasium.utils.play.play` lets a person drive.
+
+        W and S or the arrow keys drive forwards and backwards, A and D or the arrow keys turn; at half of the maximum
+        speed and turn rate. Without a key the robot stands still.
+        """
+        import pygame
+
+        # Gymnasium takes the empty text for "no key"; an empty tuple is an error.
+        actions: dict[str | tuple[str | int, ...], np.ndarray] = {"": np.zeros(2, np.float32)}
+        for keys in (("w", "s", "a", "d"), (pygame.K_UP, pygame.K_DOWN, pygame.K_LEFT, pygame.K_RIGHT)):
+            for ahead, turn in itertools.product((0, 1, -1), repeat=2):
+                pressed = [keys[0 if ahead > 0 else 1]] * (ahead != 0) + [keys[2 if turn > 0 else 3]] * (turn != 0)
+                if pressed:
+                    actions[tuple(pressed)] = KEY_ACTION * np.array([ahead, turn], dtype=np.float32)
+        return actions
 
     @property
     def family(self) -> str:

@@ -137,7 +137,7 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
 
     """
     if not isinstance(cast(object, scenario), Scenario):
-        raise TypeError(f"scenario: expected a Scenario, got {type(scenario).__name__}")
+        raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
     prepare(*KERNELS)
     problem = OptimalControlProblem.from_scenario(scenario)

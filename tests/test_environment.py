@@ -354,3 +354,28 @@ def test_frames_show_the_robot_where_it_is():
     for _ in range(20):
         env.step(np.array([0.5, 0.0], np.float32))
     assert np.nonzero(np.abs(env.render().astype(int) - (38, 98, 171)).sum(axis=2) < 20)[1].mean() > columns.mean() + 10
+
+
+def test_a_person_can_drive_by_keys(monkeypatch):
+    """Gymnasium's play loop finds the keys in the environment, also inside wrappers."""
+    import pygame
+    from gymnasium.utils.play import play
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make("leapnav/Navigate-v0", family="open", render_mode="rgb_array")
+    keys = env.unwrapped.get_keys_to_action()
+    assert keys[""].tolist() == [0.0, 0.0]
+    assert keys[("w",)].tolist() == [0.5, 0.0] and keys[("s", "d")].tolist() == [-0.5, -0.5]
+    assert keys[(pygame.K_UP, pygame.K_LEFT)].tolist() == [0.5, 0.5]
+    taken, steps = [], 6
+
+    def after_step(before, after, action, reward, terminated, truncated, info):
+        taken.append((np.asarray(action).tolist(), info["pose"]))
+        key = [pygame.event.Event(pygame.KEYDOWN, key=ord("w")), pygame.event.Event(pygame.KEYDOWN, key=ord("a"))]
+        pygame.event.post(key[len(taken) - 1] if len(taken) <= 2 else pygame.event.Event(pygame.USEREVENT))
+        if len(taken) == steps:
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+
+    play(env, callback=after_step, fps=1000, seed=0)
+    assert [action for action, _ in taken[:3]] == [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]
+    assert math.dist(taken[-1][1][:2], taken[0][1][:2]) > 0.1

@@ -1,7 +1,8 @@
-"""Error messages of invalid input, from two tables of an input and, below it, its message. No file is written.
+"""Error messages of invalid input, from tables of an input and, below it, its message. No file is written.
 
 `data/errors_on_the_command_line.txt` contains arguments of `leapnav`; `data/errors_in_python.txt` contains expressions,
-whose names are the public ones and those of the fixture `names`.
+whose names are the public ones and those of the fixture `names`. `data/plausible_mistakes.txt` contains 40 mistakes of
+new users, of both kinds: each message states the field, the value and what to do.
 """
 
 import json
@@ -61,6 +62,9 @@ FILES = {
     "cell.map": "type octile\nheight 1\nwidth 3\nmap\n.x.\n",
     "utf8.map": "type octile\nheight 1\nwidth 3\nmap\n.é.\n",
     "data/x": "",
+    "degrees.json": scenario_fields(goal=[8, 8, 90]),
+    "typo.json": {**scenario_fields(horizon=-1, obstacels=[]), "cost": {"speed_wieght": 1.0}},
+    "text.zip": "no model",
 }
 
 
@@ -92,9 +96,18 @@ def folder(tmp_path, monkeypatch):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(("words", "line"), rows("errors_on_the_command_line.txt"))
+MISTAKES = rows("plausible_mistakes.txt")
+COMMANDS = [row for row in MISTAKES if row.id.startswith("leapnav ")]
+EXPRESSIONS = [row for row in MISTAKES if row not in COMMANDS]
+
+
+def test_there_are_forty_plausible_mistakes():
+    assert len(MISTAKES) == 40 and len(COMMANDS) >= 20 and len(EXPRESSIONS) >= 12
+
+
+@pytest.mark.parametrize(("words", "line"), rows("errors_on_the_command_line.txt") + COMMANDS)
 def test_the_line_that_is_printed(words, line, folder, capsys):
-    assert main(words.split()) == 2
+    assert main(words.removeprefix("leapnav ").split()) == 2
     lines = [text for text in capsys.readouterr().err.splitlines() if not text.startswith("leapnav: compiling")]
     assert lines == [f"leapnav: {line.replace('{folder}', str(folder))}"]
 
@@ -165,7 +178,7 @@ def names(tmp_path_factory):
     }
 
 
-@pytest.mark.parametrize(("expression", "line"), rows("errors_in_python.txt"))
+@pytest.mark.parametrize(("expression", "line"), rows("errors_in_python.txt") + EXPRESSIONS)
 def test_the_exception_that_is_raised(expression, line, folder, names):
     with pytest.raises(Exception) as raised:  # noqa: PT011 (type and message are checked below)
         eval(expression, dict(names))

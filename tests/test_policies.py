@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from helpers import SMALL
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
 from leapnav.training.robots.rewards import ScaledReward
@@ -54,9 +54,35 @@ def test_half_precision_keeps_the_actor(clone, env, tmp_path):
     )
 
 
-def test_a_policy_with_another_network_is_not_saved(env, tmp_path):
-    with pytest.raises(ValueError, match=r"policy_kwargs=leapnav\.training\.network\(\)"):
-        save_policy(PPO("MlpPolicy", env), tmp_path)
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3])
+def test_an_ordinary_mlp_policy_is_saved(algorithm, env, tmp_path):
+    model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [16, 8], "activation_fn": th.nn.ELU}, device="cpu")
+    save_policy(model, tmp_path / "policy")
+    loaded = load_policy(tmp_path / "policy", env)
+    observations = np.array([env.reset(seed=seed)[0] for seed in range(5)])
+    expected, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], expected)
+
+
+class OwnFeatures(NavigationFeatures):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"features_extractor_class": OwnFeatures}, "features extractor: expected one of .*, got OwnFeatures"),
+        ({"activation_fn": th.nn.Softplus}, "activation function: expected one of ReLU, .*, got Softplus"),
+    ],
+)
+def test_a_policy_that_cannot_be_described_is_not_saved(arguments, message, env, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        save_policy(PPO("MlpPolicy", env, policy_kwargs=arguments), tmp_path / "policy")
+    with pytest.raises(ValueError, match="use_sde=True"):
+        save_policy(PPO("MlpPolicy", env, use_sde=True), tmp_path / "policy")
+    with pytest.raises(ValueError, match=r"environment: has observations \(25,\), the policy's are \(41,\)"):
+        save_policy(PPO("MlpPolicy", env), tmp_path / "policy", {"lidar_beams": 16})
+    assert not (tmp_path / "policy").exists()
 
 
 def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
@@ -76,10 +102,10 @@ def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
         load_policy(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     faults = [
-        ({**description, "format": 99}, "format: expected 2, got 99"),
+        ({**description, "format": 99}, "format: expected 3, got 99"),
         ({}, "not the description of a policy"),
         ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
-        ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, tqc, got 'dqn'"),
+        ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, td3, tqc, got 'dqn'"),
         ({**description, "hidden": ["wide"]}, "not the description of a policy"),
         ({**description, "observation_low": [0.0]}, "not the description of a policy"),
     ]

@@ -181,11 +181,22 @@ function prepareCanvas(element) {
   return [width, height];
 }
 
+let plotted = []; // what the plots show
+
 function draw() {
-  unit = parseFloat(getComputedStyle(document.documentElement).fontSize) / 14;
   const [width, height] = prepareCanvas(canvas);
   if (!play.scenario || !play.colors) return;
   drawPlane(width, height);
-  const [plotWidth, plotHeight] = prepareCanvas(byId("plots"));
-  drawPlots(plotWidth, plotHeight);
+  const { lesson, driving, time, searched, highlighted } = play, plots = byId("plots");
+  const shown = [shownPath(), lesson && lesson.content, lesson && lesson.step, driving !== null, time, searched,
+    highlighted, byId("show-optimum").checked, unit, plots.clientWidth, plots.clientHeight, window.devicePixelRatio];
+  if (shown.length === plotted.length && shown.every((value, i) => value === plotted[i])) return;
+  plotted = shown;
+  drawPlots(...prepareCanvas(plots));
+}
+
+// Line widths and fonts of the canvases follow the font size of the page.
+function resize() {
+  unit = parseFloat(getComputedStyle(document.documentElement).fontSize) / 14;
+  draw();
 }

@@ -169,7 +169,7 @@ canvas.addEventListener("pointermove", (event) => {
     if (canEdit()) canvas.style.cursor = findHandle(clientPoint(event), event.pointerType) ? "grab" : "default";
     return;
   }
-  moveTime = performance.now();
+  if (moveTime === null) moveTime = performance.now();
   const point = clientPoint(event), [dx, dy] = [point[0] - drag.from[0], point[1] - drag.from[1]], group = drag;
   drag.from = point;
   if (drag.kind === "obstacle") {

@@ -159,11 +159,13 @@ def _describe_iteration(k: int, methods: list[dict[str, Any]], best: float) -> d
             "All three methods start from the same path of a lattice search. Single shooting integrates the extremal "
             f"from the estimated initial costate; it misses the goal by {single['miss']:.1f} m. Multiple shooting "
             f"integrates {SEGMENTS} segments from their nodes; the pieces are not connected. Leapfrog connects the "
-            f"nodes by extremal arcs: its first path is feasible, at a cost {_excess(leapfrog, best)} above the optimum."
+            f"nodes by extremal arcs: its first path is feasible, and its cost is {_excess(leapfrog, best)} above the "
+            "optimum."
         )
         return {"title": "The initial guess", "text": text}
     first = (
-        f"Single shooting stalled: no Newton step reduces its residual, and it misses the goal by {single['miss']:.1f} m. "
+        "Single shooting stalled: no Newton step reduces its residual, and it misses the goal by "
+        f"{single['miss']:.1f} m. "
         if ended[0]
         else f"Single shooting misses the goal by {single['miss']:.1f} m, because a change of the initial costate is "
         "amplified along the horizon. "

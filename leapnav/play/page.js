@@ -169,7 +169,7 @@ document.addEventListener("keydown", (event) => {
   if (byId("keys").open) byId("keys").scrollIntoView({ block: "nearest" });
 });
 
-const observer = new ResizeObserver(draw);
+const observer = new ResizeObserver(resize);
 observer.observe(canvas);
 observer.observe(byId("plots"));
 

@@ -7,7 +7,9 @@ const MAX_HISTORY = 200; // changes that can be undone
 const MAX_LATENCIES = 500;
 
 const byId = (id) => document.getElementById(id);
-const setText = (id, value) => (byId(id).textContent = value);
+const setText = (id, value) => {
+  if (byId(id).textContent !== value) byId(id).textContent = value;
+};
 const format = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
 // What the page shows. It is a property of `window` so that tests and the console can read it.
@@ -32,7 +34,7 @@ const play = (window.play = {
   latencies: [], // ms from a pointer move to the drawing of the followed optimum
 });
 let drag = null, following = false, searching = false, changed = false, searchTimer = null, revision = 0;
-let moveTime = null; // time of the pointer move whose optimum is not drawn yet (ms)
+let moveTime = null; // time (ms) of the first pointer move that is in no request yet
 
 // ---- Requests
 

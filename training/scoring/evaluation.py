@@ -85,7 +85,7 @@ class FunctionPolicy:
     def _action(self, observation: Any) -> np.ndarray:
         action = np.asarray(self._function(observation), dtype=np.float32)
         if action.shape != (2,) or not np.isfinite(action).all():
-            raise ValueError(f"policy: expected two finite numbers from the function, got {action!r}")
+            raise ValueError(f"policy: expected two finite numbers from the function, got {action.tolist()}")
         return action
 
 

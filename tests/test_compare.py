@@ -1,0 +1,96 @@
+"""Comparison of one's own methods with the optimum and with other policies."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers import SMALL
+from stable_baselines3 import PPO
+
+from leapnav.cli import main
+from leapnav.envs import ScenarioBank
+from leapnav.experts import ExpertPolicy
+from leapnav.training import (
+    RandomPolicy,
+    compare,
+    evaluate,
+    make_policy,
+    network,
+    plot_episodes,
+    plot_scores,
+    print_scores,
+    write_report,
+)
+
+
+def towards_the_goal(observation):
+    """A policy as a plain function: turn towards the goal and drive at the speed that is needed."""
+    ahead, left, needed = observation[0], observation[1], observation[7]
+    return np.clip([0.5 * needed * math.copysign(1, ahead), math.atan2(left, abs(ahead))], -1, 1)
+
+
+def test_all_kinds_of_policies_are_compared(env, tmp_path):
+    found = compare(
+        {
+            "function": towards_the_goal,
+            "object": RandomPolicy(env.action_space),
+            "class": ExpertPolicy,
+            "factory": lambda env: ExpertPolicy(env, feedback="gains"),
+            "name": "go-to-goal",
+            "other observations": (lambda observation: [0.0, 0.0], {"observation": "state"}),
+            "seeds": [make_policy(env.observation_space, env.action_space, seed, SMALL) for seed in (0, 1)],
+        },
+        "open",
+        count=3,
+        progress=False,
+    )
+    rows = {row.policy: row for row in found.scores()}
+    assert list(rows) == ["function", "object", "class", "factory", "name", "other observations", "seeds"]
+    assert rows["class"].soc.value == pytest.approx(1.0, abs=1e-3) and rows["factory"].success.value == 1.0
+    assert rows["seeds"].runs == 2 and rows["other observations"].success.value == 0.0
+    assert rows["function"].mean_return.value > rows["object"].mean_return.value
+    assert repr(found).startswith("<Comparison: open; SOC: function ")
+    frame = found.to_dataframe()
+    assert len(frame) == 3 * 8 and set(frame.policy) == set(rows)
+    assert frame[frame.policy == "seeds"].run.tolist() == [0, 0, 0, 1, 1, 1]
+    print_scores(found)
+    plot_scores(found, tmp_path / "scores.png")
+    plot_episodes(found.banks, found.runs["function"][0].episodes, tmp_path / "episodes.png")
+    assert write_report(found, tmp_path / "report.html") is found
+    page = (tmp_path / "report.html").read_text()
+    assert "Comparison of policies" in page and "Learning curves" not in page and "<h2>Runs</h2>" not in page
+    assert page.count("data:image/png") == len(rows)
+
+
+def test_a_function_gets_one_observation_at_a_time_and_dictionaries_too():
+    shapes = set()
+
+    def still(observation):
+        shapes.add(observation["goal"].shape)
+        return (0, 0)
+
+    found = evaluate(still, "open", count=2, environment={"dict_observation": True}, progress=False)
+    assert shapes == {(9,)} and found.success == 0.0
+
+
+def test_banks_are_given_in_any_form(env):
+    bank = ScenarioBank.shipped("rooms", "test")
+    policy = RandomPolicy(env.action_space)
+    assert compare({"random": policy}, bank, count=1, progress=False).families == ("rooms",)
+    assert compare(
+        {"random": policy}, [bank, ScenarioBank.shipped("open", "test")], count=1, progress=False
+    ).families == (
+        "rooms",
+        "open",
+    )
+    assert len(compare({"random": policy}, "all", count=1, progress=False).families) == 5
+
+
+def test_the_commands_take_models_of_stable_baselines3(env, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    PPO("MlpPolicy", env, policy_kwargs=network(SMALL), device="cpu").save("model.zip")
+    assert main(["evaluate", "mine=model.zip", "expert", "--family", "open", "--count", "2"]) == 0
+    assert "mine" in capsys.readouterr().out
+    assert main(["report", "model.zip", "--family", "open", "--count", "2", "--out", "page.html"]) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert "model.zip" in page and "go-to-goal" in page and "Learning curves" not in page
