@@ -13,12 +13,12 @@ from typing import Any
 import tyro
 
 from leapnav.commands.bank import Bank
-from leapnav.commands.compile import Compile
-from leapnav.commands.completion import Completion
 from leapnav.commands.demo import Demo
-from leapnav.commands.doctor import Doctor
 from leapnav.commands.evaluate import Evaluate
 from leapnav.commands.export import Export
+from leapnav.commands.installation.compile import Compile
+from leapnav.commands.installation.completion import Completion
+from leapnav.commands.installation.doctor import Doctor
 from leapnav.commands.play import Play
 from leapnav.commands.report import Report
 from leapnav.commands.rollout import Rollout

@@ -373,7 +373,7 @@ def test_episodes_are_drawn_from_the_bank_by_the_seed(bank):
     ("arguments", "error", "message"),
     [
         ({"split": "validation"}, ValueError, "split: expected one of train, test, fresh, got 'validation'"),
-        ({"split": "test", "bank": "x.bank"}, ValueError, "bank: cannot be combined with split"),
+        ({"split": "test", "bank": "x.bank"}, ValueError, "split: cannot be combined with bank"),
         ({"bank": "x.bank"}, FileNotFoundError, "x.bank: no such bank"),
     ],
 )

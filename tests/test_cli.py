@@ -104,10 +104,10 @@ def test_solve_without_a_solution_is_exit_code_1(method, tmp_path, capsys):
     ("content", "expected"),
     [
         ("{", "not valid JSON"),
-        (json.dumps(scenario_fields(horizon=-1)), "horizon: input should be greater than 0, got -1"),
-        (json.dumps(scenario_fields(colour="red")), "colour: extra inputs are not permitted, got 'red'"),
+        (json.dumps(scenario_fields(horizon=-1)), "horizon: expected a number > 0, got -1"),
+        (json.dumps(scenario_fields(colour="red")), "colour: unknown field, got 'red'"),
         (json.dumps(scenario_fields(start=[4.0, 4.5, 0])), "start: (4, 4.5) is inside obstacles[0]"),
-        (json.dumps(scenario_fields(horizon=float("nan"))), "horizon: input should be a finite number, got nan"),
+        (json.dumps(scenario_fields(horizon=float("nan"))), "horizon: expected a finite number, got nan"),
         ("\xff\xfe", "not valid JSON"),
         ("[]", "a scenario is a JSON object, got []"),
     ],

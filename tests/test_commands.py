@@ -22,7 +22,7 @@ def test_watch_films_the_policy(tmp_path, capsys, monkeypatch):
     arguments = ["watch", "--family", "rooms", "--index", "11", "--episodes", "2", "--video", str(video)]
     assert main(arguments) == 0
     first, second, last = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"rooms-1-11: success after [\d.]+ s, cost [\d.]+, optimum [\d.]+", first)
+    assert re.fullmatch(r"rooms-1-11: success after [\d.]+ s, cost [\d.]+, optimum for the pose reached [\d.]+", first)
     assert second.startswith("rooms-1-12: success")
     assert last == f"wrote {video}"
     frames = iio.imread(video)
@@ -58,7 +58,7 @@ def test_closing_the_window_ends_the_watching(capsys, monkeypatch):
         (["--video", "film.mp4", "--index", "199"], "index: the bank has scenarios 0 to 199, got 199 to 201"),
         (["--video", "film.mp4", "--index", "3", "--split", "fresh"], "index: fresh scenarios have no index"),
         (["--video", "film.mp4", "--episodes", "0"], "episodes: expected at least 1, got 0"),
-        (["--video", "film.mp4", "--family", "maze"], "family: expected one of open, .*got 'maze'"),
+        (["--video", "film.mp4", "--family", "maze"], "--family: expected one of open, .*got 'maze'"),
         (["--video", "film.mp4", "--policy", "nowhere"], "nowhere: no such policy"),
         (["--video", "film.mp4", "--disturbance", "-1"], "disturbance: expected a number >= 0, got -1.0"),
     ],
@@ -115,7 +115,7 @@ def test_what_is_compiled_is_not_compiled_again(tmp_path, capsys):
 COMPILING = """
 import sys
 from leapnav.cli import main
-from leapnav.commands import compile
+from leapnav.commands.installation import compile
 from leapnav.envs.kernels import compilation
 from leapnav.envs.simulation.arcs import arc_point, sinc
 

@@ -13,6 +13,7 @@ from leapnav.cli import parse
 from leapnav.envs import Scenario
 
 ROOT = Path(__file__).parent.parent
+CHECK_LINKS = ROOT / "scripts" / "check_links.py"
 README = (ROOT / "README.md").read_text()
 BANK = r"rooms-1-7 (\d+\.\d+)\n200 \1\d* \(\d+, 3\)( \(\d+, 3\))?\n"
 NUMBER = r"\d+\.\d+(e-\d+)?"
@@ -31,10 +32,14 @@ BLOCKS = [
 # What the pages print; the blocks of a page build on each other.
 PRINTED = {
     "banks.md": BANK,
-    "index.md": rf"{NUMBER} {NUMBER}\nRolloutSummary\(demonstrations=50, .*\)\n{RATE}\n",
+    "index.md": rf"True {NUMBER} times the optimal cost\nRolloutSummary\(demonstrations=50, .*\)\n{RATE}\n"
+    r"True 3 True\n",
     "training.md": r"20 True\n1\n2 True\n",
     "tutorial.md": rf"True {NUMBER} 0\.3106\d+\n\[5\.2072\d+, .*\]\nTrue 1\.0000\d*\n"
     rf"RolloutSummary\(demonstrations=50, .*\)\n{NUMBER} {RATE} {RATE} 0\.00\d*\n{RATE}\n",
+    "guides/compare.md": r"(.*\n)* expert +100\.0 +0\.0 +1\.000 (.*\n)*1\.0\n3\n",
+    "guides/deploy.md": r"open\.onnx\.json\n0 goal\.ahead m\n(\d .*\n){8}9 lidar\[0\], .*\n"
+    r"\['speed / max_speed', 'turn_rate / max_turn_rate'\]\nTrue\n",
     "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
     "guides/obstacles.md": rf"True {NUMBER}\n8 4 True\nrooms-3\n",
     "guides/robots.md": r"1\.7322 \[ 4\. +1\. +-?0\. +-0\.2402\] \[-0\.7902 -0\.2627 +0\.0862 +-?0\. *\]\n",
@@ -80,9 +85,8 @@ def test_every_command_that_the_pages_show_is_one():
     for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
         text = path.read_text().replace("\\\n", " ")
         for line in re.findall(r"^    .*?(leapnav [^`\n]*)", text, re.MULTILINE):
-            if "--tyro-print-completion" in line:
-                continue
-            parse(shlex.split(line.rstrip(" &").replace("$seed", "0"), comments=True)[1:])
+            command = line.partition(" > ")[0].rstrip(" &").replace("$seed", "0")
+            parse(shlex.split(command, comments=True)[1:])
             shown += 1
     assert shown > 30
 
@@ -91,14 +95,82 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr
-    theory, reference, commands = (
-        (tmp_path / page / "index.html").read_text() for page in ("theory", "reference/experts", "reference/cli")
+    checked = subprocess.run([sys.executable, CHECK_LINKS, tmp_path], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    theory, reference, training, commands, changes = (
+        (tmp_path / page / "index.html").read_text()
+        for page in ("theory", "reference/experts", "reference/training", "reference/cli", "changelog")
     )
-    assert "<math" in theory
+    assert theory.count('class="formula formula--') > 50
     assert "arithmatex" not in theory
     for name in ("solve.solve", "find_optimum", "ExpertPolicy", "rollout"):
         assert f'id="leapnav.experts.{name}"' in reference
+    for row in (("family", "str"), ("index", "int"), ("scenario", "str"), ("states", "ndarray")):
+        assert row in documented(training, "leapnav.training.Episode")
+    assert ("costates", "ndarray") in documented(reference, "leapnav.experts.Extremal")
     assert "usage: leapnav train ppo" in commands
+    assert "::help" not in commands
+    assert 'href="../contributing/"' in changes
+
+
+def documented(page, name):
+    """Return the names and types in the table of attributes or arguments of a class or function."""
+    (section,) = re.findall(rf'<h\d id="{name}".*?</table>', page, re.DOTALL)
+    rows = re.findall(r'<tr class="doc-section-item">\s*<td>(.*?)</td>\s*<td>(.*?)</td>', section, re.DOTALL)
+    return [tuple(re.sub(r"<[^>]*>|\s", "", cell) for cell in row) for row in rows]
+
+
+def test_broken_links_are_found(tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "index.html").write_text('<h1 id="here">Other</h1><a href="../index.html">back</a>')
+    links = ("other/#here", "other/#there", "missing.png", "https://example.org/x", "http:///x", "../outside", "#here")
+    page = "".join(f'<a href="{link}">link</a>' for link in links) + '<img src="missing.png">'
+    (tmp_path / "index.html").write_text(page)
+    done = subprocess.run([sys.executable, CHECK_LINKS, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout.splitlines() == [
+        "index.html: other/#there: no such anchor",
+        "index.html: missing.png: no such file",
+        "index.html: http:///x: not a valid address",
+        "index.html: ../outside: outside the site",
+        "index.html: #here: no such anchor",
+    ]
+
+
+def test_an_entry_of_several_names_is_divided(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    from griffe_docstrings import rewritten
+
+    entries = """Result.
+
+Attributes:
+    family, index: the scenario: its family,
+        and its index.
+    states (N, 3), costs (N,): of the path.
+    achieved, desired (..., 4): poses.
+    cost: J.
+
+        A second paragraph.
+
+Raises:
+    TypeError, ValueError: see `solve`."""
+    assert rewritten(entries).split("\n")[3:] == [
+        "    family: the scenario: its family,",
+        "        and its index.",
+        "    index: the scenario: its family,",
+        "        and its index.",
+        "    states: (N, 3), of the path.",
+        "    costs: (N,), of the path.",
+        "    achieved: (..., 4), poses.",
+        "    desired: (..., 4), poses.",
+        "    cost: J.",
+        "",
+        "        A second paragraph.",
+        "",
+        "Raises:",
+        "    TypeError: see `solve`.",
+        "    ValueError: see `solve`.",
+    ]
 
 
 def test_the_readme_s_scenario_is_valid():

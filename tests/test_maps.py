@@ -76,7 +76,7 @@ def test_a_pose_in_a_blocked_cell_is_refused(rooms):
         Scenario.from_movingai(rooms, **{**POSES, "start": (1.1, 5.5, 0.0)})
     with pytest.raises(ScenarioError, match=r"start: \(-1, 5\.5\) is inside the arena wall"):
         Scenario.from_movingai(rooms, **{**POSES, "start": (-1.0, 5.5, 0.0)})
-    with pytest.raises(ScenarioError, match=r"start\[0\]: input should be a finite number, got nan"):
+    with pytest.raises(ScenarioError, match=r"start\[0\]: expected a finite number, got nan"):
         Scenario.from_movingai(rooms, **{**POSES, "start": (float("nan"), 5.5, 0.0)})
     # Deep in a wall there is no obstacle: nothing can get there, and nothing may begin there.
     rooms.write_text("type octile\nheight 5\nwidth 5\nmap\n@.@.@\n@@@.@\n.@@@@\n@.@@@\n@.@@@\n")

@@ -38,10 +38,10 @@ def test_an_included_policy_acts_the_same_after_the_export(tmp_path, capsys):
     assert [entry["name"] for entry in description["action"]] == ["speed / max_speed", "turn_rate / max_turn_rate"]
 
 
-@pytest.mark.parametrize("arguments", [{}, {"policy_kwargs": network(SMALL)}], ids=["default", "navigation"])
+@pytest.mark.parametrize("arguments", [dict, lambda: {"policy_kwargs": network(SMALL)}], ids=["default", "navigation"])
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_models_of_stable_baselines3_are_exported(algorithm, arguments, env, tmp_path):
-    model = algorithm("MlpPolicy", env, device="cpu", **arguments)
+    model = algorithm("MlpPolicy", env, device="cpu", **arguments())
     export_onnx(model, tmp_path / "model.onnx")
     observations = np.array([env.reset(seed=seed)[0] for seed in range(7)])
     expected, _ = model.predict(observations, deterministic=True)

@@ -1,5 +1,6 @@
 """The server of `leapnav play`, by requests."""
 
+import socket
 from functools import partial
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from play_helpers import SCENARIO, ask_server, fields, served
 
 from leapnav.cli import main
+from leapnav.commands.play import Play
 from leapnav.envs import Scenario
 from leapnav.envs.utils import colors
 from leapnav.experts import find_optimum, find_reached_optimum
@@ -231,6 +233,13 @@ def test_bad_arguments_are_one_line(words, message, capsys):
     assert main(["play", "--no-browser", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_responses_are_not_delayed_by_nagle_s_algorithm():
+    with Play(port=0)._listen() as listener:
+        assert listener.proto == socket.IPPROTO_TCP  # only then does asyncio set TCP_NODELAY
+        with socket.create_connection(listener.getsockname()):
+            listener.accept()[0].close()
 
 
 def test_a_port_in_use_is_told(port, capsys):

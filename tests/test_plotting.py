@@ -155,7 +155,7 @@ def test_rounding_does_not_fill_the_axes_of_the_hamiltonian():
 def test_obstacles_and_bounds_are_drawn_without_the_scenario_too(swept):
     scenario, extremal = swept
     axes = axes_of(plot_extremal(extremal))
-    plane, controls = axes["$y$"], axes["controls"]
+    plane, controls = axes["$y$ (m)"], axes["controls"]
     filled = plane.collections[0].get_paths()
     (x_min, x_max), (y_min, y_max) = plane.get_xlim(), plane.get_ylim()
     centers = [obstacle.circle.center for obstacle in scenario.obstacles]

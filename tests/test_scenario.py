@@ -101,7 +101,7 @@ FAULTS = [
     ({"horizon": "12"}, "horizon", "'12'"),
     ({"horizon": True}, "horizon", "True"),
     ({"start": [1.0, math.nan, 0.0]}, "start[1]", "nan"),
-    ({"start": [1.0, 1.0]}, "start", "required"),
+    ({"start": [1.0, 1.0]}, "start", "missing"),
     ({"start": [1.0, 1.0, None]}, "start[2]", "None"),
     ({"start": [4.0, 4.6, 0.0]}, "start", "(4, 4.6) is inside obstacles[0] (clearance -0.95 m)"),
     ({"start": [6.5, 3.7, 0.0]}, "start", "obstacles[1]"),
@@ -113,8 +113,8 @@ FAULTS = [
     ({"robot": {"model": "car"}}, "robot.model", "'car'"),
     ({"robot": {"radius": 0}}, "robot.radius", "got 0"),
     ({"cost": {"proximity_scale": 0.0}}, "cost.proximity_scale", "got 0.0"),
-    ({"self": 1}, "self", "not permitted"),
-    ({"two\nlines": 1}, "two lines", "not permitted"),
+    ({"self": 1}, "self", "unknown field"),
+    ({"two\nlines": 1}, "two lines", "unknown field"),
     ({"cost": {"turn_weight": -1}}, "cost.turn_weight", "-1"),
     ({"obstacles": [{}]}, "obstacles[0]", "exactly one"),
     ({"obstacles": [{**square(5, 5), "circle": {"center": [5, 5], "radius": 1}}]}, "obstacles[0]", "exactly one"),
@@ -158,5 +158,5 @@ def test_text_that_is_no_scenario_is_told_in_one_line(text):
 def test_a_missing_field_is_named():
     fields = scenario_fields()
     del fields["goal"]
-    with pytest.raises(ScenarioError, match=r"Scenario 'small': goal: field required"):
+    with pytest.raises(ScenarioError, match=r"Scenario 'small': goal: missing"):
         Scenario.from_json(json.dumps(fields))

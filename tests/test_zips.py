@@ -41,9 +41,9 @@ def rewritten(path, name, change):
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C, *OFF_POLICY])
-@pytest.mark.parametrize("arguments", [{}, {"policy_kwargs": network(SMALL)}], ids=["default", "navigation"])
+@pytest.mark.parametrize("arguments", [dict, lambda: {"policy_kwargs": network(SMALL)}], ids=["default", "navigation"])
 def test_a_model_is_loaded_without_executing_it_and_acts_the_same(algorithm, arguments, env, observations, tmp_path):
-    model = make(algorithm, env, **arguments)
+    model = make(algorithm, env, **arguments())
     model.save(tmp_path / "model.zip")
     # Every pickled object is replaced by one that cannot be loaded.
     rewritten(tmp_path / "model.zip", "data", without_pickles)

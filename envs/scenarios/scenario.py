@@ -400,7 +400,8 @@ def _fault(details: ErrorDetails) -> str:
     location, context, kind = details["loc"], details.get("ctx", {}), details["type"]
     path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".")
     if kind == "extra_forbidden":
-        return f"{path}: unknown field{suggestion(location[-1], _known_fields(location[:-1]))}"
+        hint = suggestion(location[-1], _known_fields(location[:-1]))
+        return f"{path}: unknown field, got {_shorten(details['input'])}{hint}"
     if kind == "missing":
         return f"{path}: missing"
     if kind in ("too_long", "tuple_too_long"):

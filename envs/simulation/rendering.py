@@ -193,12 +193,21 @@ def _draw_status(canvas: pygame.Surface, scene: Scene, top: int) -> None:
     texts = [f"time left {left:.1f} s", f"cost {scene.cost:.2f}"]
     if scene.reference_cost is not None:
         texts.append(f"optimum {scene.reference_cost:.2f}")
-    font = _font(max(10, min(20, canvas.get_width() // 28)))
+    size = max(10, min(20, canvas.get_width() // 28))
     column = canvas.get_width() / len(texts)
     for number, text in enumerate(texts):
-        image = font.render(text, True, OPTIMUM if number == 2 else WALL)
+        image = _text(text, size, OPTIMUM if number == 2 else WALL)
         position = column * (number + 0.5) - image.get_width() / 2, top + (STATUS_HEIGHT - image.get_height()) / 2
         canvas.blit(image, position)
+
+
+def _text(text: str, size: int, color: str) -> pygame.Surface:
+    """Return a picture of a text."""
+    try:
+        return _font(size).render(text, True, color)
+    except pygame.error:  # another program part has called pygame.quit(), which invalidates the fonts
+        _font.cache_clear()
+        return _font(size).render(text, True, color)
 
 
 @cache

@@ -103,7 +103,7 @@ class Show:
         """Search again, print lower costs, and add the results to the rows."""
         from leapnav.experts.second_opinion import verify_bank
 
-        announce(SECONDS_PER_SECOND_OPINION * len(bank) / self.workers, "searching every scenario again")
+        announce(SECONDS_PER_SECOND_OPINION * len(bank) / max(self.workers, 1), "searching every scenario again")
         opinions = verify_bank(bank, workers=self.workers)
         improved = [opinion for opinion in opinions if opinion.improvement > MIN_IMPROVEMENT]
         for opinion in improved:

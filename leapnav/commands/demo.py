@@ -30,7 +30,7 @@ class Demo:
 
     def run(self) -> int:
         """Run the demo."""
-        from leapnav.commands.compile import compile_missing
+        from leapnav.commands.installation.compile import compile_missing
 
         compile_missing()
         run_demo(self.out)

@@ -66,10 +66,13 @@ class Play:
     def _listen(self) -> socket.socket:
         try:
             family, *_, address = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0]
-            return socket.create_server(address[:2], family=family)
+            listener = socket.create_server(address[:2], family=family)
         except socket.gaierror:
             raise ValueError(f"host: expected an address of this machine, got {self.host!r}") from None
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise ValueError(f"port: {self.port} is in use; --port 0 selects a free one") from None
             raise ValueError(f"host: cannot listen at {self.host!r}: {error.strerror}") from None
+        # asyncio disables Nagle's algorithm only on sockets that name their protocol; with it, a response takes 40 ms
+        # longer.
+        return socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP, fileno=listener.detach())

@@ -163,7 +163,7 @@ function drawLessonPlots(width, height) {
   drawPlot(boxes[1], "Conjugate point (s)", [
     ["minimum", values("conjugate_time", "minimum"), branchColor("minimum")],
     ["saddle", values("conjugate_time", "saddle"), branchColor("saddle")],
-    ["horizon", steps.map(({ horizon }) => horizon), colors.wall, [4, 3]],
+    ["horizon", steps.map(({ horizon }, k) => (k === 0 || k === fold + 1 ? horizon : null)), colors.wall, [4, 3]],
   ], headings, options);
   drawAbscissa(boxes, Math.min(...headings).toFixed(2), Math.max(...headings).toFixed(2), "heading of the goal (rad)", height);
 }

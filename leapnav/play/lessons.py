@@ -302,9 +302,9 @@ def _step(heading: float, branch: str, extremal: Extremal) -> dict[str, Any]:
         text = f"Conjugate point {shown}, horizon {horizon:g} s. {MINIMUM}"
     else:
         text = (
-            f"The second branch of extremals, on the way back from the fold. Its conjugate point, {shown}, is before "
-            f"the horizon of {horizon:g} s: the extremal is a saddle, and paths close to it cost less. Its certificate "
-            f"has the status {extremal.status.name}."
+            "The second branch of extremals, on the way back from the fold. Its conjugate point (the dot), "
+            f"{shown}, is before the horizon of {horizon:g} s: the extremal is a saddle, and paths close to it cost "
+            f"less. Its certificate has the status {extremal.status.name}."
         )
     return _fields(heading, branch, extremal, optimum, time, f"Heading {heading:.2f} rad: a {branch}", text)
 

@@ -197,6 +197,7 @@ function setScenario(scenario) {
 function replaceScenario(scenario) {
   play.scenario = scenario;
   drag = null;
+  play.driving = null;
   play.selected = null;
   play.previousId = null;
   play.solution = null;

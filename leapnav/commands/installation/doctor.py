@@ -47,7 +47,7 @@ class Doctor:
         width = max(map(len, versions))
         for name, number in versions.items():
             print(f"{name:{width}}  {number}", flush=True)
-        from leapnav.commands.compile import compile_missing
+        from leapnav.commands.installation.compile import compile_missing
 
         compile_missing()  # else the first check would seem slow
         checks = []
