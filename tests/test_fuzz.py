@@ -7,7 +7,7 @@ import json
 import numpy as np
 import sympy
 from helpers import scenario_fields
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from leapnav.cli import main, parse
@@ -16,7 +16,10 @@ from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, find_optimum, solve, unicycle, verify
 
 # For cases that take tenths of a second each: they are re-integrated by an independent integrator.
-EXPENSIVE = settings(max_examples=max(10, settings.default.max_examples // 4))
+# How many random scenarios are valid depends on the constants that hypothesis finds in the code.
+EXPENSIVE = settings(
+    max_examples=max(10, settings.default.max_examples // 4), suppress_health_check=[HealthCheck.filter_too_much]
+)
 SMALL_TEXT = st.text(max_size=8)
 NUMBERS = st.one_of(
     st.integers(-(10**6), 10**6),

@@ -3,7 +3,7 @@
 // Drawing of the plane: scenario, paths and robots. All colours come from the server (`play.colors`).
 
 const canvas = byId("view");
-let context = canvas.getContext("2d");
+let context = canvas.getContext("2d", { alpha: false });
 
 // ---- The plane
 
@@ -175,9 +175,10 @@ function prepareCanvas(element) {
     element.width = Math.round(width * ratio);
     element.height = Math.round(height * ratio);
   }
-  context = element.getContext("2d");
+  context = element.getContext("2d", { alpha: false });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.clearRect(0, 0, width, height);
+  context.fillStyle = "white";
+  context.fillRect(0, 0, width, height);
   return [width, height];
 }
 
