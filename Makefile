@@ -38,6 +38,7 @@ types: .venv/installed
 # Into build/site; needs no network once the packages are installed.
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python scripts/check_links.py build/site
 	@echo "wrote build/site/index.html"
 
 bench: .venv/installed

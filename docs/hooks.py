@@ -14,8 +14,9 @@ from formulas import draw_formulas
 from leapnav.cli import main
 
 _HELP = re.compile(r"^::help (.*)$", re.MULTILINE)
-_WIDTH = "100"  # characters
+_WIDTH = "84"  # characters, which fit beside the two menus of a page
 _INCLUDE = re.compile(r"^::include (.*)$", re.MULTILINE)
+_PICTURE = re.compile(r'<img [^>]*?src="([^"]*)"[^>]*>')
 _LINK = re.compile(r"(?<=\]\()(?!https?:|#)([^)#]*)")
 # Pages of the site by the paths of the files of the repository that they show.
 _PAGES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "SECURITY.md": "security.md"}
@@ -61,5 +62,5 @@ def _help(found: re.Match[str]) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Draw the formulas."""
-    return draw_formulas(html)
+    """Draw the formulas, and make each picture a link to itself, because it is small on a phone."""
+    return _PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', draw_formulas(html))

@@ -74,7 +74,7 @@ def main() -> None:
     driven = np.array(poses)
     label = f"learned policy, J = {info['cost']:.3f}"
     plane.plot(driven[:, 0], driven[:, 1], "--", color=POLICY, linewidth=1.8, label=label)
-    for fraction in np.linspace(0.0, 1.0, 9):
+    for fraction in np.linspace(0.0, 1.0, 9)[1:-1]:
         pose = path[round(fraction * 399), :3]
         draw_robot(plane, pose, scenario.robot.radius, OPTIMUM, alpha=0.5)
     plane.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)

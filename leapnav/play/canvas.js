@@ -3,7 +3,7 @@
 // Drawing of the plane: scenario, paths and robots. All colours come from the server (`play.colors`).
 
 const canvas = byId("view");
-let context = canvas.getContext("2d", { alpha: false });
+let context = canvas.getContext("2d");
 
 // ---- The plane
 
@@ -175,10 +175,9 @@ function prepareCanvas(element) {
     element.width = Math.round(width * ratio);
     element.height = Math.round(height * ratio);
   }
-  context = element.getContext("2d", { alpha: false });
+  context = element.getContext("2d");
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.fillStyle = "white";
-  context.fillRect(0, 0, width, height);
+  context.clearRect(0, 0, width, height);
   return [width, height];
 }
 

@@ -165,6 +165,7 @@ canvas.addEventListener("pointerdown", (event) => {
 });
 
 canvas.addEventListener("pointermove", (event) => {
+  if (!event.isPrimary) return;
   if (!drag) {
     if (canEdit()) canvas.style.cursor = findHandle(clientPoint(event), event.pointerType) ? "grab" : "default";
     return;
@@ -189,8 +190,8 @@ canvas.addEventListener("pointerup", (event) => {
 });
 
 for (const name of ["pointerup", "pointercancel"]) {
-  canvas.addEventListener(name, () => {
-    if (!drag) return;
+  canvas.addEventListener(name, (event) => {
+    if (!drag || !event.isPrimary) return;
     drag = null;
     if (!play.searched) scheduleSearch();
   });

@@ -25,7 +25,9 @@ def play_policy(scenario: Scenario, policy: str) -> dict[str, Any]:
         policy: name or directory of the policy, see `leapnav.training.scoring.policy_specs`.
 
     Returns:
-        The path and the outcome, see `_describe`.
+        A dictionary: `policy`, `states` (x, y (m), heading (rad)) at intervals of `period` (s), `time` (s) of the last
+        state, `success`, `collision`, `stopped` (whether the episode ended early without a collision), `cost`, and
+        `regret` of a success, see the function `regret`.
 
     Raises:
         ValueError: the horizon is too long.
@@ -50,7 +52,7 @@ def replay_actions(scenario: Scenario, actions: Any) -> dict[str, Any]:
             that ends before the horizon ends the episode as `stopped`.
 
     Returns:
-        The path and the outcome, see `_describe`.
+        As `play_policy`; `policy` is "you".
 
     Raises:
         ValueError: the horizon is too long, or the actions are invalid.
@@ -106,7 +108,7 @@ def _play(scenario: Scenario, env: Any, act: Any) -> dict[str, Any]:
 def _describe(
     scenario: Scenario, info: dict[str, Any], states: list[list[float]], done: bool, period: float
 ) -> dict[str, Any]:
-    """Return the path (`states`, one per `period` (s)), `success`, `collision`, `stopped`, `cost` and `regret`."""
+    """Return the content of a response, see `play_policy`."""
     success = done and bool(info["is_success"])
     return {
         "states": states,

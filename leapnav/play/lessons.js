@@ -105,8 +105,7 @@ function showLesson() {
     line(cells("th", header)),
     ...rows.map(([color, ...values]) => {
       const elements = cells("td", values);
-      elements[0].style.color = color;
-      elements[0].style.fontWeight = "600";
+      elements[0].style.borderLeftColor = color;
       return line(elements);
     }),
   );

@@ -52,6 +52,7 @@ LOST_HEADING = -0.25  # rad, beyond the fold
 FOLD_TOLERANCE = 1e-4  # rad
 FOLD_DISTANCE = 0.01  # rad from the fold at which the second branch is found
 SAME_BRANCH = 0.05  # largest change of the cost per step along a branch
+MINIMUM = "No conjugate point lies before the horizon, so the extremal is a local minimum (Jacobi's condition)."
 EXTENSION = 2.0  # the extremal is continued to this multiple of the horizon, to find its conjugate point
 
 
@@ -236,9 +237,6 @@ def follow_minimum() -> dict[str, Any]:
     steps.append(_lost_step(last))
     steps += [_step(heading, "saddle", extremal) for heading, extremal in saddles]
     return {"title": "A conjugate point: how a local minimum is lost", "scenario": steps[0]["scenario"], "steps": steps}
-
-
-MINIMUM = "No conjugate point lies before the horizon, so the extremal is a local minimum (Jacobi's condition)."
 
 
 def _resolve(heading: float, guess: Extremal) -> Extremal:

@@ -63,7 +63,7 @@ function alternativeRow(row, i, path) {
   for (const cell of [format(row.cost, 4), excess, format(row.clearance, 3), row.driving.join(", ")]) {
     element.appendChild(document.createElement("td")).textContent = cell;
   }
-  element.firstChild.style.color = i ? alternativeColor(i - 1) : play.colors.optimum;
+  element.firstChild.style.borderLeftColor = i ? alternativeColor(i - 1) : play.colors.optimum;
   element.tabIndex = 0;
   const highlight = () => {
     play.highlighted = i;

@@ -1,0 +1,67 @@
+"""Draw the figures of the README and the documentation that show scenarios, optima and episodes.
+
+python scripts/draw_figures.py            # writes docs/images/*.png, except overview, play and curves
+"""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from leapnav.envs import FAMILIES, NavigateEnv, ScenarioBank, sample_scenario
+from leapnav.envs.utils.colors import OPTIMUM
+from leapnav.experts import ExpertPolicy, find_optimum, plot_extremal, solve
+from leapnav.experts.plotting import draw_scenario
+from leapnav.training import evaluate, load_policy, plot_episodes, policy_environment
+
+IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
+FAMILY_ROWS, FAMILY_INDICES = 3, (0, 1, 2)
+# Family, index in the test bank, and number of steps of the expert, of the three frames.
+FRAMES = (("clutter", 7, 124), ("polygons", 0, 110), ("slalom", 0, 364))
+
+
+def draw_families() -> None:
+    """Draw three test scenarios of each family with their optima."""
+    figure = Figure(figsize=(10.4, 6.5), layout="constrained")
+    axes = figure.subplots(FAMILY_ROWS, len(FAMILIES))
+    for column, family in enumerate(FAMILIES):
+        bank = ScenarioBank.shipped(family, "test")
+        axes[0, column].set_title(family)
+        for row, index in enumerate(FAMILY_INDICES):
+            draw_scenario(axes[row, column], bank[index])
+            axes[row, column].plot(*bank.states(index)[:, :2].T, color=OPTIMUM, linewidth=1.5)
+    figure.savefig(IMAGES / "families.png", dpi=100)
+
+
+def draw_frames() -> None:
+    """Draw frames of three episodes of the expert in progress."""
+    frames = []
+    for family, index, steps in FRAMES:
+        env = NavigateEnv(family, split="test", render_mode="rgb_array")
+        observation, _ = env.reset(options={"index": index})
+        expert = ExpertPolicy(env)
+        for _ in range(steps):
+            observation, *_ = env.step(expert.predict(observation)[0])
+        frame = env.render()
+        assert frame is not None
+        frames.append(frame)
+    figure = Figure(figsize=(18, 6.4))
+    figure.figimage(np.concatenate(frames, axis=1))
+    figure.savefig(IMAGES / "frames.png", dpi=100)
+
+
+def main() -> None:
+    """Write all figures."""
+    draw_families()
+    draw_frames()
+    scenario = sample_scenario("clutter", 910065)
+    plot_extremal(find_optimum(scenario), IMAGES / "solution.png", scenario)
+    scenario = sample_scenario("clutter", 9)
+    plot_extremal(solve(scenario, method="leapfrog", polish=False), IMAGES / "leapfrog.png", scenario)
+    bank = ScenarioBank.shipped("clutter", "test")
+    evaluation = evaluate(load_policy("clutter"), bank, environment=policy_environment("clutter"), timed=False)
+    plot_episodes([bank], evaluation.episodes, IMAGES / "episodes.png")
+
+
+if __name__ == "__main__":
+    main()
