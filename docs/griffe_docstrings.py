@@ -5,7 +5,10 @@ The docstrings list several names in one entry and write shapes after the names:
     states (N, 3), controls (N, 2): rows of the path.
 
 Griffe reads one name per entry and takes the text in parentheses for a type. This extension rewrites such an entry as
-one entry per name, with the shape in the description. The types then come from the annotations in the code. The asterisk of J*, which Markdown takes for emphasis, is escaped.
+one entry per name, with the shape in the description. The types then come from the annotations in the code.
+
+Docstrings of the fields of a dataclass become rows of one table, instead of a heading each. The asterisk of J*, which
+Markdown takes for emphasis, is escaped.
 """
 
 import re
@@ -26,7 +29,51 @@ class OneRowPerName(griffe.Extension):
 
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         """Rewrite the docstrings of all objects of a package."""
+        described = [found for found in _classes(pkg) if _own_fields(found)]
+        sections = [_attributes_section(found) for found in described]
+        for found, section in zip(described, sections, strict=True):
+            text = found.docstring.value if found.docstring else ""
+            found.docstring = griffe.Docstring(
+                f"{text}\n\n{section}",
+                parent=found,
+                parser=found.docstring.parser if found.docstring else None,
+                parser_options=found.docstring.parser_options if found.docstring else None,
+            )
+            for field in _own_fields(found):
+                field.docstring = None  # else it has a heading of its own
         _rewrite(pkg)
+
+
+def _classes(found: griffe.Object) -> list[griffe.Class]:
+    """Return the classes in an object, at any depth."""
+    classes = []
+    for member in found.members.values():
+        if not member.is_alias:
+            classes += ([member] if isinstance(member, griffe.Class) else []) + _classes(member)
+    return classes
+
+
+def _own_fields(found: griffe.Class) -> list[griffe.Attribute]:
+    """Return the fields of a dataclass that have a docstring each, without those of its bases."""
+    if not any("dataclass" in str(decorator.value) for decorator in found.decorators):
+        return []
+    return [
+        member
+        for member in found.members.values()
+        if isinstance(member, griffe.Attribute) and member.docstring is not None and "property" not in member.labels
+    ]
+
+
+def _attributes_section(found: griffe.Class) -> str:
+    """Return a section with the docstrings of the fields of a dataclass and of its bases."""
+    fields = {field.name: field for base in reversed(found.mro()) for field in _own_fields(base)}
+    fields |= {field.name: field for field in _own_fields(found)}
+    lines = ["Attributes:"]
+    for name, field in fields.items():
+        assert field.docstring is not None
+        first, *others = field.docstring.value.split("\n")
+        lines += [f"{_INDENT}{name}: {first}", *(f"{2 * _INDENT}{line}" for line in others)]
+    return "\n".join(lines)
 
 
 def _rewrite(found: griffe.Object) -> None:

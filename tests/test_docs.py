@@ -1,6 +1,7 @@
 import io
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import warnings
@@ -8,12 +9,16 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
+import yaml
 
+import leapnav
 from leapnav.cli import parse
 from leapnav.envs import Scenario
 
 ROOT = Path(__file__).parent.parent
 CHECK_LINKS = ROOT / "scripts" / "check_links.py"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PHONE = {"width": 390, "height": 844}
 README = (ROOT / "README.md").read_text()
 BANK = r"rooms-1-7 (\d+\.\d+)\n200 \1\d* \(\d+, 3\)( \(\d+, 3\))?\n"
 NUMBER = r"\d+\.\d+(e-\d+)?"
@@ -27,6 +32,7 @@ BLOCKS = [
     r"True\n",
     BANK,
     r"True 1\.\d+\n",
+    r"(.*\n)* expert +100\.0 +0\.0 +1\.000 (.*\n)*",
     r"(6\.233154049\n){4}certified: .*\[4\.993.* 6\.258.*\]\n",
 ]
 # What the pages print; the blocks of a page build on each other.
@@ -108,9 +114,29 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     for row in (("family", "str"), ("index", "int"), ("scenario", "str"), ("states", "ndarray")):
         assert row in documented(training, "leapnav.training.Episode")
     assert ("costates", "ndarray") in documented(reference, "leapnav.experts.Extremal")
+    assert ("max_failures", "int") in documented(training, "leapnav.training.DAggerConfig")
     assert "usage: leapnav train ppo" in commands
     assert "::help" not in commands
     assert 'href="../contributing/"' in changes
+    if CHROMIUM is not None:
+        assert check_in_the_browser(tmp_path) == []
+
+
+def check_in_the_browser(site):
+    """Return the pages that are wider than a phone, or that send requests to other places."""
+    from playwright.sync_api import sync_playwright
+
+    found = []
+    with sync_playwright() as driver:
+        page = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]).new_page(viewport=PHONE)
+        page.on("request", lambda request: request.url.startswith("http") and found.append(request.url))
+        for path in sorted(site.rglob("index.html")):
+            page.goto(path.as_uri())
+            width = page.evaluate("document.documentElement.scrollWidth")
+            if width > PHONE["width"]:
+                found.append(f"{path.relative_to(site)} is {width} pixels wide")
+        page.context.browser.close()
+    return found
 
 
 def documented(page, name):
@@ -171,6 +197,14 @@ Raises:
         "    TypeError: see `solve`.",
         "    ValueError: see `solve`.",
     ]
+
+
+def test_the_citation_names_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == leapnav.__version__
+    page = (ROOT / "docs" / "citing.md").read_text()
+    assert f"version = {{{leapnav.__version__}}}" in page
+    assert f"url     = {{{citation['url']}}}" in page
 
 
 def test_the_readme_s_scenario_is_valid():
