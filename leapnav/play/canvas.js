@@ -181,7 +181,9 @@ function prepareCanvas(element) {
   return [width, height];
 }
 
+const PLOT_INTERVAL = 100; // ms between two drawings of the plots during a drag, which leaves more time for the plane
 let plotted = []; // what the plots show
+let plotTime = 0; // ms, of their last drawing
 
 function draw() {
   const [width, height] = prepareCanvas(canvas);
@@ -191,7 +193,9 @@ function draw() {
   const shown = [shownPath(), lesson && lesson.content, lesson && lesson.step, driving !== null, time, searched,
     highlighted, byId("show-optimum").checked, unit, plots.clientWidth, plots.clientHeight, window.devicePixelRatio];
   if (shown.length === plotted.length && shown.every((value, i) => value === plotted[i])) return;
+  if (drag !== null && performance.now() - plotTime < PLOT_INTERVAL) return;
   plotted = shown;
+  plotTime = performance.now();
   drawPlots(...prepareCanvas(plots));
 }
 
