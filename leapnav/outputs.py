@@ -81,5 +81,5 @@ def write_json(content: Any, path: Path | None) -> None:
     if path == STDOUT:
         print(encode(content), file=_json_stream.get() or sys.stdout)
         return
-    path.write_text(encode(content) + "\n")  # not atomic: it may be a pipe or a device
+    path.write_text(encode(content) + "\n", encoding="utf-8")  # not atomic: it may be a pipe or a device
     print(f"wrote {path}")

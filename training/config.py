@@ -13,7 +13,9 @@ from leapnav.deprecated import renamed_fields
 
 # Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start; a sub-table
 # with the name of a family contains the changes for this family.
-_DEFAULTS: dict[str, Any] = tomllib.loads(files("leapnav.training").joinpath("defaults.toml").read_text())
+_DEFAULTS: dict[str, Any] = tomllib.loads(
+    files("leapnav.training").joinpath("defaults.toml").read_text(encoding="utf-8")
+)
 
 
 # A literal, so that the command line shows and completes the choices; a test compares it with `FAMILIES`.
@@ -324,7 +326,7 @@ def read_config(folder: Path) -> tuple[str, RunConfig]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run in this directory")
     try:
-        stored: dict[str, Any] = json.loads(path.read_text())["config"]
+        stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         algorithm = "sac" if stored["algorithm"] == "tqc" else str(stored["algorithm"])
         return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
             {name: value for name, value in stored.items() if name != "algorithm" or algorithm == "sac"}

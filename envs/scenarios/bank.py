@@ -129,13 +129,29 @@ class ScenarioBank(Sequence[Scenario]):
         drawn: number of scenarios drawn, admitted or not.
         rejected: number of scenarios that were not admitted, by reason.
         software: version of leapnav that built the bank.
-        costs (n,), second_costs (n,), certificates (n, 4), draws (n,), tasks (n, 11): see the module.
+        costs (n,): optimal costs J*.
+        second_costs (n,): costs of the second-best local optima found, NaN if there is none.
+        certificates (n, 4): boundary residual, defect, drift of H, clearance (m).
+        draws (n,): indices of the random draws that produced the scenarios.
+        tasks (n, 11): start (3), goal (3, heading NaN if free), horizon, limits (2), weights (2).
 
     Raises:
         FileNotFoundError: there is no such file.
         BankError: the file is not a bank, is damaged, or has another format version.
 
     """
+
+    path: Path
+    family: str
+    software: str
+    seed: int
+    drawn: int
+    rejected: dict[str, int]
+    costs: np.ndarray
+    second_costs: np.ndarray
+    certificates: np.ndarray
+    draws: np.ndarray
+    tasks: np.ndarray
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).absolute()  # independent of the working directory, which differs between processes
@@ -159,7 +175,7 @@ class ScenarioBank(Sequence[Scenario]):
                 locations = {name: _locate(file[name], name) for name in _TYPES}
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
             self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
-            self.rejected: dict[str, int] = dict(json.loads(attributes["rejected"]))
+            self.rejected = dict(json.loads(attributes["rejected"]))
             content = np.asarray(np.memmap(self.path, dtype="u1", mode="r"))
             arrays = {
                 name: content[start : start + size].view(_TYPES[name]).reshape(shape)

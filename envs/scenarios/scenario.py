@@ -220,7 +220,7 @@ class Scenario(_Frozen):
         """Return the scenario as JSON text, and write it to `path` if one is given."""
         text = json.dumps(self.to_dict())
         if path is not None:
-            Path(path).write_text(text + "\n")
+            Path(path).write_text(text + "\n", encoding="utf-8")
         return text
 
     def to_dict(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
-        with partial.open("rb") as file:
+        with partial.open("r+b") as file:  # Windows synchronises only files that are open for writing
             os.fsync(file.fileno())
         partial.replace(path)
     except BaseException as error:
@@ -42,7 +42,7 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
 def write_text(target: str | os.PathLike[str], text: str) -> None:
     """Write a text file atomically, see `atomic_path`."""
     with atomic_path(target) as partial:
-        partial.write_text(text)
+        partial.write_text(text, encoding="utf-8")
 
 
 def digest(path: str | os.PathLike[str]) -> str:

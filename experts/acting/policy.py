@@ -34,6 +34,8 @@ class NoOptimumError(RuntimeError):
 
     """
 
+    scenario: Scenario
+
     def __init__(self, message: str, scenario: Scenario) -> None:
         super().__init__(message)
         self.scenario = scenario

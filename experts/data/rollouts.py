@@ -217,7 +217,7 @@ def _finished(directory: Path, settings: dict[str, Any]) -> RolloutSummary | Non
     if not record_file.is_file() or (directory / WORK).exists() or not (directory / "leapnav").is_dir():
         return None
     try:
-        record = json.loads(record_file.read_text())
+        record = json.loads(record_file.read_text(encoding="utf-8"))
         summary = RolloutSummary(**record.pop("summary"))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{record_file}: damaged: {error!r}") from None

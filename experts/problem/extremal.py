@@ -42,6 +42,9 @@ class SolveError(RuntimeError):
 
     """
 
+    extremal: Extremal
+    name: str
+
     def __init__(self, extremal: Extremal, name: str = "") -> None:
         super().__init__(f"{name}{': ' if name else ''}{extremal.status.name}: {extremal.status.value}")
         self.extremal, self.name = extremal, name

@@ -75,7 +75,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
     settings = settings or DemoSettings()
     out.mkdir(parents=True, exist_ok=True)
     record, content = out / "settings.json", encode(asdict(settings), indent=1) + "\n"
-    if record.exists() and record.read_text() != content:
+    if record.exists() and record.read_text(encoding="utf-8") != content:
         raise ValueError(f"{out}: contains results of other settings; remove it or choose another directory")
     write_text(record, content)
 

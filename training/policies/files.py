@@ -115,7 +115,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; {folder} is not the directory of a policy")
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     try:
         description = json.loads(text)
         found = description["format"]

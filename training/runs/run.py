@@ -95,7 +95,7 @@ class Run:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such run to resume")
         try:
-            stored: dict[str, Any] = json.loads(path.read_text())["config"]
+            stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
         missing = sorted(set(self._settings) - set(stored))
@@ -165,7 +165,7 @@ class Run:
             "evaluations": len(self.evaluations),
         }
         # Not `encode`: NaN in the progress has to be restored as NaN.
-        (partial / "manifest.json").write_text(json.dumps(manifest) + "\n")
+        (partial / "manifest.json").write_text(json.dumps(manifest) + "\n", encoding="utf-8")
         old = self.folder / ".checkpoint-old"
         shutil.rmtree(old, ignore_errors=True)
         if current.exists():
@@ -192,10 +192,10 @@ class Run:
         if not folder.exists():
             return None
         try:
-            manifest = json.loads((folder / "manifest.json").read_text())
+            manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
             digests, progress = dict(manifest["files"]), dict(manifest["progress"])
             self._seconds_before, count = float(manifest["seconds"]), int(manifest["evaluations"])
-            lines = (self.folder / "evaluations.jsonl").read_text().splitlines() if count else []
+            lines = (self.folder / "evaluations.jsonl").read_text(encoding="utf-8").splitlines() if count else []
             self.evaluations = [json.loads(line) for line in lines[:count]]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{folder}: a damaged checkpoint: {error}") from None

@@ -136,7 +136,9 @@ def _write_page(
     families = comparison.families
     scores = comparison.scores()
     environment = Environment(autoescape=True, undefined=StrictUndefined)
-    template = environment.from_string(files("leapnav.training.scoring").joinpath("report.html.jinja").read_text())
+    template = environment.from_string(
+        files("leapnav.training.scoring").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    )
     page = template.render(
         title=_title(records),
         version=leapnav.__version__,
@@ -185,8 +187,8 @@ def _read_run(spec: PolicySpec) -> _RunRecord:
     folder = Path(spec.name)
     _, config = read_config(folder)
     try:
-        record = json.loads((folder / "config.json").read_text())
-        lines = (folder / "evaluations.jsonl").read_text().splitlines()
+        record = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        lines = (folder / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
         return _RunRecord(spec, config, record, [json.loads(line) for line in lines])
     except ValueError as error:
         raise ValueError(f"{folder / 'evaluations.jsonl'}: damaged: {error}") from None
