@@ -134,7 +134,7 @@ def feedback(family: str, law: str) -> Work:
 
 
 def rows() -> dict[str, Callable[[], Work]]:
-    """All rows: what prepares each, which returns its work."""
+    """Functions that prepare the work of each row and return it, by the name of the row."""
     return {
         **{name: lambda given=given: environment_steps(*given) for name, given in ENVIRONMENTS.items()},
         **{f"find_optimum, {family}": lambda family=family: optima(family) for family in FAMILIES},

@@ -163,7 +163,7 @@ def find_reached_optimum(
 
     Args:
         scenario: the scenario of the episode.
-        pose: the last pose of the episode: x, y (m), heading (rad, in any turn).
+        pose: the last pose of the episode: x, y (m), heading (rad; any winding).
         cost: the cost of the episode.
         guess: the optimum of the scenario; without it the full search is made.
 

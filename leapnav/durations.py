@@ -1,4 +1,4 @@
-"""Rough durations of long commands, stated before they begin.
+"""Estimates of the durations of long commands, printed before they start.
 
 The rates were measured on a machine with two cores without a GPU. They differ by a factor of about 2 between machines.
 """
@@ -18,7 +18,7 @@ MIN_ANNOUNCED = 60.0  # s; shorter work is not announced
 
 
 def announce(seconds: float, what: str) -> None:
-    """Print about how long some work takes, if that is more than a minute."""
+    """Print an estimate of the duration of some work, if it is more than a minute."""
     if seconds >= MIN_ANNOUNCED:
         print(f"{what} takes about {in_words(seconds)}; the progress bar has a better estimate", flush=True)
 

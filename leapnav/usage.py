@@ -23,7 +23,7 @@ def suggestion(word: str, known: Sequence[str]) -> str:
 
 
 class UsageError(ValueError):
-    """The words after `leapnav` are invalid. The message is one line with the command, the word and the way out."""
+    """The words after `leapnav` are invalid. The message is one line with the command, the word and the remedy."""
 
 
 def parse_or_explain(parse: Callable[[list[str]], Any], arguments: list[str], commands: Sequence[str]) -> Any:

@@ -63,7 +63,7 @@ def build(folder: Path) -> Path:
 
 
 def lowest() -> list[str]:
-    """The direct dependencies at their declared minimum; torch as pinned, for an older one needs an older NumPy."""
+    """The direct dependencies at their declared minimum; torch as pinned, since older versions need an older NumPy."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     found = []
     for line in project["dependencies"]:

@@ -60,7 +60,7 @@ def pendulum(horizon, bound=None, weight=1.0):
 
 @pytest.mark.parametrize("method", ["single_shooting", "multiple_shooting"])
 def test_step_control_reaches_what_one_step_does_not(method):
-    # Stretched to eight times its horizon, a swing-up in one go becomes one with swings before.
+    # With eight times the horizon, a direct swing-up becomes one with preliminary swings.
     first, last = pendulum(2.0), pendulum(16.0)
     start = solve(first, method=method)
     assert start.success

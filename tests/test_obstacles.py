@@ -141,7 +141,7 @@ def test_the_clearance_of_an_arc_is_the_smallest_of_its_points(scenario):
             assert before <= 0 or 0 <= after < 1e-3
 
 
-def test_an_arc_far_beyond_a_wall_is_no_endless_walk():
+def test_a_very_long_arc_through_a_wall_terminates():
     lowest, driven, _ = follow_arc(5.0, 5.0, 0.3, 1e9, 0.0, 1.0, SCENARIOS[0].field)
     assert lowest <= 0
     assert driven < 1e-8

@@ -298,7 +298,7 @@ def test_far_walls_change_neither_the_optimum_nor_the_cells():
     assert Lattice(Scenario.from_dict(fields)).cell == pytest.approx(0.2)
 
 
-def test_a_way_round_beyond_the_cropped_lattice_is_found():
+def test_a_detour_beyond_the_cropped_lattice_is_found():
     wall = [{"polygon": {"vertices": [[4.0, -99.0], [6.0, -99.0], [6.0, 32.0], [4.0, 32.0]]}}]
     fields = scenario_fields(arena=[-100, -100, 100, 100], obstacles=wall, horizon=80.0)
     assert Lattice(Scenario.from_dict(fields)).cropped

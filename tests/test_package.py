@@ -67,5 +67,5 @@ def test_subprocess_workers_make_the_environment():
     venv.close()
 
 
-def test_the_version_stands_in_one_place():
+def test_the_version_is_defined_in_one_place():
     assert leapnav.__version__ == importlib.metadata.version("leapnav")

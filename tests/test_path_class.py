@@ -6,7 +6,7 @@ from leapnav.envs import Scenario, sample_scenario
 from leapnav.experts import find_optimum
 from leapnav.experts.search.path_class import driving_modes, heading_winding, path_sides
 
-# A disc before a polygon in the file; circles are packed first, so that their order there is another.
+# A polygon before a disc in the file; circles are packed first, so the packed order differs from that of the file.
 OBSTACLES = [
     {"polygon": {"vertices": [[4.0, 6.0], [5.0, 6.0], [5.0, 7.0], [4.0, 7.0]]}},
     {"circle": {"center": [4.5, 3.0], "radius": 0.5}},
@@ -20,7 +20,7 @@ def test_sides_are_those_seen_by_the_driver_in_the_order_of_the_file():
     assert path_sides(line[::-1], field) == ("right", "left")
 
 
-def test_a_way_round_the_other_side_changes_only_that_obstacle():
+def test_passing_an_obstacle_on_the_other_side_changes_only_its_side():
     field = Scenario.from_dict(scenario_fields(obstacles=OBSTACLES)).field
     shares = np.linspace(0.0, 1.0, 200)
     over = np.column_stack([1.0 + 8.0 * shares, 5.0 + 4.0 * np.sin(np.pi * shares)])

@@ -242,6 +242,6 @@ def test_responses_are_not_delayed_by_nagle_s_algorithm():
             listener.accept()[0].close()
 
 
-def test_a_port_in_use_is_told(port, capsys):
+def test_a_port_in_use_is_reported(port, capsys):
     assert main(["play", "--no-browser", "--port", str(port)]) == 2
     assert capsys.readouterr().err == f"leapnav: port: {port} is in use; --port 0 selects a free one\n"

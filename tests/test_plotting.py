@@ -74,7 +74,7 @@ def test_the_drawn_sweeps_are_feasible_and_end_in_the_extremal(swept):
     for line in paths:
         row = extremal.history[int(line.get_label().split()[1])]
         points = line.get_xydata()
-        # No leap is left between the arcs, and all nodes lie on them.
+        # The arcs are connected without defects, and all nodes lie on them.
         speed = np.linalg.norm(np.diff(points, axis=0), axis=1).max() / (scenario.horizon / len(points))
         assert speed < 2 * scenario.robot.max_speed
         for node in row.nodes[:, :2]:

@@ -47,7 +47,7 @@ def test_a_miss_costs_no_more_than_the_penalty():
     assert last_step(task, GradedMiss)[0] == last_step(task)[0] == pytest.approx(-30.0, abs=0.05)
 
 
-def test_a_success_is_paid_as_before():
+def test_the_reward_of_a_success_is_unchanged():
     task = scenario((4.0, 4.0, 0.0), (4.05, 4.0, 0.0))
     reward, info = last_step(task, GradedMiss)
     assert info["is_success"]
@@ -59,7 +59,7 @@ def test_a_free_heading_is_never_off():
     assert last_step(task, GradedMiss)[0] == pytest.approx(-30.0 * 0.3, rel=1e-5)
 
 
-def test_a_collision_is_paid_in_full_and_as_a_miss_by_how_far_it_is():
+def test_a_collision_has_its_full_penalty_and_that_of_a_graded_miss():
     disc = Obstacle(circle=Circle(center=(4.0, 4.0), radius=0.5))
     task = Scenario(start=(2.0, 4.0, 0.0), goal=(6.0, 4.0, 0.0), horizon=6.0, arena=ARENA, obstacles=(disc,))
     forwards = np.array([[1.0, 0.0]], np.float32)

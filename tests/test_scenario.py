@@ -56,7 +56,7 @@ def test_a_scenario_cannot_be_changed():
         scenario.field[0] = 1.0
 
 
-def test_fields_nested_too_deeply_are_told_in_one_line():
+def test_fields_nested_too_deeply_are_reported_in_one_line():
     value = 1.0
     for _ in range(900):
         value = [value]
@@ -149,7 +149,7 @@ def test_the_error_for_an_invalid_scenario_names_field_and_value(changes, field,
 @pytest.mark.parametrize(
     "text", ["{", '{"horizon": ' + "9" * 5000 + "}", '{"horizon": 1, "horizon": 2}', "{'a': 1}", '{"a": ' * 5000]
 )
-def test_text_that_is_no_scenario_is_told_in_one_line(text):
+def test_text_that_is_no_scenario_is_reported_in_one_line(text):
     with pytest.raises(ScenarioError) as error:
         Scenario.from_json(text)
     assert "\n" not in str(error.value)

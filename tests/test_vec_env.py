@@ -14,7 +14,7 @@ from leapnav.envs import NavigateEnv, NavigateVectorEnv
 from leapnav.training import NavigateVecEnv, make_vec_env
 
 
-def test_the_last_step_of_an_episode_tells_of_it_and_starts_the_next():
+def test_the_last_step_of_an_episode_reports_it_and_starts_the_next():
     venv = make_vec_env(n_envs=3, seed=4, family="rooms")
     envs = [NavigateEnv("rooms") for _ in range(3)]
     observations = venv.reset()

@@ -289,7 +289,7 @@ def test_faulty_actions_are_refused_and_change_nothing():
 
 @pytest.mark.parametrize("period", [0.05, 0.4])
 @pytest.mark.parametrize("actuation", ["velocity", "motor"])
-def test_robots_that_go_on_after_a_touch_stay_out_of_obstacles(actuation, period):
+def test_robots_that_continue_after_a_contact_stay_out_of_obstacles(actuation, period):
     for family in ("clutter", "polygons", "rooms", "slalom"):
         env = make(12, family=family, actuation=actuation, terminate_on_collision=False, control_period=period)
         env.reset(seed=3)

@@ -250,7 +250,7 @@ class PPOConfig(_LearnerConfig):
     quiet: float = 2.0
     """Time before the horizon at which the action noise starts to decrease, to 30 % of its standard deviation (s)."""
     critic_first: float = 0.0
-    """Initial fraction of the run in which only the critic learns."""
+    """Fraction of the run, from its start, in which only the critic learns."""
     divergence: float = 0.0
     """Initial weight of the divergence from the clone (linear decay to zero); 0: none."""
     divergence_until: float = 0.5

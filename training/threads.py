@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 
 def limit_threads(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function during which torch uses one thread, or as many as LEAPNAV_TORCH_THREADS says.
+    """Decorate a function during which torch uses one thread, or the number in LEAPNAV_TORCH_THREADS.
 
     The networks are so small that several threads mostly wait for each other, and on a busy machine for other
     processes. The previous number of threads is restored afterwards.

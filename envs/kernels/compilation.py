@@ -25,7 +25,7 @@ WORKER = "from leapnav.envs.kernels.compilation import serve; serve()"
 
 
 def prepare(*kernels: Kernel, jobs: int | None = None, advise: bool = True) -> None:
-    """Makes kernels ready, with those that they call.
+    """Compile kernels and those that they call, or load them from the cache.
 
     Kernels that are not in the cache are compiled by several processes, if they are many. Processes that need them at
     the same time wait for the first one.
@@ -119,7 +119,7 @@ def _workers(count: int) -> Iterator[list[subprocess.Popen[str]]]:
 
 
 def _ask(worker: subprocess.Popen[str], one: Kernel) -> None:
-    """Lets a process compile a kernel; where that fails, this process does it and shows the error."""
+    """Compile a kernel in a worker process. If that fails, this process compiles it later and shows the error."""
     assert worker.stdin is not None and worker.stdout is not None
     function = one.py_func
     try:

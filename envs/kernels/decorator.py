@@ -34,7 +34,7 @@ WITHOUT_EFFECT = frozenset({"leapnav.envs.kernels.compilation", "leapnav.envs.ke
 
 
 def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Declares a function that Numba compiles when it is first called.
+    """Declare a function that Numba compiles when it is first called.
 
     Args:
         signature: Numba's types of the result and the arguments, see `leapnav.envs.kernels.types`.
@@ -78,7 +78,7 @@ def record_type(record: type[NamedTuple], **fields: types.Type) -> types.NamedTu
 
 @contextmanager
 def _compilation(compiled: Kernel) -> Iterator[tuple[Path, int | None]]:
-    """Yields cache directory and optimisation level (NUMBA_OPT takes precedence), and reports the progress."""
+    """Yield cache directory and optimisation level (NUMBA_OPT takes precedence), and report the progress."""
     directory = cache_directory(compiled.py_func.__module__)
     with progress.compiling(compiled, is_cached=compiled.is_cached(directory)):
         yield directory, None if "NUMBA_OPT" in os.environ else OPTIMISATION_LEVEL

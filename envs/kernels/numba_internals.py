@@ -201,7 +201,7 @@ def _typed_scratch_buffer(context: Any, count: Any) -> Any:
 
 
 scratch_buffer: Any = intrinsic(prefer_literal=True)(_typed_scratch_buffer)
-"""In kernels: a pointer to a literal number of floats on the stack, which costs no allocation."""
+"""In kernels: a pointer to a buffer of floats on the stack, without an allocation; its length is a literal."""
 
 
 @unbox(types.NamedTuple)

@@ -3,11 +3,11 @@
 The entries of the array are, by index:
 
     [0] proximity weight k   [1] proximity scale sigma   [2] robot radius   [3] circles   [4] polygons
-    [5:9] arena (x_min, y_min, x_max, y_max)   [9] index of the grid
+    [5:9] arena (x_min, y_min, x_max, y_max)   [9] index at which the grid begins
     then per circle:   x, y, r
     then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
     then the obstacles' indices in the scenario, since circles are packed before polygons
-    then the grid:     x, y, cell size, columns, lines, then the index of each cell relative to the grid, then the
+    then the grid:     x, y, cell size, columns, lines, then the offset of each cell in the grid, then the
                        cells: number of circles n, of polygons p, maximum number of edges m; then x, y, r of the n
                        circles, column by column, and (n_x, n_y, c) of the p polygons for each of the m edges, also
                        column by column

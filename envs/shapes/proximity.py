@@ -110,7 +110,7 @@ def proximity_values(xa, ya, xb, yb, xc, yc, field):
 
     One test of the distance serves all three, which takes half the time of three calls.
     """
-    if field[int(field[GRID]) + 3] > 0.0:  # the grid selects the obstacles by itself
+    if field[int(field[GRID]) + 3] > 0.0:  # the cells of the grid list the relevant obstacles
         first, second = proximity(xa, ya, field)[0], proximity(xb, yb, field)[0]
         return first, second, proximity(xc, yc, field)[0]
     radius, steepness = field[2], 1.0 / field[1]

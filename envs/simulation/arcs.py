@@ -55,7 +55,7 @@ def follow_arc(x, y, heading, distance, turn, before, field):
     Returns:
         The smallest clearance (m), with an error of at most 1 mm or 2 %, whichever is larger; the fraction of the arc
         before the first contact; and the clearance (m) at the end. Without contact the fraction is 1. With contact,
-        the smallest clearance is not positive, and the end is that of the fraction, at a clearance of 0 to 0.01 mm.
+        the smallest clearance is not positive, and the end is at this fraction, with a clearance of 0 to 0.01 mm.
 
     """
     total = abs(distance)

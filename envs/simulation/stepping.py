@@ -1,6 +1,6 @@
 """One control period of many robots (kernels): motion, running cost, reward, and end of the episode.
 
-The kernels take all episodes as one `SimulationState`, those that Python calls as a plain tuple, and read and write its
+The kernels take all episodes as one `SimulationState`, or as a plain tuple if Python calls them, and read and write its
 arrays.
 """
 
@@ -153,7 +153,7 @@ def command(actions, active, packed):
 def drive_arcs(actions, active, packed):
     """Set the velocity of each body for its period, up to the first contact, and add the running cost.
 
-    The chord of the arc that a command drives has the length v h sinc(omega h / 2) and the mean heading. A body whose
+    The chord of the arc that a command produces has the length v h sinc(omega h / 2) and the mean heading. A body whose
     velocity is the chord ends at the end of the arc, because Chipmunk moves bodies by an explicit Euler step.
 
     Returns:

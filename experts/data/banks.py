@@ -22,7 +22,8 @@ from leapnav.experts.data.store import Arrays, ResumableStore, discard
 from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.problem.extremal import Status
 
-# Batches of one task: an interruption loses only the scenarios that are being solved. Joblib declares a string.
+# Joblib's batch size: with one task, an interruption loses only the scenarios that are being solved. Joblib declares a
+# string but accepts an integer.
 ONE = cast(str, 1)
 
 
@@ -144,7 +145,7 @@ def _solve(store: ResumableStore, pool: Parallel, family: str, count: int, seed:
     n_admitted = 0
     with progress_bar(total=count, label=f"Building {family}", unit="scenarios", show=progress) as bar:
         while n_admitted < count:
-            # As many draws as scenarios are missing, so that the bank holds the first `count` admitted scenarios.
+            # One draw for each missing scenario, so that the bank holds the first `count` admitted scenarios.
             numbers = range(len(reasons), len(reasons) + count - n_admitted)
             for number, arrays in store.complete(numbers, partial(draw, family=family, seed=seed), pool, bar):
                 reasons[number] = str(arrays["rejected"])

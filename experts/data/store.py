@@ -22,7 +22,7 @@ DISCARDED = "-done"  # added to the name of a directory that is being removed
 class ResumableStore:
     """A directory of shards, open to one process at a time; each shard is complete or absent.
 
-    A computation that is interrupted, SIGKILL included, opens the directory again with the same settings and computes
+    After any interruption, including SIGKILL, a computation opens the directory with the same settings and computes
     only the missing shards. Use it as a context manager, which holds a lock file.
 
     Args:

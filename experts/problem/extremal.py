@@ -20,7 +20,7 @@ class Status(Enum):
 
     SUCCESS = "certified: a local minimum, to the tolerance"
     NO_PATH = "no path from start to goal was found. Check that the passages between the obstacles are wide enough."
-    HORIZON_TOO_SHORT = "the goal is out of reach at the robot's limits. Try a longer horizon or higher limits."
+    HORIZON_TOO_SHORT = "the goal is out of reach within the horizon. Try a longer horizon or higher limits."
     STALLED = "Newton's method stopped making progress. Try method='leapfrog', a better guess, or find_optimum."
     DIVERGED = "the extremal flow diverged from the guess. Try a guess closer to the solution, or method='leapfrog'."
     SINGULAR = "the Newton matrix is singular: the solution is not isolated. Move the start or the goal slightly."

@@ -4,8 +4,8 @@ On an extremal of the driftless robot H = -E is constant, so |u|_R = sqrt(2 (E +
 path for ds = sqrt(2 (E + Phi)) sqrt(r_v ds_xy^2 + r_w dtheta^2) (Maupertuis' principle). E follows from the horizon,
 T = integral of ds / (2 (E + Phi)). The search therefore covers reversing, cusps, windings of the heading and the
 allocation of time. Costs of shortest paths in the plane, for which rotation is free, are lower bounds of the costs on
-the lattice, and guide an A* search from the goal; the costs of that guide a search from the start. A path through an
-edge that both trees have in common is locally shortest. The cheapest distinct paths of this kind are the candidates.
+the lattice, and guide an A* search from the goal, whose costs guide a search from the start. A path through an edge
+that both trees have in common is locally shortest. The cheapest distinct paths of this kind are the candidates.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The controls are constant on each interval and move the robot along exact circul
 integrated by the trapezoidal rule. The discretised problem is solved by sequential quadratic programming. Each step is
 computed by a Riccati recursion, linear in the number of intervals, with multipliers for the end conditions (A. E.
 Bryson and Y.-C. Ho, Applied Optimal Control, 1975, section 5.3). The Hessian is exact, and shifted until the recursion
-shows that it is positive definite, so that steps descend and saddles are left. The line search uses the augmented
+shows that it is positive definite, so that steps descend and leave saddle points. The line search uses the augmented
 Lagrangian, which does not stall on curved constraints as a penalty function does (J. Nocedal and S. J. Wright,
 Numerical Optimization, 2nd ed., ch. 15, 17 and 18).
 

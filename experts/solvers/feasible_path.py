@@ -212,7 +212,7 @@ class FeasiblePath:
 
 
 def select_sweeps(n_sweeps: int, n_first: int, max_selected: int) -> list[int]:
-    """Select indices of sweeps to display: the first ones, which change most, and an even choice of the rest."""
+    """Select indices of sweeps to display: the first ones, which change most, and others evenly spaced."""
     rest = np.linspace(n_first, n_sweeps - 1, max_selected - n_first).round().astype(int) if n_sweeps > n_first else []
     return sorted({*range(min(n_first, n_sweeps)), *map(int, rest)})
 

@@ -7,8 +7,8 @@ The iterate is a feasible path with nodes z_0..z_p at times t_0..t_p. For i = 1.
 node i-1 to node i+1 by single shooting, and moves node i onto the extremal of the sub-problem, at the mean time or at
 half of its cost. The path stays feasible, and its cost never increases, because a move that would increase it is
 rejected. Costates need no guess: they are estimated from the chord between two nodes, and later taken from the last
-sweep. When a sweep gains min_gain, two arcs are replaced by one where that does not increase the cost, until p = 2 and
-the last sub-problem is the whole problem.
+sweep. When a sweep reduces the cost by less than the fraction MIN_GAIN, two arcs are replaced by one if that does not
+raise the cost, until p = 2 and the last sub-problem is the whole problem.
 """
 
 from __future__ import annotations

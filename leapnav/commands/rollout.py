@@ -30,7 +30,7 @@ class Rollout:
     seed: int = 1000
     """First scenario seed: scenario i has seed SEED + i. At least 2, because the included banks have seeds 0 and 1."""
     recoveries: int = 0
-    """Number of recoveries per scenario: demonstrations from states pushed off the optimum."""
+    """Number of recoveries per scenario: demonstrations from perturbed states of the optimum."""
     noise: float = 0.0
     """Standard deviation of the noise on the executed actions; the recorded ones are the expert's, in closed loop."""
     workers: int = os.cpu_count() or 1

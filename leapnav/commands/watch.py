@@ -26,7 +26,7 @@ class Watch:
     split: Literal["train", "test", "fresh"] = "test"
     """Split of the included banks, or "fresh" for newly sampled scenarios."""
     index: int | None = None
-    """Index of the first scenario in the bank; the next episodes play the next ones. By default random scenarios."""
+    """Index in the bank of the first episode's scenario; later episodes play the following ones. By default random."""
     episodes: int = 3
     """Number of episodes."""
     seed: int = 0

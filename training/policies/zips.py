@@ -2,8 +2,8 @@
 
 Such a file holds pickled Python objects, which can execute any code when they are loaded. Beside each object the file
 describes it as text. This module reads only these descriptions and the tensors of the weights
-(`torch.load(weights_only=True)`), and makes the network from its own code. Models that need more (own network classes,
-own feature extractors) are loaded by `trust=True` with the loader of Stable-Baselines3.
+(`torch.load(weights_only=True)`), and makes the network from its own code. Models that need more (custom networks or
+feature extractors) are loaded by `trust=True` with the loader of Stable-Baselines3.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def load_zip(
         path: the file, written by `model.save` of PPO, A2C, SAC, TD3, DDPG or TQC.
         environment: arguments of the environment with which it was trained; None: derived from the observation space,
             for a lidar.
-        trust: load with Stable-Baselines3, which executes code from the file; for models with own classes.
+        trust: load with Stable-Baselines3, which executes code from the file; for models with custom classes.
 
     Returns:
         The policy, whose critic is not loaded unless `trust` is set, and the arguments of its environment.

@@ -1,4 +1,4 @@
-"""Jump-start: the expert drives the first part of an episode, the learner the rest.
+"""Jump start: the expert drives the first part of an episode, the learner the rest.
 
 I. Uchendu et al., "Jump-start reinforcement learning" (ICML 2023). The expert's part is not simulated: the episode
 starts at a state of the scenario's optimum, with the remaining time as its horizon.

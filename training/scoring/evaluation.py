@@ -147,7 +147,7 @@ class Episode:
         """Regret (J - J*) / J* of a successful episode, with J* for the reached pose; NaN if that is not known.
 
         It is negative only if the episode is cheaper than the best optimum that the search found, or if the robot
-        slips: its path is then none of the unicycle.
+        slips: its path then violates the unicycle model.
         """
         return (self.cost - self.reached_reference) / self.reached_reference
 

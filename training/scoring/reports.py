@@ -38,7 +38,7 @@ COLUMNS = (
 )
 NEGATIVE_REGRET = (
     "A negative regret: the episodes cost less than the best known optimum for the pose reached. A robot that slips "
-    "leaves the paths of the unicycle, whose optimum it is; otherwise the search has missed a better path."
+    "violates the unicycle model, for which the optimum is computed; otherwise the search has missed a better path."
 )
 N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal; the other outputs have all
 

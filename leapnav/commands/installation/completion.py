@@ -10,8 +10,8 @@ from typing import Literal
 
 import tyro
 
-# tyro's scripts contain a description of all options. An option with choices that also accepts other words is one of
-# them only by its help text; its other words are files.
+# tyro's scripts contain a description of all options. If an option accepts other words besides its choices, only its
+# help text contains the choices; the other words are files.
 _OPEN_CHOICE = re.compile(r"('description': '\{([^}']*)\}\|STR[^']*', 'type': )'path'")
 _NO_MATCH = "                                return completions\n"
 _FILES = '                                return completions or ["__TYRO_COMPLETE_FILES__"]\n'

@@ -49,7 +49,7 @@ class Doctor:
             print(f"{name:{width}}  {number}", flush=True)
         from leapnav.commands.installation.compile import compile_missing
 
-        compile_missing()  # else the first check would seem slow
+        compile_missing()  # otherwise the first check would include the compilation
         checks = []
         for function in (find_an_optimum, keep_compiled_code, drive_the_expert, load_a_policy):
             check = _run(function)
