@@ -10,7 +10,9 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 .PHONY: demo compile test test-all lint types docs bench coverage clean
 .DELETE_ON_ERROR:
 
-demo: compile
+# Without the tools of the developers, unless they are installed already.
+demo: $(if $(wildcard .venv/installed),.venv/installed,.venv/package)
+	$(BIN)/leapnav compile
 	$(BIN)/leapnav demo
 
 # Compiles what is not in the cache, on all cores.
@@ -60,6 +62,10 @@ clean:
 	$(INSTALL) ".[dev]"
 	touch $@
 
+.venv/package: pyproject.toml constraints.txt .venv/sources
+	$(INSTALL) .
+	touch $@
+
 .venv/examples: examples/requirements.txt .venv/bin/python
 	$(BIN)/pip install --quiet --no-deps --upgrade --target $@ --requirement $<
 	touch $@
@@ -69,6 +75,5 @@ clean:
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --upgrade pip
 
 FORCE:
