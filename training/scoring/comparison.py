@@ -172,7 +172,7 @@ def compare_policies(
                     count=count,
                     environment=member.environment,
                     seed=seed,
-                    label=f"{member.name}: {bank.family}",
+                    label=f"{row if len(members) == 1 else member.name}: {bank.family}",
                     progress=progress,
                 )
                 for bank in banks
