@@ -5,12 +5,15 @@ The rates were measured on a machine with two cores without a GPU. They differ b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from leapnav.training.config import BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig
 
 # Seconds of one core to find, execute and store the optimum of a scenario.
 SECONDS_PER_SCENARIO = {"open": 0.03, "clutter": 0.05, "polygons": 0.06, "rooms": 0.08, "slalom": 0.15, "all": 0.08}
 SECONDS_PER_SECOND_OPINION = 4.0
-SECONDS_PER_EPISODE = 0.02  # of an evaluation
+SECONDS_PER_EXPERT_EPISODE, SECONDS_PER_EPISODE = 0.1, 0.01  # of an evaluation
+SECONDS_OF_DEMO = 300.0
 SAMPLES_PER_SCENARIO, CLONED_SAMPLES_PER_SECOND = 170, 40_000
 SECONDS_PER_DAGGER_ROUND = 300.0
 PPO_STEPS_PER_SECOND, SAC_STEPS_PER_SECOND = 3_000, 20
@@ -34,6 +37,12 @@ def in_words(seconds: float) -> str:
 def of_scenarios(family: str, count: int, workers: int) -> float:
     """Return the duration of finding the optima of `count` scenarios (s)."""
     return SECONDS_PER_SCENARIO.get(family, 0.08) * count / max(workers, 1)
+
+
+def of_evaluation(policies: Sequence[str], count: int) -> float:
+    """Return the duration of an evaluation of policies, given by their names, on `count` scenarios (s)."""
+    n_experts = sum(name.rpartition("=")[2] == "expert" for name in policies)
+    return count * (n_experts * SECONDS_PER_EXPERT_EPISODE + (len(policies) - n_experts) * SECONDS_PER_EPISODE)
 
 
 def of_training(config: RunConfig, workers: int) -> float:

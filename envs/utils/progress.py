@@ -10,6 +10,8 @@ from tqdm.asyncio import tqdm_asyncio
 from tqdm.auto import tqdm
 from tqdm.std import tqdm as text_bar
 
+# Always units per second: tqdm would write "2.17s/ episodes" for slow ones.
+FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
 INTERVAL = 10.0  # s between two lines where standard error is no terminal
 
 
@@ -50,7 +52,15 @@ def progress_bar(*, total: int, label: str, unit: str, initial: int = 0, show: b
     """
     is_notebook = tqdm is not tqdm_asyncio  # tqdm.auto selects a widget there
     kind = tqdm if is_notebook or sys.stderr.isatty() else _Lines
-    return kind(total=total, desc=label, unit=f" {unit}", initial=initial, disable=not show, dynamic_ncols=True)
+    return kind(
+        total=total,
+        desc=label,
+        unit=f" {unit}",
+        initial=initial,
+        disable=not show,
+        dynamic_ncols=True,
+        bar_format=None if is_notebook else FORMAT,
+    )
 
 
 def advance(bar: text_bar[Any], n: int) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from leapnav.commands.options import EnvironmentOption, FamilyOrAll, parse_environment
+from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ class Evaluate:
         specs = [
             load_policy_spec(name, seed=self.seed, environment=environment, trust=self.trust) for name in self.policies
         ]
+        n_scenarios = sum(len(bank) if self.count is None else min(self.count, len(bank)) for bank in banks)
+        announce(of_evaluation(self.policies, n_scenarios), "the evaluation")
         comparison = compare_policies(specs, banks, count=self.count, seed=self.seed)
         print_scores(comparison)
         if self.json is not None:
