@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from typing import Any
@@ -43,9 +44,12 @@ def parse_or_explain(parse: Callable[[list[str]], Any], arguments: list[str], co
         raise UsageError(
             f"command: expected one of {', '.join(commands)}, got {arguments[0]!r}{suggestion(arguments[0], commands)}"
         )
+    printed = io.StringIO()
     try:
-        with redirect_stderr(io.StringIO()):
-            return parse(arguments)
+        with redirect_stderr(printed):
+            parsed = parse(arguments)
+        print(printed.getvalue(), end="", file=sys.stderr)  # warnings
+        return parsed
     except SystemExit as end:
         if not end.code:
             raise

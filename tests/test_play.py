@@ -183,6 +183,11 @@ def test_questions_are_validated_like_a_file(question, message, ask):
     assert status == 400 and found["error"].startswith(message)
 
 
+def test_a_file_with_headings_in_degrees_is_refused(ask):
+    status, found = ask("/check", {"scenario": fields(goal=[7, 2.5, 90])})
+    assert status == 400 and found["error"].endswith("in radians, at most 2 pi, got 90; did you mean 1.571?")
+
+
 def test_invalid_requests_are_refused(ask):
     assert ask("/search", body="{")[0] == 400
     assert ask("/search", body="[" * 100_000)[0] == 400

@@ -262,7 +262,7 @@ class Scenario(_Frozen):
             raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
         scenario = cls.from_dict(fields)
         if not is_text:  # written by hand, perhaps in degrees
-            _check_headings(scenario)
+            check_headings(scenario)
         return scenario
 
     @classmethod
@@ -371,7 +371,13 @@ def _read(path: Path) -> str:
     return path.read_text(encoding="utf-8-sig")
 
 
-def _check_headings(scenario: Scenario) -> None:
+def check_headings(scenario: Scenario) -> None:
+    """Check the headings of a scenario that a person has written, perhaps in degrees.
+
+    Raises:
+        ScenarioError: a heading is beyond +-2 pi.
+
+    """
     faults = [
         f"{field}: expected a heading in radians, at most 2 pi, got {heading:g}; "
         f"did you mean {math.radians(heading):.4g}?"

@@ -16,7 +16,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.scenario import Scenario, check_headings
 from leapnav.envs.utils import colors
 from leapnav.experts.acting.policy import NoOptimumError
 from leapnav.play.solving import PlaySolver, bank_scenario
@@ -87,7 +87,9 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
         return JSONResponse({"scenario": found.to_dict()})
 
     def check(content: dict[str, Any]) -> dict[str, Any]:
-        return {"scenario": _scenario(content).to_dict()}
+        scenario = _scenario(content)
+        check_headings(scenario)  # the content of a file or a link
+        return {"scenario": scenario.to_dict()}
 
     def follow(content: dict[str, Any]) -> dict[str, Any]:
         previous = content.get("previous")
