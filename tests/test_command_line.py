@@ -1,0 +1,96 @@
+"""Choices, completion, interruptions and durations of the command line."""
+
+import shutil
+import subprocess
+from typing import get_args
+
+import pytest
+
+from leapnav import durations
+from leapnav.cli import main
+from leapnav.commands.installation.completion import complete_choices
+from leapnav.commands.options import Family, FamilyOrAll, PolicyName, parse_environment
+from leapnav.envs import FAMILIES
+from leapnav.training import BCConfig, PPOConfig, shipped_policies
+from leapnav.training.policies.files import BASELINES
+
+
+def test_the_choices_shown_are_those_that_exist():
+    assert get_args(Family) == tuple(FAMILIES)
+    assert get_args(FamilyOrAll) == (*FAMILIES, "all")
+    names = get_args(get_args(PolicyName)[0])
+    assert sorted(names) == sorted([*BASELINES, *shipped_policies()])
+
+
+def completed(script, *words):
+    """The completions of the last word in bash."""
+    code = (
+        f"source {script}; COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; "
+        'F=$(complete -p leapnav | sed "s/.*-F \\([^ ]*\\).*/\\1/"); $F; echo "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True, cwd=script.parent)
+    return done.stdout.split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_families_and_policies_are_completed(tmp_path, capsys):
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "leapnav.bash"
+    script.write_text(capsys.readouterr().out)
+    assert completed(script, "leapnav", "rollout", "--family", "r") == ["rooms"]
+    assert completed(script, "leapnav", "watch", "--policy", "cl") == ["clutter"]
+    (tmp_path / "my_policy").mkdir()
+    assert completed(script, "leapnav", "watch", "--policy", "my") == ["my_policy"]  # files, if no choice fits
+    assert "evaluate" in completed(script, "leapnav", "e")
+
+
+def test_a_script_without_open_choices_is_left_alone():
+    assert complete_choices("{'flags': ['--count'], 'type': 'value'}") == "{'flags': ['--count'], 'type': 'value'}"
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["rollout", "--out", "demos"], "the same command resumes where it stopped"),
+        (["bank", "build", "--out", "x.bank"], "the same command resumes where it stopped"),
+        (["train", "bc", "--out", "run"], "leapnav train bc --out run --resume continues from the last checkpoint"),
+        (["demo", "--out", "demo"], "the same command resumes; finished steps are not repeated"),
+        (["evaluate", "expert"], ""),
+    ],
+)
+def test_an_interruption_says_how_to_resume(words, hint, tmp_path, monkeypatch, capsys):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    for name in (
+        "leapnav.experts.data.rollouts.rollout",
+        "leapnav.experts.data.banks.build_bank",
+        "leapnav.training.runs.imitation.train_bc",
+        "leapnav.commands.demo.run_demo",
+        "leapnav.training.scoring.comparison.compare_policies",
+    ):
+        monkeypatch.setattr(name, interrupt)
+    assert main(words) == 130
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == f"leapnav: interrupted{f'; {hint}' if hint else ''}"
+
+
+def test_long_work_is_announced_and_short_work_is_not(capsys, tmp_path):
+    durations.announce(59.0, "the work")
+    assert capsys.readouterr().out == ""
+    durations.announce(600.0, "the work")
+    assert capsys.readouterr().out.startswith("the work takes about 10 min")
+    assert durations.in_words(4 * 3600) == "4 hours"
+    few, many = (durations.of_scenarios("rooms", count, workers=2) for count in (100, 10_000))
+    assert many == pytest.approx(100 * few)
+    bc, given = BCConfig(out=tmp_path), BCConfig(out=tmp_path, demos=(tmp_path,))
+    assert durations.of_training(bc, 2) > durations.of_training(given, 2) > 0
+    assert durations.of_training(PPOConfig(out=tmp_path), 2) > 600
+    assert durations.of_evaluation(["mine=expert", "clutter"], 200) > durations.of_evaluation(["clutter"], 200)
+
+
+def test_arguments_of_the_environment_are_json_or_text():
+    assert parse_environment([]) is None
+    found = parse_environment(["observation=map", "map_obstacles=3", "dict_observation=true"])
+    assert found == {"observation": "map", "map_obstacles": 3, "dict_observation": True}
