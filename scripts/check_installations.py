@@ -85,7 +85,8 @@ def main() -> int:
             if name == "wheel":
                 install(python, "--constraint", ROOT / "constraints.txt", f"{wheel}[dev]")
                 shutil.copytree(ROOT / "tests", folder / "tests")
-                for extra in ("pyproject.toml", "README.md", "docs", "examples", "scripts", "mkdocs.yml"):
+                pages = "README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md"
+                for extra in (*pages, "pyproject.toml", "docs", "examples", "scripts", "mkdocs.yml"):
                     source = ROOT / extra
                     (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / extra)
                 variables = {**os.environ, "OMP_NUM_THREADS": "1"}
