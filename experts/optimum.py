@@ -177,11 +177,13 @@ def find_reached_optimum(
     x, y, heading = (float(value) for value in pose)
     goal = (x, y, None if scenario.goal[2] is None else math.remainder(heading, 2 * math.pi))
     reached = scenario.model_copy(update={"goal": goal})
-    if guess is not None:
-        extremal = solve(reached, "multiple_shooting", guess=guess)
-        if extremal.success and extremal.cost <= cost:
-            return extremal
-    return find_optimum(reached)
+    followed = None if guess is None else solve(reached, "multiple_shooting", guess=guess)
+    if followed is not None and followed.success and followed.cost <= cost:
+        return followed
+    found = find_optimum(reached)
+    if followed is not None and followed.success and not (found.success and found.cost <= followed.cost):
+        return followed
+    return found
 
 
 def shortest_horizon(scenario: Scenario) -> float | None:

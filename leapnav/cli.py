@@ -96,6 +96,5 @@ def main(arguments: list[str] | None = None) -> int:
 def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         known = {errno.ENOENT: "no such file", errno.EISDIR: "is a directory", errno.EACCES: "permission denied"}
-        text = known.get(error.errno or 0, str(error.strerror))
-        return f"{error.filename}: {text if str(error.strerror) == os.strerror(error.errno or 0) else error.strerror}"
+        return f"{error.filename}: {known.get(error.errno or 0, error.strerror)}"
     return str(error)

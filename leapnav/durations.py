@@ -1,13 +1,14 @@
 """Estimates of the durations of long commands, printed before they start.
 
-The rates were measured on a machine with two cores without a GPU. They differ by a factor of about 2 between machines.
+The rates are rounded from runs on two cores without a GPU, those of scenarios partly from the time of the search alone.
+They differ by a factor of about 2 between machines.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from leapnav.training.config import BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig
+from leapnav.training.config import DEFAULT_EPOCHS, BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig
 
 # Seconds of one core to find, execute and store the optimum of a scenario.
 SECONDS_PER_SCENARIO = {"open": 0.03, "clutter": 0.05, "polygons": 0.06, "rooms": 0.08, "slalom": 0.15, "all": 0.08}
@@ -48,7 +49,7 @@ def of_evaluation(policies: Sequence[str], count: int) -> float:
 def of_training(config: RunConfig, workers: int) -> float:
     """Return the duration of a training run, without that of its final evaluation (s)."""
     if isinstance(config, (BCConfig, DAggerRunConfig)):
-        epochs = config.cloning.epochs or 12
+        epochs = config.cloning.epochs or DEFAULT_EPOCHS
         samples = config.scenarios * SAMPLES_PER_SCENARIO * epochs
         seconds = samples / CLONED_SAMPLES_PER_SECOND
         if not config.demos:

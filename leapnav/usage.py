@@ -11,6 +11,8 @@ from contextlib import redirect_stderr, redirect_stdout, suppress
 from typing import Any
 from unittest import mock
 
+from leapnav.training.config import ALGORITHMS
+
 _BORDER = re.compile(r"[╭╮╰╯│─]+|^[|+]|[|+]$|-{5,}|^\+- | -+\+$")
 _OPTION = re.compile(r"--[A-Za-z][\w.-]*")
 _WIDTH = "2000"  # characters, so that tyro does not wrap its messages
@@ -125,7 +127,7 @@ def _explain_unknown(
 
 def _command(arguments: Sequence[str]) -> list[str]:
     """Return the command and its subcommand, the words before the first option or file."""
-    nested = {"bank": ("build", "show"), "train": ("bc", "dagger", "ppo", "sac")}
+    nested = {"bank": ("build", "show"), "train": tuple(ALGORITHMS)}
     words = list(arguments[:1]) if arguments and not arguments[0].startswith("-") else []
     if words and arguments[1:2] and arguments[1] in nested.get(words[0], ()):
         words.append(arguments[1])

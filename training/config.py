@@ -20,6 +20,7 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(
 
 # A literal, so that the command line shows and completes the choices; a test compares it with `FAMILIES`.
 FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
+DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 
 @dataclass(frozen=True)

@@ -27,15 +27,16 @@ from leapnav.envs.utils.validation import (
     check_positive,
 )
 from leapnav.experts.data.demonstrations import Demonstration
-from leapnav.training.config import CloningConfig
+from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.actors import actor_parameters, mean_action, policy_of, set_noise, update_target
 from leapnav.training.threads import limit_threads
 
-# Defaults of the epochs and the batch size. A network that has learned from a few hundred gradient steps only is worse
-# than the demonstrations allow: 200 demonstrations of "open" gave 51 % success after 180 steps, 100 % after 2,700.
-DEFAULT_EPOCHS, MIN_STEPS = 12, 2_500
+# Gradient steps of a fit with the default epochs, and bounds of the default batch size. A network that has learned from
+# a few hundred gradient steps only is worse than the demonstrations allow: 200 demonstrations of "open" gave 51 %
+# success after 180 steps, 100 % after 2,700.
+MIN_STEPS = 2_500
 MIN_BATCH_SIZE, MAX_BATCH_SIZE = 64, 2048
 WARM_UP_STEPS = 200  # gradient steps of the linear warm-up of the learning rate
 MIN_STD = 0.01  # lower bound of the fitted standard deviation of the actions

@@ -125,6 +125,10 @@ def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | No
     """Return the specification of a policy to compare."""
     own: Mapping[str, Any] | None = None
     if isinstance(given, tuple):
+        if len(given) != 2:
+            raise ValueError(
+                f"policies: {label}: expected (policy, arguments of its environment), got {len(given)} values"
+            )
         given, own = given
     if isinstance(given, (str, Path)):
         return replace(load_policy_spec(str(given), seed=seed, environment=own), name=name, label=label)
