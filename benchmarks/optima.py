@@ -18,12 +18,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from leapnav.envs import FAMILIES, Robot, Scenario, sample_scenario
+from leapnav.envs import FAMILIES, Unicycle, Scenario, sample_scenario
 from leapnav.envs.scenarios.scenario import Circle, Obstacle, Polygon
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import OptimalControlProblem, Trajectory, build_bank, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.search.direct import discretise, optimise
+from leapnav.experts.transcription.direct import discretise, optimise
 from leapnav.experts.search.ipopt import Transcription
 from leapnav.experts.search.lattice import Lattice
 
@@ -94,7 +94,7 @@ def dense_scenario(kind: str, size: float, seed: int) -> Scenario:
         obstacles.append(Obstacle(polygon=Polygon(vertices=tuple(map(tuple, points.tolist())))))
     arena = (0.0, 0.0, size, size)
     return Scenario(
-        arena=arena, start=start, goal=goal, horizon=size, obstacles=tuple(obstacles), robot=Robot(radius=0.2)
+        arena=arena, start=start, goal=goal, horizon=size, obstacles=tuple(obstacles), robot=Unicycle(radius=0.2)
     )
 
 

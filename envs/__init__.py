@@ -1,18 +1,24 @@
-"""Gymnasium environments of a two-wheeled robot among obstacles, and the scenarios played in them."""
+"""Gymnasium environments of a wheeled robot among obstacles, and the scenarios played in them."""
 
+from leapnav.deprecated import deprecated_names
 from leapnav.envs.navigation import NavigateEnv, NavigateGoalEnv
+from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
-from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario, ScenarioError
+from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Scenario, ScenarioError
 from leapnav.envs.settings import Disturbance, Motor
 from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 
 __all__ = [
     "FAMILIES",
     "BankError",
+    "Car",
     "Circle",
     "Cost",
+    "DifferentialDrive",
+    "Disc",
     "Disturbance",
+    "DynamicUnicycle",
     "Motor",
     "NavigateEnv",
     "NavigateGoalEnv",
@@ -21,9 +27,12 @@ __all__ = [
     "Obstacle",
     "Polygon",
     "Reference",
-    "Robot",
+    "RobotModel",
     "Scenario",
     "ScenarioBank",
     "ScenarioError",
+    "Unicycle",
     "sample_scenario",
 ]
+
+__getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})

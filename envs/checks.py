@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.utils.validation import in_words
+
 
 def check_render_mode(mode: str | None, modes: Sequence[str]) -> None:
     """Raise ValueError unless the mode is None or one of `modes`."""
@@ -34,7 +36,7 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     except (TypeError, ValueError):  # rows of different lengths
         values = np.empty(0, dtype=object)
     if values.shape != shape or values.dtype.kind not in "fiu":
-        expected = "two finite numbers" if len(shape) == 1 else f"finite numbers of shape {shape}"
+        expected = f"{in_words(shape[0])} finite numbers" if len(shape) == 1 else f"finite numbers of shape {shape}"
         is_batch = values.ndim > 1 and values.dtype.kind in "fiu"
         raise ValueError(f"action: expected {expected}, got {f'shape {values.shape}' if is_batch else repr(actions)}")
     return np.ascontiguousarray(values, dtype=np.float64)

@@ -12,6 +12,7 @@ import numpy as np
 
 from leapnav.envs.checks import check_actions, check_options, check_render_mode
 from leapnav.envs.goals import GoalConditioned
+from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
@@ -171,6 +172,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         *,
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
+        robot: RobotModel | Mapping[str, Any] | str | None = None,
         observation: str = "lidar",
         reward: str = "cost",
         actuation: str = "velocity",
@@ -180,6 +182,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         control_period: float = 0.05,
         position_tolerance: float = 0.1,
         heading_tolerance: float = 0.1,
+        motion_tolerance: float = 0.1,
         collision_penalty: float = 50.0,
         miss_penalty: float = 50.0,
         discount: float = 0.99,
@@ -190,8 +193,9 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         map_vertices: int = 8,
         render_mode: str | None = None,
     ) -> None:
-        self._source = ScenarioSource(family, scenario, split, bank)
+        self._source = ScenarioSource(family, scenario, split, bank, robot)
         self.settings = EnvironmentSettings(
+            robot=self._source.robot.model,
             observation=observation,
             reward=reward,
             actuation=actuation,
@@ -201,6 +205,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
             control_period=control_period,
             position_tolerance=position_tolerance,
             heading_tolerance=heading_tolerance,
+            motion_tolerance=motion_tolerance,
             collision_penalty=collision_penalty,
             miss_penalty=miss_penalty,
             discount=discount,
@@ -217,7 +222,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / control_period))}
         self._simulator = BatchSimulator(1, self.settings)
         self.observation_space = self._simulator.layout.space
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._source.robot.sizes()[1],), np.float32)
         self._simulator.check(self._source.scenario, self.bank)
         self._choice: Scenario | int | None = None
         self._playing = np.zeros(1, dtype=bool)
@@ -272,7 +277,8 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         """
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        self._simulator.step(check_actions(action, (2,)).reshape(1, 2), self._playing)
+        values = check_actions(action, self.action_space.shape)
+        self._simulator.step(values.reshape(1, -1), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)
         row = self._simulator.state[0].tolist()
@@ -365,6 +371,11 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return x, y, heading
 
     @property
+    def state(self) -> np.ndarray:
+        """The robot's state (n,): the pose and the further states of its model."""
+        return np.concatenate([self._simulator.poses[0], self._simulator.motion[0]])
+
+    @property
     def time(self) -> float:
         """Time since the start of the episode (s)."""
         return float(self._simulator.state[0, columns.TIME])
@@ -393,6 +404,8 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         for name, column in columns.FLAGS.items():
             info[name] = row[column] != 0.0
         info["pose"], info["reward_parts"] = self.pose, parts
+        if self._simulator.motion.shape[1]:
+            info["motion"] = self._simulator.motion[0].copy()
         return info
 
     def __getstate__(self) -> dict[str, Any]:

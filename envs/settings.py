@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from leapnav.deprecated import deprecated_names
+from leapnav.envs.robots import RobotModel
+from leapnav.envs.robots.base import MODELS
 from leapnav.envs.utils.validation import (
     check_at_least,
     check_choice,
@@ -52,8 +54,10 @@ MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
     GOAL_CONDITIONED,
     OBSTACLES,
     VERTICES,
+    DRIVE,
+    MOTION_TOLERANCE,
     PACKED,
-) = range(24)
+) = range(26)
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ class EnvironmentSettings:
 
     """
 
+    robot: str = "unicycle"
     observation: str = "lidar"
     reward: str = "cost"
     actuation: str = "velocity"
@@ -128,6 +133,7 @@ class EnvironmentSettings:
     control_period: float = 0.05
     position_tolerance: float = 0.1
     heading_tolerance: float = 0.1
+    motion_tolerance: float = 0.1
     collision_penalty: float = 50.0
     miss_penalty: float = 50.0
     discount: float = 0.99
@@ -139,10 +145,11 @@ class EnvironmentSettings:
     goal_conditioned: bool = False
 
     def __post_init__(self) -> None:
+        check_choice("robot", self.robot, MODELS)
         check_choice("observation", self.observation, OBSERVATIONS)
         check_choice("reward", self.reward, GOAL_REWARDS if self.goal_conditioned else REWARDS)
         check_choice("actuation", self.actuation, ACTUATIONS)
-        for name in ("control_period", "position_tolerance", "heading_tolerance", "lidar_range"):
+        for name in ("control_period", "position_tolerance", "heading_tolerance", "motion_tolerance", "lidar_range"):
             check_positive(name, getattr(self, name))
         for name in ("collision_penalty", "miss_penalty"):
             check_not_negative(name, getattr(self, name))
@@ -152,8 +159,20 @@ class EnvironmentSettings:
             check_integer(name, getattr(self, name), minimum, MAX_COUNT)
         for name in ("terminate_on_collision", "dict_observation"):
             check_flag(name, getattr(self, name))
+        if self.motors and self.robot != "unicycle":
+            raise ValueError(f"actuation: 'motor' needs the robot 'unicycle', got {self.robot!r}")
+        if self.goal_conditioned and any(value is not None for value in self.model.goal_motion):
+            raise ValueError(
+                f"robot: the goal of a goal-conditioned environment is a pose, but {self.robot!r} has goals for its "
+                "other states; use leapnav/Navigate-v0"
+            )
         object.__setattr__(self, "disturbance", _as_disturbance(self.disturbance))
         object.__setattr__(self, "motor", _as_dataclass("motor", Motor, self.motor))
+
+    @property
+    def model(self) -> type[RobotModel]:
+        """The class of the robot's model."""
+        return MODELS[self.robot]
 
     @property
     def disturbed(self) -> bool:
@@ -179,6 +198,8 @@ class EnvironmentSettings:
         values[ACTUATION_NOISE], values[SLIP], values[SENSING_NOISE] = noise.actuation, noise.slip, noise.sensing
         values[OBSERVATION], values[GOAL_CONDITIONED] = OBSERVATIONS.index(self.observation), self.goal_conditioned
         values[OBSTACLES], values[VERTICES] = self.map_obstacles, self.map_vertices
+        values[DRIVE] = self.model.drive
+        values[MOTION_TOLERANCE] = self.motion_tolerance
         return values
 
 

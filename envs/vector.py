@@ -47,7 +47,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     Args:
         num_envs: number of robots.
-        family, scenario, split, bank: see `NavigateEnv`.
+        family, scenario, split, bank, robot: see `NavigateEnv`.
         autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
             next one. "SameStep": the last step starts the next episode, and `infos["final_obs"]` and
             `infos["final_info"]` describe the end. "Disabled": `reset(options={"reset_mask": mask})` starts it.
@@ -71,6 +71,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         *,
         split: str | None = None,
         bank: Any = None,
+        robot: Any = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         **settings: Any,
@@ -79,8 +80,10 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         for name in settings:
             if name not in SETTING_NAMES:
                 raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
-        self._source = ScenarioSource(family, scenario, split, bank)
-        self.settings = EnvironmentSettings(**settings, goal_conditioned=self._goal_conditioned)
+        self._source = ScenarioSource(family, scenario, split, bank, robot)
+        self.settings = EnvironmentSettings(
+            robot=self._source.robot.model, **settings, goal_conditioned=self._goal_conditioned
+        )
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -92,7 +95,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._simulator = BatchSimulator(self.num_envs, self.settings)
         self.single_observation_space = self._simulator.layout.space
-        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self._source.robot.sizes()[1],), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._simulator.check(self._source.scenario, self.bank)
@@ -193,12 +196,12 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Raises:
             ResetNeeded: before the first reset, or without autoreset after the end of an episode.
-            ValueError: the actions are not finite numbers (num_envs, 2); the state is unchanged then.
+            ValueError: the actions are not finite numbers (num_envs, m); the state is unchanged then.
 
         """
         if self._choices[0] is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        values = check_actions(actions, (self.num_envs, 2))
+        values = check_actions(actions, self.action_space.shape)
         restarting = self._ended.copy()
         if self.autoreset_mode is AutoresetMode.DISABLED and restarting.any():
             raise gym.error.ResetNeeded(f"robot {int(np.argmax(restarting))}: its episode has ended; reset it first")
@@ -282,6 +285,11 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._simulator.poses.copy()
 
     @property
+    def states(self) -> np.ndarray:
+        """The state of each robot (num_envs, n): the pose and the further states of its model."""
+        return np.concatenate([self._simulator.poses, self._simulator.motion], axis=1)
+
+    @property
     def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override] (the same in Gymnasium)
         """The random generator of each robot's scenarios."""
         return tuple(self._generators)
@@ -306,6 +314,8 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         for name, column in columns.FLAGS.items():
             values[name] = state[:, column] != 0.0
         values["pose"] = self._simulator.poses.copy()
+        if self._simulator.motion.shape[1]:
+            values["motion"] = self._simulator.motion.copy()
         parts = {name: -state[:, column] for name, column in columns.PARTS.items()}
         if self.settings.reward == "shaped":
             parts["shaping"] = state[:, columns.SHAPING].copy()
@@ -366,7 +376,7 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
 
 
 # Arguments that are passed on to the settings.
-SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) - {"goal_conditioned"}
+SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) - {"goal_conditioned", "robot"}
 
 
 def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

@@ -12,21 +12,23 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from leapnav.envs.kernels import prepare
-from leapnav.envs.scenarios.scenario import MAX_MAGNITUDE, Scenario
+from leapnav.envs.robots import Unicycle
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.shapes.sampling import sample_grid
+from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
 from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import Candidate, CandidateSearch
-from leapnav.experts.search.descent import descend
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.shortest_paths import LATTICE_KERNELS
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.newton import solve_nodes
+from leapnav.experts.transcription import arcs_descent, descent
 
 N_ELSEWHERE = 4  # additional candidates far from the others: inexpensive, and the most distinct alternatives
 MAX_ROUNDS = 4
@@ -69,9 +71,16 @@ class Optimum(Extremal):
         return path_sides(self.interpolate(times)[:, :2], self.problem.field)
 
     @property
+    def speeds(self) -> np.ndarray:
+        """The speed (N,) along the heading (m/s), negative backwards."""
+        drift, fields = self.problem.dynamics(self.states)
+        rates = drift + np.einsum("kij,kj->ki", fields, self.controls)
+        return rates[:, 0] * np.cos(self.states[:, 2]) + rates[:, 1] * np.sin(self.states[:, 2])
+
+    @property
     def driving_modes(self) -> tuple[Mode, ...]:
         """The sequence of driving modes."""
-        return driving_modes(self.times, self.controls[:, 0])
+        return driving_modes(self.times, self.speeds)
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to dictionaries, lists and numbers, including the alternatives and path classes."""
@@ -100,7 +109,7 @@ KERNELS = (
     sample_grid,
     clearances,
     *LATTICE_KERNELS,
-    descend,
+    arcs_descent.descend,
     solve_nodes,
     *CERTIFICATE_KERNELS,
 )
@@ -139,9 +148,13 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     if not isinstance(cast(object, scenario), Scenario):
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
-    prepare(*KERNELS)
+    is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
+    prepare(*KERNELS, *(() if is_unicycle else (descent.descend,)))
     problem = OptimalControlProblem.from_scenario(scenario)
-    if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.max_speed * scenario.horizon:
+    if (
+        np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2]))
+        > scenario.robot.speed_limits()[0] * scenario.horizon
+    ):
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
     search = LocalOptima(scenario, problem, ALTERNATIVES_BUDGET * candidates)
     grids = Grids(cache(partial(Lattice, scenario)), cache(partial(is_connected, scenario)))
@@ -272,5 +285,6 @@ def as_optimum(extremal: Extremal) -> Optimum:
 def _shortest_time(poses: np.ndarray, scenario: Scenario) -> float:
     """Duration (s) of a path at the limits of the robot."""
     step = np.abs(np.diff(poses, axis=0))
-    driving = np.hypot(step[:, 0], step[:, 1]) / scenario.robot.max_speed
-    return float(np.maximum(driving, step[:, 2] / scenario.robot.max_turn_rate).sum())
+    max_speed, max_turn_rate = scenario.robot.speed_limits()
+    driving = np.hypot(step[:, 0], step[:, 1]) / max_speed
+    return float(np.maximum(driving, step[:, 2] / max_turn_rate).sum())

@@ -20,6 +20,7 @@ from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.solvers.initial_paths import local_minima
 
@@ -166,10 +167,14 @@ def _add_ipopt(search: LocalOptima, scenario: Scenario, paths: list[Trajectory])
     # CasADi is an optional dependency.
     from leapnav.experts.search.ipopt import Transcription
 
-    transcription = Transcription(scenario, IPOPT_INTERVALS)
+    transcription = Transcription(scenario, search.problem, IPOPT_INTERVALS)
+    lift = Lifting(scenario, search.problem)
     for path in paths:
-        problem = search.problem.with_winding_of(path.states)
-        solution = transcription.solve(problem, path)
+        lifted = lift(path)
+        if lifted is None:
+            continue
+        problem = search.problem.with_winding_of(lifted.states)
+        solution = transcription.solve(problem, lifted)
         if solution is not None:
             search.add([solution])
     return len(paths)

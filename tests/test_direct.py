@@ -6,10 +6,10 @@ from leapnav.envs import Scenario
 from leapnav.experts import OptimalControlProblem, Trajectory, find_optimum
 from leapnav.experts.numerics.flow import EndCondition
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.search.descent import descend
-from leapnav.experts.search.direct import discretise, optimise
+from leapnav.experts.transcription.arcs_descent import descend
+from leapnav.experts.transcription.direct import discretise, optimise
 from leapnav.experts.search.lattice import Lattice
-from leapnav.experts.search.transcription import DiscreteProblem
+from leapnav.experts.transcription.arcs import DiscreteProblem
 
 BEST_KNOWN = best_known()
 

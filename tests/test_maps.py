@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from leapnav.envs import Robot, Scenario, ScenarioError
+from leapnav.envs import Unicycle, Scenario, ScenarioError
 from leapnav.envs.scenarios.maps import read_movingai, rectangles
 from leapnav.experts import find_optimum
 
@@ -64,7 +64,7 @@ def test_a_scenario_on_a_map_is_solved_through_its_door(rooms):
     crossing = optimum.states[np.abs(optimum.states[:, 0] - 4.5).argmin()]
     assert 3.0 < crossing[1] < 4.0  # the door is in the fourth line from the top
     poses = {"start": (0.75, 2.75, 0.0), "goal": (3.75, 2.75, 0.0), "horizon": 9.0}
-    half = Scenario.from_movingai(rooms, cell_size=0.5, name="small", robot=Robot(radius=0.1), **poses)
+    half = Scenario.from_movingai(rooms, cell_size=0.5, name="small", robot=Unicycle(radius=0.1), **poses)
     assert (half.name, half.arena) == ("small", (0.0, 0.0, 4.5, 3.5))
     assert half.obstacles[0].shape.vertices == ((0.0, 3.0), (4.5, 3.0), (4.5, 3.5), (0.0, 3.5))
 

@@ -5,7 +5,7 @@ import pytest
 from helpers import best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
-from leapnav.envs import FAMILIES, Robot, Scenario, sample_scenario
+from leapnav.envs import FAMILIES, Unicycle, Scenario, sample_scenario
 from leapnav.experts import Status, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice, Place, is_connected
@@ -221,7 +221,7 @@ def test_a_passage_slightly_too_narrow_does_not_exhaust_the_search():
 def test_walls_with_many_passages_slightly_too_narrow_are_avoided():
     """100 combinations of passages are on the straight line, and all are too narrow."""
     discs = [(x, y, 0.3) for x in (3.0, 5.0, 7.0) for y in np.arange(0.35, 8.5, 0.95)]
-    robot = Robot(radius=0.2)
+    robot = Unicycle(radius=0.2)
     scenario = Scenario.from_discs(
         discs, start=(1, 4, 0), goal=(9, 4, None), horizon=16, arena=(0, 0, 10, 10), robot=robot
     )

@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from leapnav.experts import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.search.direct import discretise, optimise
+from leapnav.experts.transcription.direct import discretise, optimise
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import (
     ANGLES,

@@ -9,6 +9,7 @@ MATRIX = float64[:, ::1]
 CUBE = float64[:, :, ::1]
 # A read-only vector; a writable one is accepted too.
 CONSTANT = types.Array(float64, 1, "C", readonly=True)
+CONSTANT_MATRIX = types.Array(float64, 2, "C", readonly=True)
 FLAGS = types.Array(boolean, 1, "C")
 INTEGERS = int64[::1]
 INDICES = int32[::1]

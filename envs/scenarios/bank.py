@@ -1,13 +1,14 @@
 """Scenario banks: memory-mapped files of scenarios with their certified optima.
 
 A bank is an HDF5 file with contiguous, uncompressed, little-endian datasets. Any HDF5 reader can open it; this one maps
-it into memory. With n scenarios and N_i points of the i-th optimum, evenly spaced in time from 0 to the horizon:
+it into memory. All scenarios of a bank have the same robot model, with n_q states and n_u controls. With n scenarios and
+N_i points of the i-th optimum, evenly spaced in time from 0 to the horizon:
 
 | Dataset | Shape, type | Content |
 |---|---|---|
 | `scenarios` | (bytes,) uint8 | the scenarios as JSON text, concatenated |
 | `scenario_ends` | (n,) int64 | the end of each text |
-| `tasks` | (n, 11) float64 | start (3), goal (3, heading NaN if free), horizon, limits (2), weights (2) |
+| `tasks` | (n, K) float64 | the packed tasks: start (3), goal (3), horizon, limits (n_u), weights (n_u), further states at the start and the goal (n_q - 3 each), parameters; NaN where the goal is free |
 | `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field` |
 | `field_ends` | (n,) int64 | the end of each field |
 | `draws` | (n,) int64 | index of the random draw that produced the scenario |
@@ -15,15 +16,15 @@ it into memory. With n scenarios and N_i points of the i-th optimum, evenly spac
 | `second_costs` | (n,) float64 | J of the second-best local optimum found, NaN if there is none |
 | `certificates` | (n, 4) float64 | boundary residual, defect, drift of H, clearance (m) |
 | `path_ends` | (n,) int64 | the end of the points of each optimum |
-| `states` | (sum of N_i, 3) float32 | x, y (m), heading (rad, unwrapped) |
-| `controls` | (sum of N_i, 2) float32 | speed (m/s), turn rate (rad/s) |
-| `costates` | (sum of N_i, 3) float32 | lambda, the gradient of the cost-to-go |
+| `states` | (sum of N_i, n_q) float32 | x, y (m), heading (rad, unwrapped), further states |
+| `controls` | (sum of N_i, n_u) float32 | for the unicycle speed (m/s), turn rate (rad/s) |
+| `costates` | (sum of N_i, n_q) float32 | lambda, the gradient of the cost-to-go |
 
 Attributes of the file: `format` ("leapnav-bank"), `version` (4), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
 leapnav that built the bank) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that of
 the other attributes).
-"""
+"""  # noqa: E501 (tables)
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from leapnav.envs.scenarios.scenario import TASK_COLUMNS, Scenario
+from leapnav.envs.robots import RobotModel, Unicycle
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import atomic_path
 from leapnav.envs.utils.validation import check_choice, is_integer
 
@@ -65,7 +67,7 @@ _TYPES = {
     "costates": "<f4",
 }
 
-_WIDTHS = {"tasks": (TASK_COLUMNS,), "certificates": (4,), "states": (3,), "controls": (2,), "costates": (3,)}
+_TABLES = ("tasks", "certificates", "states", "controls", "costates")  # datasets with columns
 
 
 class BankError(ValueError):
@@ -81,9 +83,9 @@ class Reference:
         second_cost: J of the second-best local optimum found, None if there is none.
         certificate: boundary residual, defect, drift of H, clearance (m).
         times (N,): times of the points (s), from 0 to the horizon.
-        states (N, 3): x, y (m) and heading (rad, unwrapped), float32.
-        controls (N, 2): speed (m/s) and turn rate (rad/s), float32.
-        costates (N, 3): gradient of the cost-to-go, float32.
+        states (N, n): x, y (m), heading (rad, unwrapped) and further states, float32.
+        controls (N, m): the robot's controls, float32.
+        costates (N, n): gradient of the cost-to-go, float32.
 
     """
 
@@ -133,7 +135,7 @@ class ScenarioBank(Sequence[Scenario]):
         second_costs (n,): costs of the second-best local optima found, NaN if there is none.
         certificates (n, 4): boundary residual, defect, drift of H, clearance (m).
         draws (n,): indices of the random draws that produced the scenarios.
-        tasks (n, 11): start (3), goal (3, heading NaN if free), horizon, limits (2), weights (2).
+        tasks (n, K): see `leapnav.envs.scenarios.scenario`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -197,6 +199,24 @@ class ScenarioBank(Sequence[Scenario]):
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
         self.tasks = arrays["tasks"]
         self._scenarios: dict[int, Scenario] = {}
+        self._check_widths()
+
+    @property
+    def robot(self) -> RobotModel:
+        """The robot of the first scenario, a unicycle in an empty bank."""
+        return self[0].robot if len(self) else Unicycle()
+
+    def _check_widths(self) -> None:
+        """Raise BankError unless the numbers of columns are those of the robot."""
+        n, m = self.robot.sizes()
+        columns = len(self[0].task) if len(self) else self.tasks.shape[1]
+        expected = {"tasks": columns, "certificates": 4, "states": n, "controls": m, "costates": n}
+        for name, width in expected.items():
+            if self._stored[name].shape[1] != width:
+                found = self._stored[name].shape[1]
+                raise BankError(
+                    f"{self.path}: not a scenario bank, or damaged: {name}: expected {width} columns, got {found}"
+                )
 
     def _verify(self, name: str, content: np.ndarray | bytes) -> None:
         """Compare the content of a dataset, or the attributes, with the stored checksum.
@@ -226,21 +246,32 @@ class ScenarioBank(Sequence[Scenario]):
             self._array(name)
 
     @classmethod
-    def shipped(cls, family: str, split: str) -> ScenarioBank:
+    def shipped_families(cls, robot: str = "unicycle") -> list[str]:
+        """Return the families of which banks for a robot model are included in the package."""
+        found = (path.name.removesuffix("-test.bank") for path in BANK_DIRECTORY.glob("*-test.bank"))
+        prefix = "" if robot == "unicycle" else f"{robot}-"
+        return sorted(
+            name.removeprefix(prefix)
+            for name in found
+            if name.startswith(prefix) and name.count("-") == prefix.count("-")
+        )
+
+    @classmethod
+    def shipped(cls, family: str, split: str, robot: str = "unicycle") -> ScenarioBank:
         """Return a bank included in the package; repeated calls return the same object.
 
         Args:
             family: one of `leapnav.envs.FAMILIES`.
             split: "train" or "test".
+            robot: model of the robot.
 
         Raises:
-            ValueError: there is no such family or split.
+            ValueError: there is no such bank.
 
         """
-        families = sorted(path.name.removesuffix("-test.bank") for path in BANK_DIRECTORY.glob("*-test.bank"))
-        check_choice("family", family, families)
+        check_choice("family", family, cls.shipped_families(robot))
         check_choice("split", split, SPLITS)
-        return _shipped(family, split)
+        return _shipped(family if robot == "unicycle" else f"{robot}-{family}", split)
 
     def __len__(self) -> int:
         return len(self.costs)
@@ -296,7 +327,7 @@ class ScenarioBank(Sequence[Scenario]):
         return self._array("fields")[start:end]
 
     def states(self, index: int) -> np.ndarray:
-        """Return the states (N, 3) of the optimum of a scenario, see `Reference`.
+        """Return the states (N, n_q) of the optimum of a scenario, see `Reference`.
 
         Raises:
             IndexError: the index is out of range.
@@ -331,8 +362,8 @@ class ScenarioBank(Sequence[Scenario]):
 
 
 @cache
-def _shipped(family: str, split: str) -> ScenarioBank:
-    return ScenarioBank(BANK_DIRECTORY / f"{family}-{split}.bank")
+def _shipped(name: str, split: str) -> ScenarioBank:
+    return ScenarioBank(BANK_DIRECTORY / f"{name}-{split}.bank")
 
 
 def _digest(content: np.ndarray | bytes) -> str:
@@ -351,7 +382,7 @@ def _locate(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
     if (
         dataset.dtype != np.dtype(_TYPES[name])
         or dataset.chunks is not None
-        or dataset.shape[1:] != _WIDTHS.get(name, ())
+        or len(dataset.shape) != (2 if name in _TABLES else 1)
     ):
         raise ValueError(f"{name}: type or layout differs from the format")
     # A dataset without entries has no offset.
@@ -392,15 +423,22 @@ def write_bank(
         entries: the scenarios with their optima.
         family, seed, drawn, rejected, software: see `ScenarioBank`.
 
+    Raises:
+        ValueError: the scenarios have different robot models.
+
     """
     import h5py
 
     texts = [entry.scenario.encode() for entry in entries]
     scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
+    models = sorted({scenario.robot.model for scenario in scenarios})
+    if len(models) > 1:
+        raise ValueError(f"entries: expected one robot model for all scenarios, got {', '.join(models)}")
+    n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
     columns: dict[str, Any] = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
         "scenario_ends": np.cumsum([len(text) for text in texts]),
-        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(-1, TASK_COLUMNS),
+        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(len(scenarios), -1 if scenarios else 11),
         "fields": np.concatenate([np.empty(0), *(scenario.field for scenario in scenarios)]),
         "field_ends": np.cumsum([len(scenario.field) for scenario in scenarios]),
         "draws": [entry.draw for entry in entries],
@@ -408,9 +446,9 @@ def write_bank(
         "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],
         "certificates": np.array([entry.certificate for entry in entries]).reshape(-1, 4),
         "path_ends": np.cumsum([len(entry.states) for entry in entries]),
-        "states": np.concatenate([np.empty((0, 3)), *(entry.states for entry in entries)]),
-        "controls": np.concatenate([np.empty((0, 2)), *(entry.controls for entry in entries)]),
-        "costates": np.concatenate([np.empty((0, 3)), *(entry.costates for entry in entries)]),
+        "states": np.concatenate([np.empty((0, n)), *(entry.states for entry in entries)]),
+        "controls": np.concatenate([np.empty((0, m)), *(entry.controls for entry in entries)]),
+        "costates": np.concatenate([np.empty((0, n)), *(entry.costates for entry in entries)]),
     }
     arrays = {name: np.asarray(values, dtype=_TYPES[name]) for name, values in columns.items()}
     attributes = {

@@ -6,13 +6,15 @@ A family is a function from a random generator to a layout. Robot, cost, poses a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Robot, Scenario
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.robots import RobotModel
+from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Scenario, check_robot
+from leapnav.envs.shapes.clearance import clearances, footprint_clearances
 from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.validation import suggestion
 
@@ -133,7 +135,9 @@ def check_family(family: object) -> None:
         raise ValueError(f"family: expected one of {', '.join(FAMILIES)} or {ALL}, got {family!r}{hint}")
 
 
-def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
+def sample_scenario(
+    family: str, seed: int | np.random.Generator, robot: RobotModel | Mapping[str, Any] | str = "unicycle"
+) -> Scenario:
     """Sample a random scenario; the same family and seed give the same scenario.
 
     Start and goal are at least 4 m apart and connected by a path with a margin of 0.1 m on either side of the robot.
@@ -142,29 +146,34 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     Args:
         family: one of `FAMILIES`, or "all" to sample the family, too.
         seed: an integer, or a random generator.
+        robot: name of a robot model, a dict of its fields with `model`, or a robot. Obstacles and poses are the same for
+            robots with the same footprint.
 
     Raises:
-        ValueError: the family is unknown.
+        ValueError: the family or the robot is invalid.
 
     """
     check_family(family)
+    body = check_robot(robot)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
     if family == ALL:
         family = list(FAMILIES)[rng.integers(len(FAMILIES))]
     name = family if isinstance(seed, np.random.Generator) else f"{family}-{seed}"
-    robot, cost = Robot(), Cost()
+    discs, cost = body.discs(), Cost()
     while True:  # rejection sampling: the draws are independent, so it ends
         layout = FAMILIES[family](rng)
         areas = np.array([layout.start, layout.goal])
         field = pack_field(
             [obstacle.shape for obstacle in layout.obstacles],
             ARENA,
-            robot.radius,
+            float(discs[:, 1].max()),
             cost.proximity_weight,
             cost.proximity_scale,
         )
         poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
-        if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE or clearances(poses, field).min() < MIN_POSE_CLEARANCE:
+        if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE or (
+            footprint_clearances(poses, discs, field).min() < MIN_POSE_CLEARANCE
+        ):
             continue
         length = _shortest_path(field, poses[0, :2], poses[1, :2])
         if length is not None:
@@ -173,7 +182,7 @@ def sample_scenario(family: str, seed: int | np.random.Generator) -> Scenario:
     return Scenario(
         name=name,
         arena=ARENA,
-        robot=robot,
+        robot=body,
         start=start,
         goal=goal,
         horizon=round(min(length / REFERENCE_SPEED, MAX_HORIZON), 1),

@@ -12,26 +12,25 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
+from leapnav.deprecated import deprecated_names
+from leapnav.envs.robots import Disc, RobotModel, Unicycle
+from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
+from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Point, Positive
 from leapnav.envs.utils.validation import check_positive, suggestion
 
-# Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
-MAX_MAGNITUDE = 1e6
-# Columns of a packed task: start (x, y, heading), goal (x, y, heading; NaN if free), then one column each.
-START, GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, TURN_WEIGHT, TASK_COLUMNS = 0, 3, 6, 7, 8, 9, 10, 11
-Finite = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
-Point = tuple[Finite, Finite]
-
-
+# Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
+# goal heading NaN if free), the horizon, the limits (m) and weights (m) of the controls, the further states (n - 3) at
+# the start and at the goal (NaN if free), and the parameters (k).
+START, GOAL, HORIZON, LIMITS = 0, 3, 6, 7
 MAX_FAULTS = 8  # faults in one message
 # Messages for the types of pydantic's errors.
 EXPECTED = {
@@ -53,36 +52,23 @@ class ScenarioError(ValueError):
     """A scenario is invalid. The message is one line with the scenario and, for each fault, the field and the value."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
-class Robot(_Frozen):
-    """The robot: its model, radius (m), maximum speed (m/s) and maximum turn rate (rad/s)."""
-
-    model: Literal["unicycle"] = "unicycle"
-    radius: Positive = 0.25
-    max_speed: Positive = 2.0
-    max_turn_rate: Positive = 3.0
-
-
-class Cost(_Frozen):
-    """Weights of the running cost 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(x, y)."""
+class Cost(Frozen):
+    """Weights of the running cost 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(q), see the robot's model."""
 
     speed_weight: Positive = 1.0
     turn_weight: Positive = 0.5
-    proximity_weight: Annotated[float, Field(ge=0, le=MAX_MAGNITUDE, allow_inf_nan=False)] = 1.0
+    proximity_weight: NotNegative = 1.0
     proximity_scale: Positive = 0.1
 
 
-class Circle(_Frozen):
+class Circle(Frozen):
     """A disc obstacle: center (x, y) and radius (m)."""
 
     center: Point
     radius: Positive
 
 
-class Polygon(_Frozen):
+class Polygon(Frozen):
     """A convex polygon obstacle: at least three vertices (x, y) (m), in either orientation."""
 
     vertices: tuple[Point, ...]
@@ -104,7 +90,7 @@ class Polygon(_Frozen):
         return vertices
 
 
-class Obstacle(_Frozen):
+class Obstacle(Frozen):
     """An obstacle: exactly one of a circle or a polygon, `{"circle": {...}}` or `{"polygon": {...}}` in the file."""
 
     circle: Circle | None = None
@@ -124,18 +110,20 @@ class Obstacle(_Frozen):
         return shape
 
 
-class Scenario(_Frozen):
+class Scenario(Frozen):
     """A navigation task. Immutable; scenarios with equal fields are equal.
 
     Args:
         name: label used in messages and tables.
         arena: (x_min, y_min, x_max, y_max), the positions of the walls (m).
-        robot: model, radius and limits of the robot.
+        robot: model, footprint and limits of the robot, a model of `leapnav.envs.robots`.
         start: pose (x, y, heading) at time 0.
         goal: pose (x, y, heading) at the horizon; a heading of None is free.
         horizon: duration of the task (s).
         obstacles: circles and convex polygons.
         cost: weights of the running cost.
+        start_motion: further states of the robot at time 0, such as speed and turn rate; None for zeros.
+        goal_motion: further states at the horizon, each a number or None if it is free; None for those of the model.
 
     Raises:
         ScenarioError: a field is missing, unknown, not finite or invalid.
@@ -144,18 +132,25 @@ class Scenario(_Frozen):
 
     name: str = "scenario"
     arena: tuple[Finite, Finite, Finite, Finite]
-    robot: Robot = Robot()
+    robot: SerializeAsAny[RobotModel] = Unicycle()
     start: tuple[Finite, Finite, Finite]
     goal: tuple[Finite, Finite, Finite | None]
     horizon: Positive
     obstacles: tuple[Obstacle, ...] = ()
     cost: Cost = Cost()
+    start_motion: tuple[Finite, ...] | None = None
+    goal_motion: tuple[Finite | None, ...] | None = None
 
     def __init__(self, /, **fields: Any) -> None:
+        faults: list[str] = []
+        if isinstance(robot := fields.get("robot"), Mapping):
+            fields["robot"], faults = _read_robot(robot)
         try:
             super().__init__(**fields)
         except ValidationError as error:
-            raise ScenarioError(_one_line(fields.get("name", "scenario"), error)) from None
+            faults += [_fault(details) for details in error.errors(include_url=False)]
+        if faults:
+            raise ScenarioError(_one_line(fields.get("name", "scenario"), faults)) from None
 
     @field_validator("arena")
     @classmethod
@@ -166,11 +161,31 @@ class Scenario(_Frozen):
         return arena
 
     @model_validator(mode="after")
+    def _check_robot(self) -> Self:
+        name, robot = self.robot.model, self.robot
+        further = robot.state_names[3:]
+        for field in ("start_motion", "goal_motion"):
+            values = getattr(self, field)
+            if values is not None and len(values) != len(further):
+                expected = f"{len(further)} ({', '.join(further)})" if further else "0"
+                raise ValueError(f"{field}: expected {expected} numbers for the robot {name!r}, got {values!r}")
+        for field in ("speed_weight", "turn_weight"):
+            value = getattr(self.cost, field)
+            if field not in robot.cost_fields and value != Cost.model_fields[field].default:
+                raise ValueError(f"cost.{field}: not used by the robot {name!r}, got {value:g}")
+        return self
+
+    @model_validator(mode="after")
     def _check_poses_are_free(self) -> Self:
         names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
         faults = []
         for field, pose in (("start", self.start), ("goal", self.goal)):
-            distance, nearest = clearance(pose[0], pose[1], self.field)
+            x, y, heading = pose
+            distance, nearest = footprint_clearance(x, y, heading or 0.0, self.discs, self.field)
+            if heading is None and self.robot.footprint is not None:  # some heading must be free
+                headings = np.linspace(-np.pi, np.pi, 73).tolist()
+                found = [footprint_clearance(x, y, angle, self.discs, self.field) for angle in headings]
+                distance, nearest = max(found)
             if not distance > 0:
                 faults.append(
                     f"{field}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
@@ -184,15 +199,35 @@ class Scenario(_Frozen):
         """The packed obstacle field, see `leapnav.envs.shapes.field` (read-only)."""
         cost = self.cost
         shapes = [obstacle.shape for obstacle in self.obstacles]
-        return pack_field(shapes, self.arena, self.robot.radius, cost.proximity_weight, cost.proximity_scale)
+        radius = float(self.discs[:, 1].max())
+        return pack_field(shapes, self.arena, radius, cost.proximity_weight, cost.proximity_scale)
+
+    @cached_property
+    def discs(self) -> np.ndarray:
+        """The discs of the robot's footprint (D, 2): offset along its axis and radius (m) (read-only)."""
+        discs = self.robot.discs()
+        discs.flags.writeable = False
+        return discs
+
+    @property
+    def start_state(self) -> tuple[float, ...]:
+        """The state (n,) of the robot at time 0."""
+        n = self.robot.sizes()[0]
+        return (*self.start, *((0.0,) * (n - 3) if self.start_motion is None else self.start_motion))
+
+    @property
+    def goal_state(self) -> tuple[float | None, ...]:
+        """The state (n,) of the robot at the horizon; None where it is free."""
+        return (*self.goal, *(self.robot.goal_motion if self.goal_motion is None else self.goal_motion))
 
     @cached_property
     def task(self) -> np.ndarray:
-        """The packed task (TASK_COLUMNS,): start, goal, horizon, limits and weights (read-only)."""
-        goal, robot, cost = self.goal, self.robot, self.cost
-        heading = math.nan if goal[2] is None else goal[2]
-        limits, weights = (robot.max_speed, robot.max_turn_rate), (cost.speed_weight, cost.turn_weight)
-        task = np.array([*self.start, goal[0], goal[1], heading, self.horizon, *limits, *weights])
+        """The packed task, see the constants of this module (read-only)."""
+        robot, cost = self.robot, self.cost
+        goal = [math.nan if value is None else value for value in self.goal_state]
+        controls = (*robot.limits(), *robot.control_weight(cost))
+        further = (*self.start_state[3:], *goal[3:], *robot.parameters(cost))
+        task = np.array([*self.start, *goal[:3], self.horizon, *controls, *further])
         task.flags.writeable = False
         return task
 
@@ -214,7 +249,10 @@ class Scenario(_Frozen):
     def __getstate__(self) -> dict[Any, Any]:
         state = super().__getstate__()
         # Arrays are writeable after unpickling, so the packed ones are computed again instead.
-        return {**state, "__dict__": {k: v for k, v in state["__dict__"].items() if k not in ("field", "task")}}
+        return {
+            **state,
+            "__dict__": {k: v for k, v in state["__dict__"].items() if k not in ("field", "discs", "task")},
+        }
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Return the scenario as JSON text, and write it to `path` if one is given."""
@@ -344,6 +382,37 @@ class Scenario(_Frozen):
         return scenario
 
 
+def check_robot(value: RobotModel | Mapping[str, Any] | str) -> RobotModel:
+    """Return a robot given by the name of its model, a dict of its fields with `model`, or itself.
+
+    Raises:
+        ValueError: it is invalid; the message names the field and the value.
+
+    """
+    if isinstance(value, RobotModel):
+        return value
+    if isinstance(value, str):
+        value = {"model": value}
+    if not isinstance(value, Mapping):
+        raise ValueError(f"robot: expected the name of a model, a dict of its fields or a robot, got {_shorten(value)}")
+    robot, faults = _read_robot(value)
+    if faults:
+        raise ValueError("; ".join(faults))
+    return robot
+
+
+def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
+    """Return a robot from its fields, with the faults; with faults, another robot."""
+    try:
+        model = robot_class(fields.get("model", "unicycle"))
+    except ValueError as error:
+        return Unicycle(), [f"robot.model: {error}"]
+    try:
+        return model(**_tuples(dict(fields))), []
+    except ValidationError as error:
+        return Unicycle(), [_fault(details, model) for details in error.errors(include_url=False)]
+
+
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     fields = dict(pairs)
     if len(fields) < len(pairs):
@@ -393,20 +462,21 @@ def _shorten(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _one_line(name: Any, error: ValidationError) -> str:
-    """Return all faults of a pydantic error as one line: scenario, then field, fault and value of each."""
-    faults = [_fault(details) for details in error.errors(include_url=False)]
+def _one_line(name: Any, faults: list[str]) -> str:
+    """Return all faults as one line: scenario, then field, fault and value of each."""
     hidden = len(faults) - MAX_FAULTS
     text = "; ".join(faults[:MAX_FAULTS]) + (f"; and {hidden} more faults" if hidden > 0 else "")
     return " ".join(f"Scenario {_shorten(name)}: {text}".splitlines())  # an unknown key may contain line breaks
 
 
-def _fault(details: ErrorDetails) -> str:
-    """Return one fault: field, what is expected, and the value."""
+def _fault(details: ErrorDetails, robot: type[BaseModel] | None = None) -> str:
+    """Return one fault, of the scenario or of a robot of the given class: field, what is expected, and the value."""
     location, context, kind = details["loc"], details.get("ctx", {}), details["type"]
+    if robot is not None:
+        location = ("robot", *location)
     path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".")
     if kind == "extra_forbidden":
-        hint = suggestion(location[-1], _known_fields(location[:-1]))
+        hint = suggestion(location[-1], _known_fields(location[:-1], robot or Unicycle))
         return f"{path}: unknown field, got {_shorten(details['input'])}{hint}"
     if kind == "missing":
         return f"{path}: missing"
@@ -420,8 +490,18 @@ def _fault(details: ErrorDetails) -> str:
     return f"{path}: {message}, got {_shorten(details['input'])}" if path else message
 
 
-def _known_fields(location: Sequence[Any]) -> tuple[str, ...]:
+def _known_fields(location: Sequence[Any], robot: type[BaseModel]) -> tuple[str, ...]:
     """Return the fields of the part of a scenario at a location."""
-    parts: dict[Any, type[BaseModel]] = {"robot": Robot, "cost": Cost, "circle": Circle, "polygon": Polygon}
-    model = parts.get(location[-1], Obstacle) if location else Scenario
+    parts: dict[Any, type[BaseModel]] = {
+        "robot": robot,
+        "footprint": Disc,
+        "cost": Cost,
+        "circle": Circle,
+        "polygon": Polygon,
+    }
+    names = [key for key in location if isinstance(key, str)]
+    model = parts.get(names[-1], Obstacle) if names else Scenario
     return tuple(model.model_fields)
+
+
+__getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})

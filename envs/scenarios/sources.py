@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, check_family, sample_scenario
-from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
+from leapnav.envs.scenarios.scenario import Scenario, ScenarioError, check_robot
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 SPLITS = ("train", "test", "fresh")
@@ -21,9 +22,10 @@ class ScenarioSource:
     """The source of an environment's scenarios: a fixed scenario, a bank, or a family.
 
     Args:
-        family, scenario, split, bank: see `NavigateEnv`.
+        family, scenario, split, bank, robot: see `NavigateEnv`.
 
     Attributes:
+        robot: the robot of new scenarios; that of the bank or of the fixed scenario if one is given.
         family: name of the family; that of the bank if a bank is given.
         scenario: the fixed scenario, or None.
         bank: the scenario bank, or None.
@@ -41,6 +43,7 @@ class ScenarioSource:
         scenario: Scenario | Mapping[str, Any] | str | None = None,
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
+        robot: RobotModel | Mapping[str, Any] | str | None = None,
     ) -> None:
         if family is not None:
             check_family(family)
@@ -63,8 +66,16 @@ class ScenarioSource:
             self.family = self.bank.family
             if len(self.bank) == 0:
                 raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
-        elif scenario is None and split != "fresh" and family != ALL:
-            self.bank = ScenarioBank.shipped(family, split or "train")
+        chosen = Unicycle() if robot is None else check_robot(robot)
+        if self.bank is None and scenario is None and split != "fresh" and family != ALL:
+            self.bank = _shipped_bank(family, split, chosen)
+        given_by = (
+            self.scenario.robot if self.scenario is not None else self.bank.robot if self.bank is not None else None
+        )
+        if robot is not None and given_by is not None and given_by != chosen:
+            place = "scenario" if self.scenario is not None else "bank"
+            raise ValueError(f"robot: expected that of the {place}, {given_by!r}, got {chosen!r}")
+        self.robot: RobotModel = given_by or chosen
 
     def select(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:
         """Return the scenario that the options of a reset select, or its index in the bank; None without a selection.
@@ -89,7 +100,26 @@ class ScenarioSource:
         """Sample the scenario of an episode, or its index in the bank."""
         if self.bank is not None:
             return int(rng.integers(len(self.bank)))
-        return sample_scenario(self.family, rng) if self.scenario is None else self.scenario
+        return sample_scenario(self.family, rng, self.robot) if self.scenario is None else self.scenario
+
+
+def _shipped_bank(family: str, split: str | None, robot: RobotModel) -> ScenarioBank | None:
+    """Return the included bank of a family for a robot, or None to sample fresh scenarios.
+
+    Raises:
+        ValueError: a split is given, and there is no included bank for the robot.
+
+    """
+    names = ScenarioBank.shipped_families(robot.model)
+    if family in names and robot == type(robot)():
+        return ScenarioBank.shipped(family, split or "train", robot.model)
+    if split is not None:
+        reason = f"for {', '.join(names)}" if names else "for no family"
+        which = f"{robot.model!r}" if robot == type(robot)() else f"{robot.model!r} with these parameters"
+        if robot != type(robot)():
+            reason = "for the default parameters only"
+        raise ValueError(f"split: the robot {which} has included banks {reason}, got {split!r} of {family!r}")
+    return None
 
 
 def as_scenario(value: Scenario | Mapping[str, Any] | str) -> Scenario:

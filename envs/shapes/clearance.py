@@ -1,4 +1,4 @@
-"""The clearance of a packed obstacle field (kernels): signed distance from the robot's rim to the nearest obstacle."""
+"""The clearance of a packed obstacle field (kernels): signed distance of the robot to the nearest obstacle."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, VECTOR, tuple_of
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.field import ARENA, CIRCLES, GRID, POLYGONS, SHAPES
 from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
-def clearance(x, y, field):
-    """Signed distance (m) from the robot's rim to the nearest obstacle or wall, and the index of that obstacle.
+def obstacle_distance(x, y, field):
+    """Signed distance (m) from a point to the nearest obstacle or wall, and the index of that obstacle.
 
     Negative inside. The wall has the index after the last obstacle.
     """
-    radius = field[2]
     circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
     indices = int(field[GRID]) - circles - polygons
     best = min(
@@ -43,7 +42,48 @@ def clearance(x, y, field):
             distance = polygon_distance(x, y, field, rows, edges)
             if distance < best:
                 best, nearest = distance, int(field[indices + circles + i])
-    return best - radius, nearest
+    return best, nearest
+
+
+@kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
+def clearance(x, y, field):
+    """Signed distance (m) from a disc with the radius of the field, and the index of the nearest obstacle.
+
+    See `obstacle_distance`.
+    """
+    distance, nearest = obstacle_distance(x, y, field)
+    return distance - field[2], nearest
+
+
+@kernel(tuple_of(float64, int64)(float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
+def footprint_clearance(x, y, heading, discs, field):
+    """Signed distance (m) from the robot's outline to the nearest obstacle or wall, and the index of that obstacle.
+
+    Args:
+        x, y, heading: pose (m, rad).
+        discs (D, 2): offsets along the robot's axis and radii (m).
+        field: packed obstacle field.
+
+    """
+    if len(discs) == 1 and discs[0, 0] == 0.0:
+        distance, nearest = obstacle_distance(x, y, field)
+        return distance - discs[0, 1], nearest
+    cos, sin = math.cos(heading), math.sin(heading)
+    best, found = np.inf, -1
+    for k in range(len(discs)):
+        distance, nearest = obstacle_distance(x + discs[k, 0] * cos, y + discs[k, 0] * sin, field)
+        if distance - discs[k, 1] < best:
+            best, found = distance - discs[k, 1], nearest
+    return best, found
+
+
+@kernel(VECTOR(float64[:, :], CONSTANT_MATRIX, CONSTANT))
+def footprint_clearances(poses, discs, field):
+    """Clearance (m) of the robot's outline at many poses, shape (N, >= 3) -> (N,)."""
+    result = np.empty(len(poses))
+    for i in range(len(poses)):
+        result[i] = footprint_clearance(poses[i, 0], poses[i, 1], poses[i, 2], discs, field)[0]
+    return result
 
 
 @kernel(VECTOR(float64[:, :], CONSTANT))

@@ -2,7 +2,8 @@
 
 The entries of the array are, by index:
 
-    [0] proximity weight k   [1] proximity scale sigma   [2] robot radius   [3] circles   [4] polygons
+    [0] proximity weight k   [1] proximity scale sigma   [2] largest radius of a disc of the robot's footprint
+    [3] circles   [4] polygons
     [5:9] arena (x_min, y_min, x_max, y_max)   [9] index at which the grid begins
     then per circle:   x, y, r
     then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
@@ -46,7 +47,7 @@ def pack_field(
     Args:
         shapes: obstacles with `center` and `radius`, or with `vertices`.
         arena: (x_min, y_min, x_max, y_max) (m).
-        radius: radius of the robot (m).
+        radius: largest radius of a disc of the robot's footprint (m).
         weight, scale: proximity weight and proximity scale (m).
 
     """

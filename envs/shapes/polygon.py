@@ -43,8 +43,8 @@ def polygon_distance(x, y, field, rows, edges):
     return inside if inside < 0 else outside
 
 
-@kernel(float64(float64, float64, CONSTANT, int64, int64, float64))
-def polygon_term(x, y, field, rows, edges, steepness):
+@kernel(float64(float64, float64, CONSTANT, int64, int64, float64, float64))
+def polygon_term(x, y, field, rows, edges, radius, steepness):
     """Value of the proximity term per unit of weight: 1 / (sum over the edges of exp((distance - radius) / scale))."""
     largest = half_plane_distance(x, y, field, rows, edges)
     total = 0.0
@@ -52,7 +52,7 @@ def polygon_term(x, y, field, rows, edges, steepness):
         row = rows + 5 * j
         # Shifted by the largest distance: exp() of the distances themselves overflows.
         total += math.exp((field[row] * x + field[row + 1] * y - field[row + 2] - largest) * steepness)
-    return math.exp((field[2] - largest) * steepness) / total
+    return math.exp((radius - largest) * steepness) / total
 
 
 @kernel(tuple_of(*[float64] * 5)(float64, float64, float64, float64, float64, float64, float64))

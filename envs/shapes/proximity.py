@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from numba import float64
+from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
@@ -22,8 +22,14 @@ VALUE_CUTOFF = 25.0  # proximity scales beyond which a term is skipped where not
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, CONSTANT))
 def proximity(x, y, field):
-    """Proximity cost at a point: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
-    k, radius = field[0], field[2]
+    """Proximity cost of a disc with the radius of the field, see `disc_proximity`."""
+    return disc_proximity(x, y, field[2], field)
+
+
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
+def disc_proximity(x, y, radius, field):
+    """Proximity cost of a disc: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
+    k = field[0]
     reach = CUTOFF * field[1]
     steepness = 1.0 / field[1]  # divisions are the slow part of a term, after exp()
     value = gx = gy = hxx = hxy = hyy = 0.0
@@ -42,7 +48,7 @@ def proximity(x, y, field):
                 gy -= slope
                 hyy += sign * slope * steepness
     if field[int(field[GRID]) + 3] > 0.0:
-        found = grid_proximity(x, y, field)
+        found = grid_proximity(x, y, radius, field)
         gx, gy = gx + found[1], gy + found[2]
         return value + found[0], gx, gy, hxx + found[3], hxy + found[4], hyy + found[5]
     at = SHAPES
@@ -98,22 +104,22 @@ def proximity(x, y, field):
     return value, gx, gy, hxx, hxy, hyy
 
 
-@kernel(float64(float64, float64, CONSTANT))
-def proximity_value(x, y, field):
-    """Proximity cost at a point, without derivatives, to 1e-11 of the weight for each obstacle."""
-    return proximity_values(x, y, x, y, x, y, field)[1]
+@kernel(float64(float64, float64, float64, CONSTANT))
+def proximity_value(x, y, radius, field):
+    """Proximity cost of a disc, without derivatives, to 1e-11 of the weight for each obstacle."""
+    return proximity_values(x, y, x, y, x, y, radius, field)[1]
 
 
-@kernel(tuple_of(*[float64] * 3)(float64, float64, float64, float64, float64, float64, CONSTANT))
-def proximity_values(xa, ya, xb, yb, xc, yc, field):
+@kernel(tuple_of(*[float64] * 3)(float64, float64, float64, float64, float64, float64, float64, CONSTANT))
+def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
     """Proximity cost, as `proximity_value`, at three points near each other, the second between the others.
 
     One test of the distance serves all three, which takes half the time of three calls.
     """
     if field[int(field[GRID]) + 3] > 0.0:  # the cells of the grid list the relevant obstacles
-        first, second = proximity(xa, ya, field)[0], proximity(xb, yb, field)[0]
-        return first, second, proximity(xc, yc, field)[0]
-    radius, steepness = field[2], 1.0 / field[1]
+        first, second = disc_proximity(xa, ya, radius, field)[0], disc_proximity(xb, yb, radius, field)[0]
+        return first, second, disc_proximity(xc, yc, radius, field)[0]
+    steepness = 1.0 / field[1]
     apart = max(abs(xa - xb) + abs(ya - yb), abs(xc - xb) + abs(yc - yb))
     reach = VALUE_CUTOFF * field[1] + apart
     first = second = third = 0.0
@@ -138,8 +144,42 @@ def proximity_values(xa, ya, xb, yb, xc, yc, field):
         rows = at + 1
         at = rows + 5 * edges
         if half_plane_distance(xb, yb, field, rows, edges) - radius < reach:
-            first += polygon_term(xa, ya, field, rows, edges, steepness)
-            second += polygon_term(xb, yb, field, rows, edges, steepness)
-            third += polygon_term(xc, yc, field, rows, edges, steepness)
+            first += polygon_term(xa, ya, field, rows, edges, radius, steepness)
+            second += polygon_term(xb, yb, field, rows, edges, radius, steepness)
+            third += polygon_term(xc, yc, field, rows, edges, radius, steepness)
     weight = field[0]
     return weight * first, weight * second, weight * third
+
+
+@kernel(tuple_of(*[float64] * 10)(float64, float64, float64, CONSTANT, int64, CONSTANT))
+def footprint_proximity(x, y, heading, data, first, field):
+    """Proximity cost of a footprint: the sum over its discs.
+
+    Args:
+        x, y, heading: pose (m, rad).
+        data: offset along the robot's axis and radius (m) of each disc, from the index `first` to the end.
+        first: see `data`.
+        field: packed obstacle field.
+
+    Returns:
+        (Phi, Phi_x, Phi_y, Phi_h, Phi_xx, Phi_xy, Phi_xh, Phi_yy, Phi_yh, Phi_hh); h is the heading.
+
+    """
+    cos, sin = math.cos(heading), math.sin(heading)
+    value = gx = gy = gh = hxx = hxy = hxh = hyy = hyh = hhh = 0.0
+    for k in range(first, len(data), 2):
+        a = data[k]
+        term, tx, ty, txx, txy, tyy = disc_proximity(x + a * cos, y + a * sin, data[k + 1], field)
+        # Derivatives of the disc's centre with respect to the heading.
+        dx, dy = -a * sin, a * cos
+        value += term
+        gx += tx
+        gy += ty
+        gh += tx * dx + ty * dy
+        hxx += txx
+        hxy += txy
+        hyy += tyy
+        hxh += txx * dx + txy * dy
+        hyh += txy * dx + tyy * dy
+        hhh += (txx * dx + 2.0 * txy * dy) * dx + tyy * dy * dy - a * (tx * cos + ty * sin)
+    return value, gx, gy, gh, hxx, hxy, hxh, hyy, hyh, hhh

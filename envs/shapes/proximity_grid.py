@@ -52,12 +52,12 @@ def exponential(x):
 
 
 @kernel(
-    tuple_of(*[float64] * 6)(float64, float64, CONSTANT),
+    tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT),
     fastmath={"contract", "nsz", "reassoc"},
 )
-def grid_proximity(x, y, field):
-    """Return (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy) of the obstacles in the grid, without the walls."""
-    k, steepness, radius = field[0], 1.0 / field[1], field[2]
+def grid_proximity(x, y, radius, field):
+    """Return, for a disc of a radius (m), (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy) of the obstacles in the grid, without the walls."""
+    k, steepness = field[0], 1.0 / field[1]
     grid = np.uint64(field[GRID])
     columns, lines = int(field[grid + 3]), int(field[grid + 4])
     column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)

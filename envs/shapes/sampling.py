@@ -34,14 +34,14 @@ def _index_range(low, high, origin, spacing, count):
     return max(int((low - origin) / spacing), 0), min(int((high - origin) / spacing) + 2, count)
 
 
-@kernel(tuple_of(MATRIX, MATRIX)(CONSTANT, POINT_GRID, float64))
-def sample_grid(field, grid, band):
-    """Phi and clearance (m), both (columns, lines), at the points of a grid.
+@kernel(tuple_of(MATRIX, MATRIX)(CONSTANT, float64, POINT_GRID, float64))
+def sample_grid(field, radius, grid, band):
+    """Phi and clearance (m) of a disc of a radius (m), both (columns, lines), at the points of a grid.
 
     Obstacles farther away than `band` (m) do not contribute to Phi, and the clearance is at most `band`, so that each
     obstacle is evaluated at the points around it only.
     """
-    weight, steepness, radius = field[0], 1.0 / field[1], field[2]
+    weight, steepness = field[0], 1.0 / field[1]
     x0, y0, spacing, columns, lines = grid.x0, grid.y0, grid.spacing, grid.columns, grid.lines
     phi = np.empty((columns, lines))
     closest = np.empty((columns, lines))
@@ -84,6 +84,6 @@ def sample_grid(field, grid, band):
             for j in range(bottom, top):
                 x, y = x0 + i * spacing, y0 + j * spacing
                 if half_plane_distance(x, y, field, rows, edges) - radius < band:
-                    phi[i, j] += weight * polygon_term(x, y, field, rows, edges, steepness)
+                    phi[i, j] += weight * polygon_term(x, y, field, rows, edges, radius, steepness)
                     closest[i, j] = min(closest[i, j], polygon_distance(x, y, field, rows, edges) - radius)
     return phi, closest

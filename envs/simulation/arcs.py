@@ -1,4 +1,4 @@
-"""Circular arcs among obstacles (kernels): first contact, clearance and proximity cost.
+"""Circular arcs of a disc among obstacles (kernels): first contact, clearance and proximity cost.
 
 An arc starts at a pose (x, y, heading), has the length `distance` (m; negative: backwards) and turns by `turn` (rad).
 """
@@ -11,6 +11,7 @@ from numba import float64, types
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT
+from leapnav.envs.robots.arcs import sinc
 from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.shapes.proximity import proximity_values
 
@@ -19,12 +20,6 @@ MAX_PANELS = 1000
 CLEARANCE_TOLERANCE = 1e-3  # m, absolute ...
 RELATIVE_CLEARANCE_TOLERANCE = 0.02  # ... and relative error of the smallest clearance along an arc
 CONTACT_TOLERANCE = 1e-5  # m: an arc is cut at a clearance below this
-
-
-@kernel(float64(float64))
-def sinc(angle):
-    """Return sin(angle) / angle, continuous at 0."""
-    return 1.0 - angle * angle / 6.0 if abs(angle) < 1e-4 else math.sin(angle) / angle
 
 
 @kernel(types.UniTuple(float64, 2)(float64, float64, float64, float64, float64, float64))
@@ -111,6 +106,6 @@ def arc_proximity(x, y, heading, distance, turn, field):
         xa, ya = arc_point(x, y, heading, distance, turn, middle - offset)
         xb, yb = arc_point(x, y, heading, distance, turn, middle)
         xc, yc = arc_point(x, y, heading, distance, turn, middle + offset)
-        first, second, third = proximity_values(xa, ya, xb, yb, xc, yc, field)
+        first, second, third = proximity_values(xa, ya, xb, yb, xc, yc, field[2], field)
         total += 5.0 * first + 8.0 * second + 5.0 * third
     return total / 18.0 * width

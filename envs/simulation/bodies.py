@@ -18,11 +18,10 @@ import pymunk.batch
 from numba import float64, types
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
+from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import ARENA, unpack_field
 from leapnav.envs.shapes.proximity import proximity_value
-from leapnav.envs.simulation.arcs import follow_arc
 
 WALL_THICKNESS = 1.0  # m, outside the arena
 CONTACT_MARGIN = 1e-3  # m by which the rim is enlarged, so that a robot sliding along an obstacle stays in contact
@@ -94,13 +93,14 @@ class ContactWorld:
 
     Args:
         field: the packed field of the scenario.
+        discs (D, 2): footprint of the robot, offset along its heading and radius (m).
         mass, moment: mass (kg) and moment of inertia (kg m^2) of the robot.
         friction: coefficient of friction between the robot and obstacles or walls.
 
     """
 
-    def __init__(self, field: np.ndarray, mass: float, moment: float, friction: float) -> None:
-        self._field = field
+    def __init__(self, field: np.ndarray, discs: np.ndarray, mass: float, moment: float, friction: float) -> None:
+        self._field, self._discs = field, discs
         self._robot = mass, moment, friction
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
@@ -152,32 +152,40 @@ class ContactWorld:
         # A new body in each period: the memory of bodies and contacts must not carry over to the next period.
         mass, moment, friction = self._robot
         body = pymunk.Body(mass, moment)
-        rim = pymunk.Circle(body, self._field[2] + CONTACT_MARGIN)
-        rim.friction = friction
+        outline = [
+            pymunk.Circle(body, radius + CONTACT_MARGIN, (offset, 0.0)) for offset, radius in self._discs.tolist()
+        ]
+        for disc in outline:
+            disc.friction = friction
         x, y, angle = row[:3].tolist()
         body.position, body.angle = (x, y), angle
         body.velocity, body.angular_velocity = (velocity[0], velocity[1]), velocity[2]
         body.velocity_func = apply
-        self._space.add(body, rim)
+        self._space.add(body, *outline)
         step = duration / substeps
         lowest, speed_integral, turn_integral = math.inf, 0.0, 0.0
-        phi = proximity_value(x, y, self._field)
+        phi = self._proximity(x, y, angle)
         phi_sum = phi / 2  # trapezoidal rule
         for _ in range(substeps):
             self._space.step(step)
             to_x, to_y, to_angle = _pose(body)
-            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, self._field)
+            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, to_angle, self._discs, self._field)
             body.position = to_x, to_y
             lowest = min(lowest, depth)
             speed_integral += ((to_x - x) ** 2 + (to_y - y) ** 2) / step
             turn_integral += (to_angle - angle) ** 2 / step
             x, y, angle = to_x, to_y, to_angle
-            phi = proximity_value(x, y, self._field)
+            phi = self._proximity(x, y, angle)
             phi_sum += phi
         row[:3] = x, y, angle
         velocity[:] = *body.velocity, body.angular_velocity
-        self._space.remove(body, rim)
+        self._space.remove(body, *outline)
         return lowest, speed_integral, turn_integral, (phi_sum - phi / 2) * step
+
+    def _proximity(self, x: float, y: float, heading: float) -> float:
+        """Return the proximity cost at a pose."""
+        cos, sin = math.cos(heading), math.sin(heading)
+        return sum(proximity_value(x + a * cos, y + a * sin, r, self._field) for a, r in self._discs.tolist())
 
 
 def _pose(body: pymunk.Body) -> tuple[float, float, float]:
@@ -185,8 +193,8 @@ def _pose(body: pymunk.Body) -> tuple[float, float, float]:
     return x, y, body.angle
 
 
-@kernel(types.UniTuple(float64, 3)(float64, float64, float64, float64, CONSTANT))
-def resolve_overlap(x, y, to_x, to_y, field):
+@kernel(types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
+def resolve_overlap(x, y, to_x, to_y, heading, discs, field):
     """Move a robot out of an obstacle that it overlaps after a step of Chipmunk from (x, y) to (to_x, to_y).
 
     Chipmunk detects a contact only after bodies overlap, by up to the length of a step. After a short step, the robot
@@ -198,10 +206,20 @@ def resolve_overlap(x, y, to_x, to_y, field):
 
     """
     step = math.hypot(to_x - x, to_y - y)
-    before = clearance(to_x, to_y, field)[0]
-    if step > MAX_CORRECTED_STEP * field[2]:
-        here = max(clearance(x, y, field)[0], MAX_OVERLAP)
-        _, fraction, _ = follow_arc(x, y, math.atan2(to_y - y, to_x - x), step, 0.0, here, field)
+    before = footprint_clearance(to_x, to_y, heading, discs, field)[0]
+    smallest = discs[0, 1]
+    for k in range(len(discs)):
+        smallest = min(smallest, discs[k, 1])
+    if step > MAX_CORRECTED_STEP * smallest:
+        # Steps of at most the clearance, so that the first contact is not missed.
+        fraction = 0.0
+        here = max(footprint_clearance(x, y, heading, discs, field)[0], MAX_OVERLAP)
+        while fraction < 1.0:
+            following = min(fraction + here / step, 1.0)
+            here = footprint_clearance(x + following * (to_x - x), y + following * (to_y - y), heading, discs, field)[0]
+            if here < MAX_OVERLAP:
+                break
+            fraction = following
         return x + fraction * (to_x - x), y + fraction * (to_y - y), before
     depth = before
     new_x, new_y = to_x, to_y
@@ -209,12 +227,14 @@ def resolve_overlap(x, y, to_x, to_y, field):
     for _ in range(50):
         if depth >= -MAX_OVERLAP:
             return new_x, new_y, before
-        nx = clearance(new_x + h, new_y, field)[0] - clearance(new_x - h, new_y, field)[0]
-        ny = clearance(new_x, new_y + h, field)[0] - clearance(new_x, new_y - h, field)[0]
+        nx = footprint_clearance(new_x + h, new_y, heading, discs, field)[0]
+        nx -= footprint_clearance(new_x - h, new_y, heading, discs, field)[0]
+        ny = footprint_clearance(new_x, new_y + h, heading, discs, field)[0]
+        ny -= footprint_clearance(new_x, new_y - h, heading, discs, field)[0]
         size = math.hypot(nx, ny)
         if size == 0.0:
             break
         new_x -= depth * nx / size
         new_y -= depth * ny / size
-        depth = clearance(new_x, new_y, field)[0]
+        depth = footprint_clearance(new_x, new_y, heading, discs, field)[0]
     return x, y, before

@@ -11,8 +11,8 @@ from gymnasium import spaces
 from numba import float32, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import INTEGERS, MATRIX, NOTHING, VECTOR
-from leapnav.envs.scenarios.scenario import GOAL, HORIZON, MAX_MAGNITUDE
+from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
+from leapnav.envs.scenarios.scenario import GOAL, HORIZON
 from leapnav.envs.settings import (
     GOAL_CONDITIONED,
     LIDAR_RANGE,
@@ -27,6 +27,7 @@ from leapnav.envs.settings import (
 )
 from leapnav.envs.simulation.sensing import WALL_ENTRIES, map_surroundings, scan
 from leapnav.envs.simulation.state import PACKED_STATE, SPIN, TIME, VX, VY, SimulationState
+from leapnav.envs.utils.records import MAX_MAGNITUDE
 
 # Number of entries of the parts, which are documented in `NavigateEnv`.
 GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 3, 4
@@ -34,7 +35,6 @@ TIME_LEFT = 4  # index in the goal part
 # Bounds of the observation spaces (m, s, m/s or rad/s), which scenarios of realistic size do not reach.
 MAX_DISTANCE, MAX_TIME, MAX_RATE = 1000.0, 10_000.0, 20.0
 LIDAR, MAP = OBSERVATIONS.index("lidar"), OBSERVATIONS.index("map")
-SENSING_COLUMN = 4  # first column of the sensing noise; the columns before it are the actuation noise
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,9 @@ def _parts(settings: EnvironmentSettings) -> list[Part]:
     else:
         low = (-MAX_DISTANCE, -MAX_DISTANCE, -1.0, -1.0, 0.0, -MAX_RATE, -MAX_RATE, 0.0, -MAX_RATE)
         parts.append(Part("goal", low, (MAX_DISTANCE, MAX_DISTANCE, 1.0, 1.0, MAX_TIME, *[MAX_RATE] * 4)))
-    if settings.motors:
-        parts.append(Part("motion", (-MAX_RATE,) * MOTION_ENTRIES, (MAX_RATE,) * MOTION_ENTRIES))
+    entries = motion_entries(settings)
+    if entries:
+        parts.append(Part("motion", (-MAX_RATE,) * entries, (MAX_RATE,) * entries))
     if settings.observation == "lidar":
         beams = settings.lidar_beams
         parts.append(Part("lidar", (0.0,) * beams, (settings.lidar_range,) * beams))
@@ -69,6 +70,11 @@ def _parts(settings: EnvironmentSettings) -> list[Part]:
     return [part for part in parts if part.low]
 
 
+def motion_entries(settings: EnvironmentSettings) -> int:
+    """Return the number of entries of the part `motion`."""
+    return MOTION_ENTRIES if settings.motors else settings.model.sizes()[0] - 3
+
+
 class ObservationBuffers(NamedTuple):
     """Constants and working memory of `observe_robots`.
 
@@ -77,6 +83,7 @@ class ObservationBuffers(NamedTuple):
         surroundings: output of `leapnav.envs.simulation.sensing.map_surroundings`; empty without a map.
         row (size,): an observation before it is rounded to float32.
         bounds (2, size): lower and upper bounds, float32.
+        is_heading (n - 3,): which further states of the robot are headings, bool.
 
     """
 
@@ -85,10 +92,17 @@ class ObservationBuffers(NamedTuple):
     surroundings: np.ndarray
     row: np.ndarray
     bounds: np.ndarray
+    is_heading: np.ndarray
 
 
 OBSERVATION_BUFFERS = record_type(
-    ObservationBuffers, beams=MATRIX, scratch=MATRIX, surroundings=VECTOR, row=VECTOR, bounds=float32[:, ::1]
+    ObservationBuffers,
+    beams=MATRIX,
+    scratch=MATRIX,
+    surroundings=VECTOR,
+    row=VECTOR,
+    bounds=float32[:, ::1],
+    is_heading=FLAGS,
 )
 PACKED_BUFFERS = types.Tuple(OBSERVATION_BUFFERS.types)
 
@@ -121,6 +135,9 @@ class ObservationLayout:
             surroundings=np.zeros(map_entries if settings.observation == "map" else 0),
             row=np.zeros(self.size),
             bounds=self.bounds,
+            is_heading=np.array(
+                [name in settings.model.heading_states for name in settings.model.state_names[3:]], dtype=bool
+            ),
         )
         self._packed_buffers = tuple(self._buffers)
         ends = np.cumsum([len(part.low) for part in parts]).tolist()
@@ -188,6 +205,7 @@ def observe_robots(robots, packed, packed_buffers, out):
     goal_conditioned, motors = settings[GOAL_CONDITIONED] != 0.0, settings[MOTORS] != 0.0
     has_lidar, has_map = settings[OBSERVATION] == LIDAR, settings[OBSERVATION] == MAP
     count = beams.shape[1]
+    sensing = 2 * sim.controls.shape[1]  # first column of the sensing noise, after that of the actuation
     for i in robots:
         x, y, heading = bodies[i, 0], bodies[i, 1], bodies[i, 2]
         cos, sin = math.cos(heading), math.sin(heading)
@@ -196,9 +214,9 @@ def observe_robots(robots, packed, packed_buffers, out):
         # Achieved goals are observed without noise, because they determine the reward.
         if deviation != 0.0 and not goal_conditioned:
             drawn = sim.noise_rows[i]
-            x += deviation * noise[i, drawn, SENSING_COLUMN]
-            y += deviation * noise[i, drawn, SENSING_COLUMN + 1]
-            heading += deviation * noise[i, drawn, SENSING_COLUMN + 2]
+            x += deviation * noise[i, drawn, sensing]
+            y += deviation * noise[i, drawn, sensing + 1]
+            heading += deviation * noise[i, drawn, sensing + 2]
             cos, sin = math.cos(heading), math.sin(heading)
         goal_x, goal_y, goal_heading = tasks[i, GOAL], tasks[i, GOAL + 1], tasks[i, GOAL + 2]
         free = math.isnan(goal_heading)
@@ -228,12 +246,18 @@ def observe_robots(robots, packed, packed_buffers, out):
             row[at + 1] = cos * state[i, VY] - sin * state[i, VX]
             row[at + 2] = state[i, SPIN]
             at += MOTION_ENTRIES
+        for k in range(sim.motion.shape[1]):
+            value = sim.motion[i, k]
+            if buffers.is_heading[k]:
+                value = (value - heading + math.pi) % (2 * math.pi) - math.pi
+            row[at] = value
+            at += 1
         if has_lidar and count > 0:
             for k in range(count):
                 row[at + k] = scratch[2, k]
             if deviation != 0.0:
                 for k in range(count):
-                    row[at + k] += deviation * noise[i, sim.noise_rows[i], SENSING_COLUMN + 3 + k]
+                    row[at + k] += deviation * noise[i, sim.noise_rows[i], sensing + 3 + k]
         elif has_map:
             obstacles, vertices = int(settings[OBSTACLES]), int(settings[VERTICES])
             map_surroundings(x, y, cos, sin, sim.fields[i], obstacles, vertices, surroundings)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from leapnav.envs.kernels import prepare
+from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.robots.base import ARCS, GENERAL
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.scenario import GOAL, TASK_COLUMNS, Scenario
+from leapnav.envs.scenarios.scenario import GOAL, LIMITS, Scenario
+from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.simulation import stepping
-from leapnav.envs.simulation.arcs import sinc
 from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
+from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, RobotMotion, no_state_cost
 from leapnav.envs.simulation.sensing import max_vertices
 from leapnav.envs.simulation.state import (
     CLEARANCE,
@@ -34,9 +37,11 @@ from leapnav.envs.simulation.state import (
     VX,
     SimulationState,
 )
+from leapnav.envs.utils.validation import in_words
 
 MAX_MOTOR_STEP = 0.01  # s, substep of a control period with motors
 MAX_CONTACT_STEP = 0.0025  # s, substep of a control period in contact
+UNUSED_DISC = (0.0, -math.inf)  # offset and radius (m)
 NOISE_ROWS = 32  # control periods whose noise is sampled together
 
 
@@ -51,8 +56,9 @@ class BatchSimulator:
         settings: settings of the environment.
         layout: observation space, and the parts of an observation.
         poses (count, 3): x, y (m) and heading (rad, unwrapped).
+        motion (count, n - 3): further states of the robots.
         state (count, COLUMNS): see `leapnav.envs.simulation.state`.
-        tasks (count, TASK_COLUMNS): see `leapnav.envs.scenarios.scenario`.
+        tasks (count, K): see `leapnav.envs.scenarios.scenario`.
         fields (count, L): packed obstacle fields; the end of a row is unused.
 
     """
@@ -62,7 +68,13 @@ class BatchSimulator:
         self.settings = settings
         self.layout = ObservationLayout(settings)
         self.state = np.zeros((count, COLUMNS))
-        self.tasks = np.zeros((count, TASK_COLUMNS))
+        n, m = settings.model.sizes()
+        self.motion, self._controls = np.zeros((count, n - 3)), np.zeros((count, m))
+        self.tasks = np.zeros((count, LIMITS + 2 * m + 2 * (n - 3)))
+        self._discs = np.zeros((count, 1, 2))
+        self._metric = np.zeros((count, 2))
+        self._drive, self._drives_paths = settings.model.drive, settings.model.drive == GENERAL
+        self._pointers: tuple[FunctionPointer, FunctionPointer] | None = None
         self.fields = np.zeros((count, 0))
         self._packed = settings.packed()
         self._record: tuple[np.ndarray, ...] | None = None
@@ -74,7 +86,7 @@ class BatchSimulator:
         motor = settings.motor
         self._free = FreeBodies(count, motor.mass, motor.moment, forces=settings.motors)
         self._contacts: dict[int, ContactWorld] = {}
-        width = 7 + settings.lidar_beams if settings.disturbed else 0
+        width = 2 * m + 3 + settings.lidar_beams if settings.disturbed else 0
         self._noise = np.zeros((count, NOISE_ROWS if settings.disturbed else 1, width))
         self._noise_rows = np.zeros(count, dtype=np.int64)
         self._generators: list[np.random.Generator | None] = [None] * count
@@ -91,10 +103,14 @@ class BatchSimulator:
             self._record = tuple(
                 SimulationState(
                     bodies=self._free.rows,
+                    motion=self.motion,
+                    controls=self._controls,
                     state=self.state,
                     tasks=self.tasks,
+                    discs=self._discs,
                     fields=self.fields,
                     guides=self._guides,
+                    metric=self._metric,
                     noise=self._noise,
                     noise_rows=self._noise_rows,
                     settings=self._packed,
@@ -125,6 +141,11 @@ class BatchSimulator:
         fields = [_get_field(choice, bank) for choice in choices]
         for field in fields:
             self._check_fits(field)
+        tasks = [self._get_task(choice, bank) for choice in choices]
+        footprints = [
+            choice.discs if isinstance(choice, Scenario) else _bank_discs(_require(bank)) for choice in choices
+        ]
+        self._make_room(max(map(len, tasks)), max(map(len, footprints)))
         longest = max(map(len, fields))
         if longest > self.fields.shape[1]:
             # Rows at multiples of a large power of two would map to the same cache sets, so a row has an odd number of
@@ -135,10 +156,16 @@ class BatchSimulator:
         for i, choice, field in zip(indices.tolist(), choices, fields, strict=True):
             self.fields[i, : len(field)] = field
             self._lengths[i] = len(field)
-            if isinstance(choice, Scenario):
-                self.tasks[i] = choice.task
-            else:
-                self.tasks[i] = _require(bank).tasks[choice]
+        m = self._controls.shape[1]
+        for i, choice, task, discs in zip(indices.tolist(), choices, tasks, footprints, strict=True):
+            self.tasks[i, : len(task)] = task
+            self._discs[i] = UNUSED_DISC
+            self._discs[i, : len(discs)] = discs
+            if self._drive == ARCS:
+                self._metric[i] = task[LIMITS + m : LIMITS + 2 * m]
+            elif self.settings.reward == "shaped":
+                scenario = get_scenario(choice, bank)
+                self._metric[i] = scenario.robot.metric(scenario.cost)
             if self.settings.reward == "shaped":
                 self._guides[i] = self._guide(choice, bank, self.tasks[i])
             self._contacts.pop(i, None)
@@ -148,6 +175,32 @@ class BatchSimulator:
                 self._generators[i] = generator
                 self._draw_noise(i)
 
+    def _get_task(self, choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray:
+        """Return the packed task of a scenario.
+
+        Raises:
+            ValueError: the scenario has another robot than the environment.
+
+        """
+        robot = choice.robot if isinstance(choice, Scenario) else _require(bank).robot
+        if robot.model != self.settings.robot:
+            name = f"scenario {choice.name!r}" if isinstance(choice, Scenario) else f"bank {_require(bank).path.name}"
+            raise ValueError(
+                f"robot: this environment is for {self.settings.robot!r}, but {name} has the robot {robot.model!r}; "
+                f"make the environment with robot={robot.model!r}"
+            )
+        return choice.task if isinstance(choice, Scenario) else _require(bank).tasks[choice]
+
+    def _make_room(self, n_columns: int, n_discs: int) -> None:
+        """Enlarge the arrays of tasks and footprints."""
+        if n_columns > self.tasks.shape[1]:
+            self.tasks = np.pad(self.tasks, ((0, 0), (0, n_columns - self.tasks.shape[1])))
+            self._record = None
+        if n_discs > self._discs.shape[1]:
+            more = np.full((len(self._discs), n_discs - self._discs.shape[1], 2), UNUSED_DISC)
+            self._discs, self._record = np.concatenate([self._discs, more], axis=1), None
+            self._drives_paths = True
+
     def check(self, choice: Scenario | int | None, bank: ScenarioBank | None) -> None:
         """Check that a scenario fits the observation.
 
@@ -156,12 +209,14 @@ class BatchSimulator:
             bank: the bank, or None.
 
         Raises:
-            ValueError: a polygon has more vertices than the map.
+            ValueError: a polygon has more vertices than the map, or the scenario has another robot.
 
         """
         if choice is not None:
+            self._get_task(choice, bank)
             self._check_fits(_get_field(choice, bank))
         elif bank is not None:
+            self._get_task(0, bank)
             for index in range(len(bank)):
                 self._check_fits(bank.field(index))
 
@@ -195,7 +250,7 @@ class BatchSimulator:
         """Simulate one control period.
 
         Args:
-            actions (count, 2): float64.
+            actions (count, m): float64.
             active (count,): bool, the robots to simulate; None for all. The state of the others is unchanged.
 
         Raises:
@@ -206,18 +261,21 @@ class BatchSimulator:
         state, arrays = self.state, self._arrays
         if self._disturbed:
             self._noise_rows[:] = state[:, STEPS] % NOISE_ROWS
-        start = stepping.command if self._motors else stepping.drive_arcs
+        start = stepping.command if self._motors or self._drive == GENERAL else stepping.drive_arcs
         invalid = start(actions, active, arrays)
         if invalid >= 0:
             robot = "" if len(state) == 1 else f" for robot {invalid}"
-            raise ValueError(f"action: expected two finite numbers, got {actions[invalid].tolist()}{robot}")
+            expected = in_words(actions.shape[1])
+            raise ValueError(f"action: expected {expected} finite numbers, got {actions[invalid].tolist()}{robot}")
         if self._motors:
             bodies, substeps = self._free.rows, self._substeps
             for substep in range(substeps):
-                stepping.drive_motors(bodies, state, self.tasks, self.fields, self._packed, substep, substeps)
+                stepping.drive_motors(bodies, state, self._metric, self.fields, self._packed, substep, substeps)
                 self._free.advance()
             stepping.read_velocities(bodies, state, substeps)
         else:
+            if self._drives_paths:
+                stepping.drive_paths(arrays, self._robot_motion)
             self._free.advance()
         if not self.settings.terminate_on_collision:
             for i in np.flatnonzero(state[:, REMAINING] > 0).tolist():
@@ -228,38 +286,77 @@ class BatchSimulator:
             for i in np.flatnonzero(active & (state[:, STEPS] % NOISE_ROWS == 0)).tolist():
                 self._draw_noise(i)
 
+    @property
+    def _robot_motion(self) -> RobotMotion:
+        """The kernels of the robot's model."""
+        if self._pointers is None:
+            model = self.settings.model
+            self._pointers = (
+                FunctionPointer(model.advance, ADVANCE_FUNCTION),
+                FunctionPointer(model.state_cost or no_state_cost, STATE_COST_FUNCTION),
+            )
+        return RobotMotion(*self._pointers)
+
     def _drive_in_contact(self, i: int) -> None:
         """Simulate the rest of a period after a contact."""
         row, body = self.state[i], self._free.rows[i]
         duration = float(row[REMAINING])
-        field = self.field(i)
+        field, discs = self.field(i), self._discs[i][self._discs[i, :, 1] > 0.0]
         motor = self.settings.motor
         if i not in self._contacts:
-            self._contacts[i] = ContactWorld(field, motor.mass, motor.moment, motor.friction)
+            self._contacts[i] = ContactWorld(field, discs, motor.mass, motor.moment, motor.friction)
         substeps = math.ceil(duration / MAX_CONTACT_STEP)
         step = duration / substeps
-        speed, turn_rate = float(row[SPEED]), float(row[TURN_RATE])
-        velocity = row[VX : SPIN + 1].copy()
-        if self._motors:
-
-            def control(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
-                fx, fy, torque = stepping.wheel_forces(vx, vy, heading, spin, speed, turn_rate, step, self._packed)
-                return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
-        else:
-
-            def control(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
-                along = speed * sinc(turn_rate * step / 2)
-                middle = heading + turn_rate * step / 2
-                return along * math.cos(middle), along * math.sin(middle), turn_rate
-
-            velocity[:] = control(0.0, 0.0, float(body[2]), 0.0)
-        lowest, speeds, turn_rates, proximity = self._contacts[i].drive(body, velocity, control, duration, substeps)
+        command = self._command(i, step)
+        velocity = row[VX : SPIN + 1].copy() if self._motors else np.array(command(0.0, 0.0, float(body[2]), 0.0))
+        motion = self.motion[i].copy()
+        lowest, speeds, turn_rates, proximity = self._contacts[i].drive(body, velocity, command, duration, substeps)
         if self._motors:
             row[VX : SPIN + 1] = velocity
-        row[EFFORT] += stepping.effort(self.tasks, i, speeds, turn_rates)
+        model = self.settings.model
+        if model.velocity_states is not None:  # what the contact has left of the velocity
+            ahead = velocity[0] * math.cos(body[2]) + velocity[1] * math.sin(body[2])
+            for name, value in zip(model.velocity_states, (ahead, velocity[2]), strict=True):
+                self.motion[i, model.state_names.index(name) - 3] = value
+        if self._drive == ARCS:
+            row[EFFORT] += stepping.effort(self._metric, i, speeds, turn_rates)
+        else:
+            # The controls are held, and further states change by them also in contact; the state cost is that at both
+            # ends of the period.
+            row[EFFORT] += stepping.control_effort(self.tasks, self._controls, i) * duration
+            if model.state_cost is not None:
+                parameters = self._parameters(i)
+                ends = [np.concatenate([body[:3], values]) for values in (motion, self.motion[i])]
+                row[EFFORT] += sum(model.state_cost(q, parameters) for q in ends) / 2 * duration
         row[PROXIMITY] += proximity
-        row[POSE_CLEARANCE] = clearance(body[0], body[1], field)[0]
+        row[POSE_CLEARANCE] = footprint_clearance(body[0], body[1], body[2], discs, field)[0]
         row[CLEARANCE] = min(row[CLEARANCE], lowest)
+
+    def _parameters(self, i: int) -> np.ndarray:
+        """Return the parameters of a robot's model."""
+        n, m = self.settings.model.sizes()
+        return self.tasks[i, LIMITS + 2 * m + 2 * (n - 3) :]
+
+    def _command(self, i: int, step: float) -> Callable[[float, float, float, float], tuple[float, float, float]]:
+        """Return the function from the velocity of a robot in contact to that of its next step without contact."""
+        row, motor, model = self.state[i], self.settings.motor, self.settings.model
+        if self._motors:
+            speed, turn_rate = float(row[SPEED]), float(row[TURN_RATE])
+
+            def track(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
+                fx, fy, torque = stepping.wheel_forces(vx, vy, heading, spin, speed, turn_rate, step, self._packed)
+                return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
+
+            return track
+        controls, parameters, new = self._controls[i], self._parameters(i), np.zeros(3 + self.motion.shape[1])
+
+        def follow(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
+            q = np.array([0.0, 0.0, heading, *self.motion[i]])
+            model.advance(q, controls, step, parameters, new)
+            self.motion[i] = new[3:]
+            return new[0] / step, new[1] / step, (new[2] - heading) / step
+
+        return follow
 
     def field(self, i: int) -> np.ndarray:
         """Return the packed obstacle field of a robot's scenario."""
@@ -285,7 +382,11 @@ class BatchSimulator:
 
     def __getstate__(self) -> dict[str, Any]:
         # Contact worlds have no memory between periods, so they can be created again.
-        return {**self.__dict__, "_contacts": {}, "_record": None}
+        return {**self.__dict__, "_contacts": {}, "_record": None, "_pointers": None}
+
+
+def _bank_discs(bank: ScenarioBank) -> np.ndarray:
+    return bank[0].discs
 
 
 def _require(bank: ScenarioBank | None) -> ScenarioBank:
@@ -301,4 +402,11 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
     motors = stepping.command, stepping.drive_motors, stepping.read_velocities
     moving = motors if settings.motors else (stepping.drive_arcs,)
+    if settings.model.drive == GENERAL:
+        moving = (
+            stepping.command,
+            stepping.drive_paths,
+            settings.model.advance,
+            settings.model.state_cost or no_state_cost,
+        )
     return stepping.start_episodes, *moving, stepping.end_periods, observe_robots

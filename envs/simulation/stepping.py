@@ -12,17 +12,21 @@ import numpy as np
 from numba import boolean, float64, int64, types
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
-from leapnav.envs.scenarios.scenario import GOAL, HORIZON, MAX_SPEED, MAX_TURN_RATE, SPEED_WEIGHT, START, TURN_WEIGHT
+from leapnav.envs.kernels.types import CONSTANT_MATRIX, FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
+from leapnav.envs.robots.arcs import sinc
+from leapnav.envs.robots.base import ARCS, GENERAL, WHEELS
+from leapnav.envs.scenarios.scenario import GOAL, HORIZON, LIMITS, START
 from leapnav.envs.settings import (
     ACTUATION_NOISE,
     COLLISION_PENALTY,
     DISCOUNT,
+    DRIVE,
     GRIP,
     HEADING_TOLERANCE,
     MASS,
     MISS_PENALTY,
     MOMENT,
+    MOTION_TOLERANCE,
     PERIOD,
     POSITION_TOLERANCE,
     RESPONSE,
@@ -32,8 +36,9 @@ from leapnav.envs.settings import (
     TRACK,
     WHEEL_FORCE,
 )
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.simulation.arcs import arc_proximity, follow_arc, sinc
+from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.simulation.arcs import arc_proximity, follow_arc
+from leapnav.envs.simulation.paths import MOTION, follow_path, path_costs
 from leapnav.envs.simulation.state import (
     CLEARANCE,
     COLLIDED,
@@ -68,9 +73,26 @@ GRAVITY = 9.81  # m/s^2
 
 
 @kernel(float64(MATRIX, int64, float64, float64))
-def effort(tasks, i, speed_squared, turn_rate_squared):
-    """Return the running cost of the motion of robot i, without the proximity cost."""
-    return 0.5 * (tasks[i, SPEED_WEIGHT] * speed_squared + tasks[i, TURN_WEIGHT] * turn_rate_squared)
+def effort(weights, i, speed_squared, turn_rate_squared):
+    """Return the running cost of the motion of robot i, a unicycle, without the proximity cost.
+
+    Args:
+        weights (count, 2): weights of the squared speed and turn rate.
+        i: index of the robot.
+        speed_squared, turn_rate_squared: (m/s)^2 and (rad/s)^2.
+
+    """
+    return 0.5 * (weights[i, 0] * speed_squared + weights[i, 1] * turn_rate_squared)
+
+
+@kernel(float64(MATRIX, MATRIX, int64))
+def control_effort(tasks, controls, i):
+    """Return the running cost of the controls of robot i."""
+    m = controls.shape[1]
+    total = 0.0
+    for j in range(m):
+        total += tasks[i, LIMITS + m + j] * controls[i, j] ** 2
+    return 0.5 * total
 
 
 @kernel(float64(int64, SIMULATION_STATE))
@@ -88,7 +110,7 @@ def potential(i, sim):
     heading = tasks[i, GOAL + 2]
     turn = 0.0 if math.isnan(heading) else (heading - bodies[i, 2] + math.pi) % (2 * math.pi) - math.pi
     time = max(tasks[i, HORIZON] - sim.state[i, TIME], sim.settings[PERIOD])
-    estimate = effort(tasks, i, length * length, turn * turn) / time
+    estimate = effort(sim.metric, i, length * length, turn * turn) / time
     return -min(estimate, sim.settings[MISS_PENALTY])
 
 
@@ -97,14 +119,19 @@ def start_episodes(robots, packed):
     """Place robots, given by index, at the start of their tasks."""
     sim = SimulationState(*packed)
     bodies, state, tasks, settings = sim.bodies, sim.state, sim.tasks, sim.settings
+    further = LIMITS + 2 * sim.controls.shape[1]
     for i in robots:
         for column in range(bodies.shape[1]):
             bodies[i, column] = tasks[i, START + column] if column < 3 else 0.0
+        for k in range(sim.motion.shape[1]):
+            sim.motion[i, k] = tasks[i, further + k]
         for column in range(state.shape[1]):
             state[i, column] = 0.0
         # A remainder of less than 1e-6 periods is a rounding error of the horizon, not another period.
         state[i, LAST_STEP] = max(1.0, math.ceil(tasks[i, HORIZON] / settings[PERIOD] - 1e-6))
-        state[i, POSE_CLEARANCE] = clearance(bodies[i, 0], bodies[i, 1], sim.fields[i])[0]
+        state[i, POSE_CLEARANCE] = footprint_clearance(
+            bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.discs[i], sim.fields[i]
+        )[0]
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
         if settings[SHAPED] != 0.0:
             state[i, POTENTIAL] = potential(i, sim)
@@ -112,7 +139,7 @@ def start_episodes(robots, packed):
 
 @kernel(int64(MATRIX, FLAGS, PACKED_STATE))
 def command(actions, active, packed):
-    """Set the commanded speed and turn rate of a period, with actuation noise.
+    """Set the controls of a period, with actuation noise, and the speed and turn rate of a robot that follows arcs.
 
     For robots that are not active, the duration of the period is 0.
 
@@ -121,10 +148,12 @@ def command(actions, active, packed):
 
     """
     sim = SimulationState(*packed)
-    state, tasks, settings = sim.state, sim.tasks, sim.settings
+    state, tasks, settings, controls = sim.state, sim.tasks, sim.settings, sim.controls
+    m, drive = controls.shape[1], int(settings[DRIVE])
     for i in range(len(state)):
-        if active[i] and not (math.isfinite(actions[i, 0]) and math.isfinite(actions[i, 1])):
-            return i
+        for j in range(m):
+            if active[i] and not math.isfinite(actions[i, j]):
+                return i
     disturbed = settings[ACTUATION_NOISE] != 0.0 or settings[SLIP] != 0.0
     for i in range(len(state)):
         for column in (IN_CONTACT, REMAINING, SPEED, TURN_RATE, DURATION):
@@ -134,19 +163,72 @@ def command(actions, active, packed):
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
         if not active[i]:
             continue
-        speed = min(max(actions[i, 0], -1.0), 1.0) * tasks[i, MAX_SPEED]
-        turn_rate = min(max(actions[i, 1], -1.0), 1.0) * tasks[i, MAX_TURN_RATE]
-        if disturbed:
+        for j in range(m):
+            controls[i, j] = min(max(actions[i, j], -1.0), 1.0) * tasks[i, LIMITS + j]
+            if disturbed:
+                controls[i, j] *= 1.0 + settings[ACTUATION_NOISE] * sim.noise[i, sim.noise_rows[i], j]
+        if disturbed and drive == ARCS:
             noise, row = sim.noise, sim.noise_rows[i]
-            speed *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, 0]
-            turn_rate *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, 1]
             half = settings[TRACK] / 2
+            speed, turn_rate = controls[i, 0], controls[i, 1]
             right = (speed + half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 2]), 1.0))
             left = (speed - half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 3]), 1.0))
-            speed, turn_rate = (right + left) / 2, (right - left) / (2 * half)
-        state[i, SPEED], state[i, TURN_RATE] = speed, turn_rate
+            controls[i, 0], controls[i, 1] = (right + left) / 2, (right - left) / (2 * half)
+        elif disturbed:
+            for j in range(m):
+                controls[i, j] *= 1.0 - min(settings[SLIP] * abs(sim.noise[i, sim.noise_rows[i], m + j]), 1.0)
+        if drive == WHEELS:
+            track = tasks[i, LIMITS + 2 * m]
+            state[i, SPEED] = 0.5 * (controls[i, 0] + controls[i, 1])
+            state[i, TURN_RATE] = (controls[i, 1] - controls[i, 0]) / track
+        elif drive == ARCS:
+            state[i, SPEED], state[i, TURN_RATE] = controls[i, 0], controls[i, 1]
         state[i, DURATION] = max(min(settings[PERIOD], tasks[i, HORIZON] - state[i, TIME]), 0.0)
     return -1
+
+
+@kernel(boolean(CONSTANT_MATRIX))
+def is_one_disc(discs):
+    """Return whether a footprint is one disc around the robot's position."""
+    return discs[0, 0] == 0.0 and (len(discs) == 1 or discs[1, 1] <= 0.0)
+
+
+@kernel(NOTHING(PACKED_STATE, MOTION))
+def drive_paths(packed, motion):
+    """Set velocity and force of each body, and the further states, for the period, up to the first contact.
+
+    A body moves by the displacement of the robot, and its force then changes its velocity to that of the robot. For
+    robots that `drive_arcs` has left out, and those whose controls do not lead to arcs; `command` is called before.
+    """
+    sim = SimulationState(*packed)
+    bodies, state, settings = sim.bodies, sim.state, sim.settings
+    general, m, n = settings[DRIVE] == GENERAL, sim.controls.shape[1], 3 + sim.motion.shape[1]
+    first = LIMITS + 2 * m + 2 * (n - 3)
+    q, new, work = np.empty(n), np.empty(n), np.empty(n)
+    for i in range(len(state)):
+        if general:
+            bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
+        discs, field, duration = sim.discs[i], sim.fields[i], state[i, DURATION]
+        if duration == 0.0 or (not general and is_one_disc(discs)):
+            continue
+        parameters, u = sim.tasks[i, first:], sim.controls[i]
+        for k in range(n):
+            q[k] = bodies[i, k] if k < 3 else sim.motion[i, k - 3]
+        lowest, fraction, after = follow_path(motion, q, u, duration, parameters, discs, field, new)
+        state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
+        if fraction < 1.0:
+            state[i, IN_CONTACT] = 1.0
+            state[i, CLEARANCE] = after  # the robot does not reach the rest of the path
+            state[i, REMAINING] = duration * (1.0 - fraction)
+        driven = duration * fraction
+        if driven > 0.0:
+            proximity, state_cost = path_costs(motion, q, u, driven, parameters, discs, field, work)
+            state[i, EFFORT] += (control_effort(sim.tasks, sim.controls, i) + state_cost) * driven
+            state[i, PROXIMITY] += proximity * driven
+        for k in range(3):
+            bodies[i, 3 + k] = new[k] - bodies[i, k]
+        for k in range(n - 3):
+            sim.motion[i, k] = new[3 + k]
 
 
 @kernel(int64(MATRIX, FLAGS, PACKED_STATE))
@@ -155,6 +237,7 @@ def drive_arcs(actions, active, packed):
 
     The chord of the arc that a command produces has the length v h sinc(omega h / 2) and the mean heading. A body whose
     velocity is the chord ends at the end of the arc, because Chipmunk moves bodies by an explicit Euler step.
+    Robots with a footprint of several discs are left to `drive_paths`.
 
     Returns:
         As `command`, which is called first.
@@ -162,12 +245,13 @@ def drive_arcs(actions, active, packed):
     """
     sim = SimulationState(*packed)
     bodies, state = sim.bodies, sim.state
+    wheels = sim.settings[DRIVE] == WHEELS
     invalid = command(actions, active, packed)
     if invalid >= 0:
         return invalid
     for i in range(len(state)):
         bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        if state[i, DURATION] == 0.0:
+        if state[i, DURATION] == 0.0 or not is_one_disc(sim.discs[i]):
             continue
         x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.fields[i]
         distance, turn = state[i, SPEED] * state[i, DURATION], state[i, TURN_RATE] * state[i, DURATION]
@@ -180,7 +264,10 @@ def drive_arcs(actions, active, packed):
             distance *= fraction
             turn *= fraction
         driven = state[i, DURATION] * fraction
-        state[i, EFFORT] += effort(sim.tasks, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
+        if wheels:
+            state[i, EFFORT] += control_effort(sim.tasks, sim.controls, i) * driven
+        else:
+            state[i, EFFORT] += effort(sim.metric, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
         if driven > 0.0:
             state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, field) * driven
         chord, middle = distance * sinc(turn / 2), heading + turn / 2
@@ -220,7 +307,7 @@ def read_velocities(bodies, state, substeps):
 
 
 @kernel(NOTHING(MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, int64, int64))
-def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
+def drive_motors(bodies, state, metric, fields, settings, substep, substeps):
     """Set velocity and force of each body for one substep, up to the first contact, and add the running cost.
 
     The velocities after the previous substep are read first.
@@ -239,7 +326,7 @@ def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
         lowest, fraction, after = follow_arc(x, y, course, distance, 0.0, state[i, POSE_CLEARANCE], field)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = min(state[i, CLEARANCE], lowest), after
         speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
-        state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
+        state[i, EFFORT] += effort(metric, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
         state[i, PROXIMITY] += arc_proximity(x, y, course, distance * fraction, 0.0, field) * step * fraction
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * fraction, dy * fraction, turn * fraction
         if fraction < 1.0:
@@ -259,6 +346,11 @@ def at_goal(i, sim):
     dx, dy = bodies[i, 0] - tasks[i, GOAL], bodies[i, 1] - tasks[i, GOAL + 1]
     if math.hypot(dx, dy) > settings[POSITION_TOLERANCE]:
         return False
+    further = LIMITS + 2 * sim.controls.shape[1] + sim.motion.shape[1]
+    for k in range(sim.motion.shape[1]):
+        goal = tasks[i, further + k]
+        if not math.isnan(goal) and abs(sim.motion[i, k] - goal) > settings[MOTION_TOLERANCE]:
+            return False
     heading = tasks[i, GOAL + 2]
     if math.isnan(heading):
         return True

@@ -47,6 +47,11 @@ def check_integer(name: str, value: Any, minimum: int, maximum: int | None = Non
     return int(value)
 
 
+def in_words(count: int) -> str:
+    """Return a small number as a word, a larger one in digits."""
+    return {1: "one", 2: "two", 3: "three"}.get(count, str(count))
+
+
 def check_choice(name: str, value: Any, choices: Iterable[str]) -> None:
     """Raise ValueError unless the value is one of the choices."""
     known = tuple(choices)

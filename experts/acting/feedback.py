@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.experts.acting.gains import Gains
 from leapnav.experts.acting.tracking import FLOW_ACCURACY, advance, control_at, follow, follow_all
 from leapnav.experts.numerics.integrator import propagate
@@ -31,7 +31,7 @@ GAIN_HOLD = 0.25  # s before the horizon from which the gains are constant, beca
 
 
 class _Solution(NamedTuple):
-    """Times (K + 1,) in the episode, nodes (K + 1, 6) of states and costates, and costs (K,) of the segments."""
+    """Times (K + 1,) in the episode, nodes (K + 1, 2n) of states and costates, and costs (K,) of the segments."""
 
     times: np.ndarray
     nodes: np.ndarray
@@ -62,8 +62,9 @@ class Feedback:
         self.scenario, self._quick = scenario, quick
         self.searches = 0
         self._next_search = 0.0  # s; earliest time of the next search
+        self._n, self._m = scenario.robot.sizes()
         problem = OptimalControlProblem.from_scenario(scenario)
-        if not self._adopt(problem, path, 0.0) and not self._search(np.array(scenario.start), 0.0):
+        if not self._adopt(problem, path, 0.0) and not self._search(np.array(scenario.start_state), 0.0):
             raise ValueError(f"scenario {scenario.name!r}: no optimum was found")
 
     def _adopt(self, problem: OptimalControlProblem, path: Trajectory, start_time: float) -> bool:
@@ -84,7 +85,7 @@ class Feedback:
         """Re-solve from a state at a time, and store the solution.
 
         Args:
-            state: x, y (m), heading (rad), shape (3,).
+            state: the robot's state, shape (n,).
             time: s since the start of the episode.
 
         Returns:
@@ -97,10 +98,10 @@ class Feedback:
         return found is not None
 
     def value(self, state: np.ndarray, time: float, tol: float = 1e-9) -> tuple[float, np.ndarray]:
-        """Return the cost-to-go and its gradient, the costate (3,); the stored solution is unchanged.
+        """Return the cost-to-go and its gradient, the costate (n,); the stored solution is unchanged.
 
         Args:
-            state: x, y (m), heading (rad), shape (3,).
+            state: the robot's state, shape (n,).
             time: s since the start of the episode.
             tol: residual of the boundary and continuity conditions.
 
@@ -115,22 +116,22 @@ class Feedback:
             self._arrays, self._stored, self._next_search = stored
         if found is None:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
-        return float(found.costs.sum()), found.nodes[0, 3:].copy()
+        return float(found.costs.sum()), found.nodes[0, self._n :].copy()
 
     @property
     def stored(self) -> tuple[float, np.ndarray]:
-        """Cost-to-go and costate (3,) at the state and time of the stored solution."""
-        return float(self._stored.costs.sum()), self._stored.nodes[0, 3:].copy()
+        """Cost-to-go and costate (n,) at the state and time of the stored solution."""
+        return float(self._stored.costs.sum()), self._stored.nodes[0, self._n :].copy()
 
     @property
     def final_costate(self) -> np.ndarray:
-        """Costate (3,) at the horizon."""
-        return self._stored.nodes[-1, 3:].copy()
+        """Costate (n,) at the horizon."""
+        return self._stored.nodes[-1, self._n :].copy()
 
     def control(self, time: float) -> np.ndarray:
-        """Return speed (m/s) and turn rate (rad/s) of the stored solution at a time."""
+        """Return the controls (m,) of the stored solution at a time."""
         arrays, (times, nodes, _) = self._arrays, self._stored
-        return control_at(arrays.flow, arrays.control, times, nodes, time, len(arrays.data) // 3)
+        return control_at(arrays.flow, arrays.control, times, nodes, time, self._m)
 
     def gains(self) -> Gains:
         """Compute neighbouring-extremal gains along the stored solution."""
@@ -138,7 +139,7 @@ class Feedback:
         start, end = float(self._stored.times[0]), float(self._stored.times[-1])
         times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_SAMPLING - 1e-9) + 1))
         extremal = np.array([follow(arrays.flow, *self._stored[:2], time) for time in times])
-        n = 3
+        n = self._n
         transitions = np.empty((len(times) - 1, 2 * n, 2 * n))
         for k, transition in enumerate(transitions):
             transition[:] = np.eye(2 * n)
@@ -156,17 +157,17 @@ class Feedback:
                 slopes[k] = np.linalg.solve(D - slopes[k + 1] @ B, slopes[k + 1] @ A - C)
         last = max(0, int(np.searchsorted(times, end - GAIN_HOLD, side="right")) - 1)
         slopes[last:] = slopes[last]
-        return Gains(times, extremal, slopes, arrays.control, arrays.data)
+        return Gains(times, extremal, slopes, arrays.control, arrays.data, self._m)
 
     def _resolve(self, state: np.ndarray, time: float, tol: float) -> _Solution | None:
         """The solution from a state and time, None without one."""
         if self._stored.times[-1] - time <= 0.0:
             return None
         found, times, nodes = self._newton(*self._stored[:2], state, time, tol)
-        check_clearance = np.abs(state - nodes[0, :3]).max() > LARGE_DEVIATION
+        check_clearance = np.abs(state[:3] - nodes[0, :3]).max() > LARGE_DEVIATION
         if found is None:
             found, check_clearance = self._approach(times, nodes, state, tol), True
-        if found is not None and check_clearance and clearances(self._sample(found), self.scenario.field).min() <= 0.0:
+        if found is not None and check_clearance and self._clearance(found) <= 0.0:
             found = None
         if found is not None or not self._search(state, time):
             return found
@@ -185,7 +186,7 @@ class Feedback:
 
     def _approach(self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, tol: float) -> _Solution | None:
         """Solve by continuation in the state, with steps that are halved when they fail."""
-        start = nodes[0, :3]
+        start = nodes[0, : self._n]
 
         def advance_to(fraction: float, previous: np.ndarray) -> np.ndarray | None:
             nonlocal found
@@ -196,16 +197,20 @@ class Feedback:
         reached = step_halving(advance_to, nodes, first_step=0.5, min_step=MIN_STEP)
         return None if reached is None else found
 
-    def _sample(self, solution: _Solution) -> np.ndarray:
-        """States (K, 3) of a solution, evenly spaced in time."""
+    def _clearance(self, solution: _Solution) -> float:
+        """Smallest clearance (m) of states of a solution that are evenly spaced in time."""
         arrays, (times, nodes, _) = self._arrays, solution
         count = math.ceil((times[-1] - times[0]) / CLEARANCE_SAMPLING) + 1
         moments = np.linspace(times[0], times[-1], count)
-        return follow_all(arrays.flow, times, nodes, moments)
+        states = follow_all(arrays.flow, times, nodes, moments)
+        return float(footprint_clearances(states, self.scenario.discs, self.scenario.field).min())
 
     def _remaining_scenario(self, state: np.ndarray, time: float) -> Scenario | None:
         """The rest of the episode as a scenario, None in collision or without time left."""
-        update = {"start": tuple(state.tolist()), "horizon": float(self.scenario.horizon - time)}
+        x, y, heading, *motion = state.tolist()
+        update: dict[str, Any] = {"start": (x, y, heading), "horizon": float(self.scenario.horizon - time)}
+        if motion:
+            update["start_motion"] = tuple(motion)
         try:
             return self.scenario.model_copy(update=update)
         except ScenarioError:

@@ -16,35 +16,46 @@ class Gains:
 
     Args:
         times (K,): s, evenly spaced.
-        extremal (K, 6): states and costates.
-        slopes (K, 3, 3): P.
+        extremal (K, 2n): states and costates.
+        slopes (K, n, n): P.
         control: control law, see `ProblemArrays`.
         data: constants of the control law, see `ProblemArrays`.
+        n_controls: number m of controls.
 
     """
 
-    def __init__(self, times: np.ndarray, extremal: np.ndarray, slopes: np.ndarray, control: Any, data: Any) -> None:
+    def __init__(
+        self,
+        times: np.ndarray,
+        extremal: np.ndarray,
+        slopes: np.ndarray,
+        control: Any,
+        data: Any,
+        n_controls: int,
+    ) -> None:
         self.times, self.extremal, self.slopes = times, extremal, slopes
+        self._n_controls = n_controls
         self._control, self._data = control, data
 
     def control(self, state: np.ndarray, time: float, ahead: float = 0.0) -> np.ndarray:
-        """Return speed (m/s) and turn rate (rad/s) for a state (3,).
+        """Return the controls (m,) for a state (n,).
 
         Args:
-            state: x, y (m), heading (rad).
+            state: the robot's state.
             time: s since the start of the episode.
             ahead: s by which the control lies ahead of `time`; the deviation from the extremal is kept.
 
         """
         k, fraction = self._locate(time)
         z = (1 - fraction) * self.extremal[k] + fraction * self.extremal[k + 1]
-        deviation = np.asarray(state, dtype=float) - z[:3]
+        n = self.slopes.shape[1]
+        deviation = np.asarray(state, dtype=float) - z[:n]
         k, fraction = self._locate(time + ahead)
         z = (1 - fraction) * self.extremal[k] + fraction * self.extremal[k + 1]
         slope = (1 - fraction) * self.slopes[k] + fraction * self.slopes[k + 1]
-        z[:3] += deviation
-        z[3:] += slope @ deviation
-        control = np.empty(2)
+        z[:n] += deviation
+        z[n:] += slope @ deviation
+        control = np.empty(self._n_controls)
         self._control(z, self._data, control)
         return control
 

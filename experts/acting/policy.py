@@ -42,26 +42,30 @@ class NoOptimumError(RuntimeError):
 
 
 def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) -> np.ndarray:
-    """The optimum as actions (K, 2) in [-1, 1], one per control period of the environment.
+    """The optimum as actions (K, m) in [-1, 1], one per control period of the environment.
 
-    Each action is the optimal control in the middle of its period. The environment integrates held controls exactly,
-    so the error of the resulting path is of second order in the control period.
+    Each action is the optimal control in the middle of its period; for a robot with further states it is the mean over
+    the period, with which the states that integrate a control have no error. The environment integrates held controls
+    exactly, so the error of the resulting path is of second order in the control period.
     """
     count = max(1, math.ceil(scenario.horizon / control_period - 1e-6))
     starts = control_period * np.arange(count)
-    middles = (starts + np.minimum(starts + control_period, scenario.horizon)) / 2
-    limits = scenario.robot.max_speed, scenario.robot.max_turn_rate
-    return (extremal.evaluate(middles)[1] / limits).astype(np.float32)
+    ends = np.minimum(starts + control_period, scenario.horizon)
+    middles = (starts + ends) / 2
+    controls = extremal.evaluate(middles)[1]
+    if scenario.robot.sizes()[0] > 3:  # Simpson's rule
+        controls = (extremal.evaluate(starts)[1] + 4.0 * controls + extremal.evaluate(ends)[1]) / 6.0
+    return (controls / scenario.robot.limits()).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class _Situation:
-    """Scenario, pose and time of one robot."""
+    """Scenario, state and time of one robot."""
 
     scenario: Scenario
     index: int | None
     bank: ScenarioBank | None
-    pose: np.ndarray
+    state: np.ndarray
     time: float
     period: float
 
@@ -75,7 +79,7 @@ class _Robot:
     limits: np.ndarray
     feedback: Feedback
     gains: Gains | None
-    label: tuple[float, np.ndarray] = (math.nan, np.full(3, math.nan))  # cost-to-go and costate of the last action
+    label: tuple[float, np.ndarray]  # cost-to-go and costate of the last action
 
 
 class ExpertPolicy:
@@ -83,7 +87,7 @@ class ExpertPolicy:
 
     Args:
         env: the environment that the actions are for: `NavigateEnv` or `NavigateVectorEnv`, wrapped or not, or a
-            Stable-Baselines3 `VecEnv` of them. Scenarios, poses and times are read from it; the observations given to
+            Stable-Baselines3 `VecEnv` of them. Scenarios, states and times are read from it; the observations given to
             `predict` are ignored.
         references: known optima of scenarios, with costates. The optima of a bank are read from the bank; all others
             are computed at the first step of an episode.
@@ -113,6 +117,7 @@ class ExpertPolicy:
         check_choice("feedback", feedback, FEEDBACKS)
         self._quick = quick
         self._envs = unwrap(env)
+        self._n, self._m = self._envs[0].settings.model.sizes()
         self._references = dict(references or {})
         self._feedback = feedback
         self._workers = workers or os.cpu_count() or 1
@@ -141,7 +146,7 @@ class ExpertPolicy:
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return the actions for the environment's current step, and `state` unchanged.
 
-        Actions have shape (2,), or (N, 2) for batched observations.
+        Actions have shape (m,), or (N, m) for batched observations.
 
         Raises:
             NoOptimumError: a scenario has no certified optimum.
@@ -158,7 +163,7 @@ class ExpertPolicy:
         still the best optimum, after a large one it may not be.
 
         Args:
-            state: x, y (m), heading (rad), shape (3,), or (N, 3) for several robots; None: the current states.
+            state: states of the robots, shape (n,), or (N, n) for several robots; None: the current states.
             time: s since the start of the episode, a number or (N,); None: the current times.
 
         Returns:
@@ -173,51 +178,54 @@ class ExpertPolicy:
         return np.array(values) if len(values) > 1 else values[0]
 
     def costate(self, state: Any = None, time: Any = None) -> np.ndarray:
-        """Return the gradient of `value` with respect to the state, (3,) or (N, 3); arguments and errors as there."""
+        """Return the gradient of `value` with respect to the state, (n,) or (N, n); arguments and errors as there."""
         costates = [costate for _, costate in self._ask(state, time)]
         return np.array(costates) if len(costates) > 1 else costates[0]
 
     def labels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cost-to-go (N,) and costate (N, 3) that the last `predict` computed.
+        """Return the cost-to-go (N,) and costate (N, n) that the last `predict` computed.
 
         They are accurate to 1e-6, and NaN if the goal could not be reached. All are NaN unless the feedback is
         "resolve".
         """
-        found = [(math.nan, np.full(3, math.nan)) if robot is None else robot.label for robot in self._robots]
+        found = [self._no_label if robot is None else robot.label for robot in self._robots]
         return np.array([cost for cost, _ in found]), np.array([costate for _, costate in found])
+
+    @property
+    def _no_label(self) -> tuple[float, np.ndarray]:
+        return math.nan, np.full(self._n, math.nan)
 
     def _ask(self, state: Any, time: Any) -> list[tuple[float, np.ndarray]]:
         situations = self._situations()
         count = len(situations)
         if state is not None:
             states = np.asarray(state, dtype=float)
-            if states.shape not in ((count, 3), (3,)) or not np.isfinite(states).all():
-                raise ValueError(f"state: expected finite numbers of shape {(count, 3)}, got {state!r}")
-            situations = [
-                replace(s, pose=p) for s, p in zip(situations, np.broadcast_to(states, (count, 3)), strict=True)
-            ]
+            shape = count, self._n
+            if states.shape not in (shape, shape[1:]) or not np.isfinite(states).all():
+                raise ValueError(f"state: expected finite numbers of shape {shape}, got {state!r}")
+            situations = [replace(s, state=p) for s, p in zip(situations, np.broadcast_to(states, shape), strict=True)]
         times = [s.time for s in situations] if time is None else np.broadcast_to(time, (count,)).tolist()
         for situation, t in zip(situations, times, strict=True):
             if not 0.0 <= t < situation.scenario.horizon:
                 raise ValueError(f"time: expected a number from 0 to {situation.scenario.horizon:g}, got {t!r}")
 
         def ask(i: int, situation: _Situation) -> tuple[float, np.ndarray]:
-            return self._robot(i, situation).feedback.value(situation.pose, times[i])
+            return self._robot(i, situation).feedback.value(situation.state, times[i])
 
         return self._each(ask, situations)
 
     def _act(self, i: int, situation: _Situation) -> np.ndarray:
         left = situation.scenario.horizon - situation.time
         if left <= 0.0:  # the episode has ended
-            return np.zeros(2)
+            return np.zeros(self._m)
         robot = self._robot(i, situation)
         ahead = min(situation.period, left) / 2
         if robot.gains is not None:
-            control = robot.gains.control(situation.pose, situation.time, ahead)
+            control = robot.gains.control(situation.state, situation.time, ahead)
         else:
             if self._feedback == "resolve":
-                solved = robot.feedback.update(situation.pose, situation.time)
-                robot.label = robot.feedback.stored if solved else (math.nan, np.full(3, math.nan))
+                solved = robot.feedback.update(situation.state, situation.time)
+                robot.label = robot.feedback.stored if solved else self._no_label
             control = robot.feedback.control(situation.time + ahead)
         return control / robot.limits
 
@@ -242,9 +250,9 @@ class ExpertPolicy:
             feedback = Feedback(scenario, path, quick=self._quick)
         except ValueError as error:
             raise NoOptimumError(str(error), scenario) from None
-        limits = np.array([scenario.robot.max_speed, scenario.robot.max_turn_rate])
+        limits = np.array(scenario.robot.limits())
         gains = feedback.gains() if self._feedback == "gains" else None
-        robot = _Robot(scenario, situation.time, limits, feedback, gains)
+        robot = _Robot(scenario, situation.time, limits, feedback, gains, self._no_label)
         self._robots[i] = robot
         return robot
 
@@ -254,10 +262,10 @@ class ExpertPolicy:
         for env in self._envs:
             period, bank = env.control_period, env.bank
             if isinstance(env, NavigateEnv):
-                found.append(_Situation(env.scenario, env.index, bank, np.array(env.pose), env.time, period))
+                found.append(_Situation(env.scenario, env.index, bank, env.state, env.time, period))
             else:
-                rows = zip(env.scenarios, env.indices, env.poses, env.times.tolist(), strict=True)
-                found += [_Situation(scenario, i, bank, pose, time, period) for scenario, i, pose, time in rows]
+                rows = zip(env.scenarios, env.indices, env.states, env.times.tolist(), strict=True)
+                found += [_Situation(scenario, i, bank, state, time, period) for scenario, i, state, time in rows]
         return found
 
     def _each(self, function: Callable[[int, _Situation], Any], situations: list[_Situation]) -> list[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
+from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -14,8 +15,10 @@ import numpy as np
 from joblib import Parallel
 
 import leapnav
+from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankEntry, BankError, ScenarioBank, point_times, write_bank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
+from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.store import Arrays, ResumableStore, discard
@@ -54,6 +57,7 @@ def build_bank(
     count: int,
     out: str | os.PathLike[str],
     *,
+    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     seed: int = 0,
     workers: int = 1,
     progress: bool = True,
@@ -68,6 +72,7 @@ def build_bank(
         family: family of the scenarios.
         count: number of scenarios in the bank.
         out: file of the bank. A complete bank is returned unchanged.
+        robot: name of a robot model, a dict of its fields with `model`, or a robot.
         seed: seed of the bank; draw k uses a generator with the seed (seed, k).
         workers: number of processes.
         progress: show a progress bar.
@@ -79,6 +84,7 @@ def build_bank(
 
     """
     check_choice("family", family, FAMILIES)
+    body = check_robot(robot)
     check_at_least("count", count, 1)
     check_at_least("workers", workers, 1)
     check_at_least("seed", seed, 0)
@@ -86,13 +92,15 @@ def build_bank(
     if target.is_dir():
         raise IsADirectoryError(f"{target}: is a directory")
     if target.exists():
-        return _complete(target, family, count, seed)
+        return _complete(target, family, count, seed, body)
     if not target.absolute().parent.is_dir():
         raise FileNotFoundError(f"{target.parent}: no such directory")
     settings = {"version": VERSION, "software": leapnav.__version__, "family": family, "seed": seed}
+    if body != Unicycle():  # as before there were other robots
+        settings["robot"] = body.model_dump(mode="json", exclude_none=True)
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="4 * n_jobs")
     with ResumableStore(_build_directory(target), "bank", settings, BankError) as store:
-        reasons = _solve(store, pool, family, count, seed, progress)
+        reasons = _solve(store, pool, partial(draw, family=family, seed=seed, robot=body), count, progress)
         entries = [_entry(number, store.read(number)) for number, reason in reasons.items() if not reason]
         write_bank(
             target,
@@ -107,17 +115,20 @@ def build_bank(
     return ScenarioBank(target)
 
 
-def draw(number: int, family: str, seed: int) -> Arrays:
+def draw(number: int, family: str, seed: int, robot: RobotModel | None = None) -> Arrays:
     """One random scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
 
     Args:
         number: index of the draw.
         family: family of the scenario.
         seed: seed of the bank.
+        robot: the robot; None for the unicycle.
 
     """
-    scenario = sample_scenario(family, np.random.default_rng([seed, number]))
-    scenario = scenario.model_copy(update={"name": f"{family}-{seed}-{number}"})
+    body = robot or Unicycle()
+    scenario = sample_scenario(family, np.random.default_rng([seed, number]), body)
+    prefix = "" if body.model == "unicycle" else f"{body.model}-"
+    scenario = scenario.model_copy(update={"name": f"{prefix}{family}-{seed}-{number}"})
     optimum = find_optimum(scenario)
     rejection = judge(optimum)
     if rejection is not None:
@@ -139,15 +150,17 @@ def draw(number: int, family: str, seed: int) -> Arrays:
     }
 
 
-def _solve(store: ResumableStore, pool: Parallel, family: str, count: int, seed: int, progress: bool) -> dict[int, str]:
+def _solve(
+    store: ResumableStore, pool: Parallel, compute: Callable[[int], Arrays], count: int, progress: bool
+) -> dict[int, str]:
     """Complete the draws until `count` scenarios are admitted; return each draw's reason of rejection, in order."""
     reasons: dict[int, str] = {}
     n_admitted = 0
-    with progress_bar(total=count, label=f"Building {family}", unit="scenarios", show=progress) as bar:
+    with progress_bar(total=count, label="Building the bank", unit="scenarios", show=progress) as bar:
         while n_admitted < count:
             # One draw for each missing scenario, so that the bank holds the first `count` admitted scenarios.
             numbers = range(len(reasons), len(reasons) + count - n_admitted)
-            for number, arrays in store.complete(numbers, partial(draw, family=family, seed=seed), pool, bar):
+            for number, arrays in store.complete(numbers, compute, pool, bar):
                 reasons[number] = str(arrays["rejected"])
                 advance(bar, not reasons[number])
             n_admitted = sum(not reason for reason in reasons.values())
@@ -169,11 +182,12 @@ def _entry(number: int, arrays: Arrays) -> BankEntry:
     )
 
 
-def _complete(target: Path, family: str, count: int, seed: int) -> ScenarioBank:
+def _complete(target: Path, family: str, count: int, seed: int, robot: RobotModel) -> ScenarioBank:
     """The bank at `target`, if it is the requested one."""
     bank = ScenarioBank(target)
     expected: dict[str, Any] = {"family": family, "seed": seed, "count": count, "software": leapnav.__version__}
-    found = {"family": bank.family, "seed": bank.seed, "count": len(bank), "software": bank.software}
+    found: dict[str, Any] = {"family": bank.family, "seed": bank.seed, "count": len(bank), "software": bank.software}
+    expected["robot"], found["robot"] = robot, bank.robot
     for name, value in expected.items():
         if found[name] != value:
             raise BankError(f"{target}: exists, with {name} {found[name]!r} instead of {value!r}; choose another name")

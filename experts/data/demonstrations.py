@@ -18,9 +18,10 @@ from minari.data_collector import EpisodeBuffer
 import leapnav
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.families import MAX_HORIZON
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.problem.extremal import Extremal
@@ -31,6 +32,7 @@ ENVIRONMENT = "leapnav/Navigate-v0"
 CONTROL_PERIOD = 0.05  # s, the default of the environment; demonstrations use it
 # A recovery starts from a perturbed state of the optimum.
 PERTURBATION = np.array([0.15, 0.15, 0.3])  # standard deviations (m, m, rad)
+MOTION_PERTURBATION = 0.1  # standard deviation of the further states (in their units)
 PERTURBATION_DECAY = 0.5  # s; time constant with which the initial guess returns to the optimum
 MIN_RECOVERY_TIME = 1.0  # s between the perturbation and the horizon; with less time the robot could not recover
 MIN_RECOVERY_CLEARANCE = 0.02  # m
@@ -49,11 +51,11 @@ class Demonstration:
     Attributes:
         scenario: the scenario of the episode.
         observations: (K + 1, d).
-        actions: (K, 2), of the expert.
-        executed: (K, 2), the executed actions; with noise they differ from the expert's.
+        actions: (K, m), of the expert.
+        executed: (K, m), the executed actions; with noise they differ from the expert's.
         rewards: (K,).
-        states: (K + 1, 3), x, y (m), heading (rad), as simulated.
-        costates: (K + 1, 3), of the optimum.
+        states: (K + 1, n), x, y (m), heading (rad) and further states, as simulated.
+        costates: (K + 1, n), of the optimum.
         cost_to_go: (K + 1,), of the optimum; the first entry is the reference cost J*.
         running_cost: (K,), cost of each environment step.
         is_success: whether the episode ended in success.
@@ -115,20 +117,20 @@ def demonstrate_disturbed(
     inner = env.unwrapped
     assert isinstance(inner, NavigateEnv)
     feedback = Feedback(scenario, Trajectory(extremal.times, extremal.states, extremal.costates))
-    limits = scenario.robot.max_speed, scenario.robot.max_turn_rate
+    limits = scenario.robot.limits()
     costates, costs = [], []
 
     def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
-        state, now = np.array(inner.pose), inner.time
+        state, now = inner.state, inner.time
         if feedback.update(state, now):
             cost, costate = feedback.value(state, now)
         else:
-            cost, costate = np.nan, np.full(3, np.nan)
+            cost, costate = np.nan, np.full(len(state), np.nan)
         costs.append(cost)
         costates.append(costate)
         ahead = min(inner.control_period, scenario.horizon - inner.time) / 2
         action = np.clip(feedback.control(inner.time + ahead) / limits, -1.0, 1.0).astype(np.float32)
-        executed = np.clip(action + noise * rng.standard_normal(2), -1.0, 1.0).astype(np.float32)
+        executed = np.clip(action + noise * rng.standard_normal(len(limits)), -1.0, 1.0).astype(np.float32)
         return action, executed
 
     driven = _drive(env, scenario, decide)
@@ -153,10 +155,15 @@ def _drive(env: gym.Env, scenario: Scenario, decide: Callable[[int], tuple[np.nd
         "actions": np.stack(actions),
         "executed": np.stack([step.action for step in transitions]),
         "rewards": np.array([step.reward for step in transitions]),
-        "states": np.array([info["pose"], *(step.info["pose"] for step in transitions)]),
+        "states": np.array([state_of(info), *(state_of(step.info) for step in transitions)]),
         "running_cost": np.diff([0.0, *(step.info["cost"] for step in transitions)]),
         "is_success": bool(transitions[-1].info["is_success"]),
     }
+
+
+def state_of(info: dict[str, Any]) -> np.ndarray:
+    """Return the robot's state (n,) from the info of a step."""
+    return np.array([*info["pose"], *info.get("motion", ())])
 
 
 def recovery(
@@ -175,20 +182,14 @@ def recovery(
 
     """
     time = rng.uniform(0.0, max(scenario.horizon - MIN_RECOVERY_TIME, 0.0))
-    perturbation = rng.normal(size=3) * PERTURBATION
+    n = scenario.robot.sizes()[0]
+    perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
     state = extremal.evaluate(time)[0] + perturbation
-    if clearance(state[0], state[1], scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
+    x, y, heading, *motion = state.tolist()
+    if footprint_clearance(x, y, heading, scenario.discs, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
-    rest = Scenario(
-        name=name,
-        arena=scenario.arena,
-        robot=scenario.robot,
-        start=tuple(state.tolist()),
-        goal=scenario.goal,
-        horizon=float(scenario.horizon - time),
-        obstacles=scenario.obstacles,
-        cost=scenario.cost,
-    )
+    update = {"name": name, "start": (x, y, heading), "horizon": float(scenario.horizon - time)}
+    rest = scenario.model_copy(update={**update, "start_motion": tuple(motion)} if motion else update)
     times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])
     states, _, costates = extremal.evaluate(times + time)
     times[-1] = rest.horizon
@@ -200,7 +201,7 @@ def recovery(
     return rest, solution
 
 
-def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: str) -> None:
+def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: str, robot: RobotModel) -> None:
     """Write a Minari dataset with state, costate and cost-to-go of every step.
 
     The scenario of an episode is its `options["scenario"]`, so `env.reset(options=...)` with the options that Minari
@@ -210,9 +211,14 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: s
         demonstrations: consumed one by one; they need not fit into memory together.
         root: root directory of Minari datasets.
         family: family of the scenarios.
+        robot: the robot.
 
     """
-    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=MAX_STEPS)
+    arguments: dict[str, Any] = {}
+    if robot != Unicycle():
+        fields = robot.model_dump(mode="json", exclude_none=True)
+        arguments = {"robot": robot.model if robot == type(robot)() else fields, "split": "fresh"}
+    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=MAX_STEPS, **arguments)
     scenarios: list[Scenario] = []
     returns: list[float] = []
 
@@ -225,7 +231,7 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: s
 
     with _minari_root(str(root)):
         dataset = minari.create_dataset_from_buffers(
-            dataset_id(family),
+            dataset_id(family, robot.model),
             cast(list[EpisodeBuffer], episodes()),  # Minari declares a list, but any iterable works
             env=env,
             eval_env=env,
@@ -233,8 +239,8 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: s
             author="leapnav",
             author_email="",
             code_permalink="",
-            description="Certified optima driven in the environment. Infos: state (x, y, heading), control (speed, "
-            "turn rate), executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's scenario is "
+            description="Certified optima driven in the environment. Infos: state (x, y, heading, further "
+            "states of the robot), control, executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's scenario is "
             "options['scenario'] as JSON. Reference scores: random actions and the optimum.",
             requirements=[f"leapnav=={leapnav.__version__}"],
         )
@@ -248,7 +254,9 @@ def _random_score(env: gym.Env, scenarios: Sequence[Scenario]) -> float:
     total = 0.0
     for scenario in scenarios:
         _, _, steps = play_episode(
-            env, lambda *_: rng.uniform(-1.0, 1.0, 2).astype(np.float32), options={"scenario": scenario}
+            env,
+            lambda *_: rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32),
+            options={"scenario": scenario},
         )
         for step in steps:
             total += step.reward
@@ -259,8 +267,7 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
     steps = len(demonstration.actions)
     terminations = np.zeros(steps, dtype=bool)
     terminations[-1] = True
-    robot = demonstration.scenario.robot
-    controls = demonstration.actions * np.array([robot.max_speed, robot.max_turn_rate])
+    controls = demonstration.actions * np.array(demonstration.scenario.robot.limits())
     return EpisodeBuffer(
         id=number,
         seed=demonstration.seed,
@@ -284,9 +291,9 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
     )
 
 
-def dataset_id(family: str) -> str:
-    """The Minari dataset id of a family's demonstrations."""
-    return f"leapnav/{family}/expert-v0"
+def dataset_id(family: str, robot: str = "unicycle") -> str:
+    """The Minari dataset id of the demonstrations of a family and a robot model."""
+    return f"leapnav/{family}/expert-v0" if robot == "unicycle" else f"leapnav/{robot}-{family}/expert-v0"
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -19,8 +19,9 @@ from joblib import Parallel, parallel_config
 import leapnav
 from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.families import check_family, sample_scenario
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
@@ -32,6 +33,7 @@ from leapnav.experts.data.demonstrations import (
     iterate_demonstrations,
     open_dataset,
     recovery,
+    state_of,
     write_dataset,
 )
 from leapnav.experts.data.store import DISCARDED, Arrays, ResumableStore, discard
@@ -81,6 +83,7 @@ def rollout(
     count: int,
     out: str | os.PathLike[str],
     *,
+    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     seed: int = 1000,
     recoveries: int = 0,
     noise: float = 0.0,
@@ -100,7 +103,8 @@ def rollout(
             replaced by following ones. Seeds 0 and 1 are refused: their scenarios are in the included banks, one of
             them in the test split.
         out: directory, a root of Minari datasets. Read it with `load_demonstrations(out)`; if the environment variable
-            MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family))`.
+            MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family, robot))`.
+        robot: name of a robot model, a dict of its fields with `model`, or a robot.
         recoveries: number of additional demonstrations per scenario that start from perturbed states of the optimum.
         noise: standard deviation of the noise that is added to the executed actions, which are in [-1, 1]. The expert
             then acts in closed loop and the dataset contains its own actions, which show how to recover.
@@ -133,16 +137,19 @@ def rollout(
         "recoveries": recoveries,
         "noise": float(noise),
     }
+    body = check_robot(robot)
+    if body != Unicycle():  # as before there were other robots
+        settings["robot"] = body.model_dump(mode="json", exclude_none=True)
     finished = None if force else _finished(directory, {**settings, "count": count})
     if finished is not None:
         return finished
     _prepare(directory, force)
     # The settings of the store exclude `count`: a longer rollout continues a shorter one.
     with ResumableStore(directory / WORK, "rollout", settings) as store:
-        compute = partial(_shard, family=family, seed=seed, recoveries=recoveries, noise=float(noise))
+        compute = partial(_shard, family=family, seed=seed, recoveries=recoveries, noise=float(noise), robot=body)
         with _backend(workers, dask) as pool:
             n_shards = _solve(store, pool, compute, family, count, progress)
-        summary = _write(store, n_shards, directory, family, count)
+        summary = _write(store, n_shards, directory, family, count, body)
         record = {**settings, "count": count, "summary": asdict(summary)}
         write_text(directory / RECORD, encode(record, indent=1) + "\n")
     discard(store.directory)
@@ -181,10 +188,11 @@ def check_dataset(folder: str | os.PathLike[str], *, progress: bool = True) -> R
 
     """
     total = open_dataset(folder).total_episodes
-    env = NavigateEnv(split="fresh")
+    env: NavigateEnv | None = None
     largest, worst, episodes = np.zeros(3), None, 0
     with progress_bar(total=total, label="Replaying", unit="episodes", show=progress) as bar:
         for number, demonstration in enumerate(iterate_demonstrations(folder)):
+            env = env or NavigateEnv(split="fresh", robot=demonstration.scenario.robot)
             deviations = _replay(env, demonstration)
             if worst is None or deviations.max() > largest.max():
                 worst = number
@@ -205,7 +213,7 @@ def _replay(env: NavigateEnv, demonstration: Demonstration) -> np.ndarray:
     pairs = (
         ([observation, *(step.observation for step in transitions)], demonstration.observations),
         ([step.reward for step in transitions], demonstration.rewards),
-        ([info["pose"], *(step.info["pose"] for step in transitions)], demonstration.states),
+        ([state_of(info), *(state_of(step.info) for step in transitions)], demonstration.states),
     )
     return np.array([np.abs(np.subtract(one, other)).max() for one, other in pairs])
 
@@ -278,7 +286,9 @@ def _solve(
     return n_shards
 
 
-def _write(store: ResumableStore, n_shards: int, directory: Path, family: str, count: int) -> RolloutSummary:
+def _write(
+    store: ResumableStore, n_shards: int, directory: Path, family: str, count: int, robot: RobotModel
+) -> RolloutSummary:
     """Write the dataset of the first `count` solved scenarios in the work directory, then move it to its place."""
     totals = {"demonstrations": 0, "unsolved": 0, "failed": 0, "steps": 0}
 
@@ -301,20 +311,20 @@ def _write(store: ResumableStore, n_shards: int, directory: Path, family: str, c
 
     root = directory / WORK / "root"
     shutil.rmtree(root, ignore_errors=True)  # left by a run that was interrupted here
-    write_dataset(demonstrations(), root, family)
+    write_dataset(demonstrations(), root, family, robot)
     shutil.rmtree(directory / "leapnav", ignore_errors=True)  # an earlier copy of the same dataset, see `_prepare`
     (root / "leapnav").replace(directory / "leapnav")
     return RolloutSummary(totals["demonstrations"], totals["unsolved"], totals["failed"], totals["steps"])
 
 
-def _shard(number: int, family: str, seed: int, recoveries: int, noise: float) -> Arrays:
+def _shard(number: int, family: str, seed: int, recoveries: int, noise: float, robot: RobotModel) -> Arrays:
     first = seed + number * SHARD_SIZE
-    return _pack([_demonstrations(family, s, recoveries, noise) for s in range(first, first + SHARD_SIZE)])
+    return _pack([_demonstrations(family, s, recoveries, noise, robot) for s in range(first, first + SHARD_SIZE)])
 
 
-def _demonstrations(family: str, seed: int, recoveries: int, noise: float) -> list[Demonstration]:
+def _demonstrations(family: str, seed: int, recoveries: int, noise: float, robot: RobotModel) -> list[Demonstration]:
     """The demonstrations of one scenario, its optimum first; empty without a certified optimum."""
-    scenario = sample_scenario(family, seed)
+    scenario = sample_scenario(family, seed, robot)
     optimum = find_optimum(scenario)
     if not optimum.success:
         return []
@@ -325,7 +335,7 @@ def _demonstrations(family: str, seed: int, recoveries: int, noise: float) -> li
         recovered = recovery(scenario, optimum, rng, f"{scenario.name}-recovery-{number}")
         if recovered is not None:
             episodes.append(recovered)
-    env = NavigateEnv(family, split="fresh")
+    env = NavigateEnv(family, split="fresh", robot=robot)
     noise_rng = np.random.default_rng([seed, 2])
     found = []
     for episode in episodes:

@@ -25,7 +25,8 @@ class ExtremalFlow(NamedTuple):
 
     Attributes:
         function: the compiled flow, of type FLOW_SIGNATURE.
-        data: control weights (m,), lower and upper control bounds (2m,), parameters of the system.
+        data: control weights (m,), lower and upper control bounds (2m,), parameters of the system, offsets and
+            radii of the discs of a footprint.
         field: packed obstacle field; empty without obstacles.
 
     """

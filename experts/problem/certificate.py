@@ -88,8 +88,10 @@ def certify(
             conjugate_point = min((t for t in (conjugate_point, crossing) if t is not None), default=None)
     clearance = None
     if problem.field is not None and problem.system.position is not None:
-        ix, iy = (problem.system.state.index(symbol) for symbol in problem.system.position)
-        clearance = float(dense_clearance(problem.field, extremal.times, z, terms, ix, iy))
+        system = problem.system
+        heading = -1 if system.heading is None else system.state.index(system.heading)
+        places = np.array([*map(system.state.index, problem.system.position), heading])
+        clearance = float(dense_clearance(problem.field, problem.discs, places, extremal.times, z, terms))
     certificate = Certificate(
         residual=float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max())),
         defect=float(defect),

@@ -8,66 +8,68 @@ a Python module with common subexpressions removed, and compiled into the user's
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import sys
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from itertools import combinations_with_replacement
+from typing import Any, Literal
 
 import sympy as sp
-from sympy.printing.precedence import PRECEDENCE
-from sympy.printing.pycode import PythonCodePrinter
-from sympy.simplify.cse_main import tree_cse
 
-from leapnav.envs.kernels.decorator import cache_root, source_stamp
 from leapnav.envs.kernels.numba_internals import FunctionPointer
-from leapnav.envs.utils.files import write_text
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION
+from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
 
-GENERATOR_VERSION = "4"  # part of the file name; to be increased whenever the generated code changes
+GENERATOR_VERSION = "5"  # part of the file name; to be increased whenever the generated code changes
 # The modules that the generated module imports.
 IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.numerics.flow"
 
 
+# What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or that
+# of the discs of a footprint.
+Obstacles = Literal["none", "disc", "footprint"]
+
+
 @lru_cache(maxsize=64)
 def compile_flow(
-    system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool
+    system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles
 ) -> tuple[FunctionPointer, FunctionPointer]:
     """Compile the extremal flow and the control law of a system.
 
     Args:
         system: the system.
         state_cost: SymPy expression in the state and the parameters.
-        in_field: whether to add the proximity cost of a packed obstacle field at the system's position.
+        obstacles: see `Obstacles`.
 
     Returns:
         `flow(z, data, field, S, dz, dS) -> running cost` and `control(z, data, u)`, see
         `leapnav.experts.numerics.flow`.
 
     Raises:
-        ValueError: `in_field`, and the system has no position.
+        ValueError: there are obstacles, and the system has no position, or no heading for a footprint.
 
     """
-    declaration = sp.srepr(
-        (system.state, system.parameters, system.drift, system.fields, system.position, state_cost, in_field)
-    )
-    # The functions that the generated module calls are compiled into it, so the key includes their source.
-    identity = "\n".join([GENERATOR_VERSION, declaration, *map(source_stamp, IMPORTED)])
-    name = f"flow_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
-    path = cache_root() / f"{name}.py"
-    if not path.exists():
-        write_text(path, _generate(system, state_cost, in_field))
-    spec = importlib.util.spec_from_file_location(f"leapnav_generated.{name}", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    check_obstacles(system, obstacles)
+    declaration = declare(system, state_cost, obstacles)
+    module = load("flow", GENERATOR_VERSION, declaration, IMPORTED, lambda: _generate(system, state_cost, obstacles))
     return FunctionPointer(module.flow, FLOW_FUNCTION), FunctionPointer(module.control, CONTROL_FUNCTION)
 
 
-def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) -> str:
+def declare(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles) -> str:
+    """Return a text that identifies a system with its cost."""
+    places = system.position, system.heading, obstacles
+    return sp.srepr((system.state, system.parameters, system.drift, system.fields, state_cost, str(places)))
+
+
+def check_obstacles(system: ControlAffineSystem, obstacles: Obstacles) -> None:
+    """Raise ValueError unless a system has the symbols that obstacles need."""
+    if obstacles != "none" and system.position is None:
+        raise ValueError("position: expected two state symbols for a problem with obstacles, got None")
+    if obstacles == "footprint" and system.heading is None:
+        raise ValueError("heading: expected a state symbol for a problem with a footprint, got None")
+
+
+def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles) -> str:
     """Return the source of the generated module."""
     n, m = system.n, system.m
     # The user's symbols are renamed, because their names need not be valid or distinct identifiers.
@@ -95,17 +97,16 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
                 p = switching[j]
                 entry += u[j] * sp.diff(p, z[a], z[b]) - slope[j] * sp.diff(p, z[a]) * sp.diff(p, z[b])
             hessian[a, b] = hessian[b, a] = entry
-    at: list[int] = []
-    if in_field:
-        if system.position is None:
-            raise ValueError("position: expected two state symbols for a problem with obstacles, got None")
-        phi = sp.symbols("phi phi_x phi_y phi_xx phi_xy phi_yy", real=True)
-        at = [system.state.index(s) for s in system.position]
+    at = obstacle_states(system, obstacles)
+    phi = [sp.Symbol(name, real=True) for name in PHI[len(at)]]
+    if at:
         value = value + phi[0]
-        for k in range(2):
+        for k in range(len(at)):
             gradient[at[k]] += phi[1 + k]
-        for k, row, column in ((3, 0, 0), (4, 0, 1), (4, 1, 0), (5, 1, 1)):
-            hessian[at[row], at[column]] += phi[k]
+        for k, (row, column) in enumerate(combinations_with_replacement(at, 2)):
+            hessian[row, column] += phi[1 + len(at) + k]
+            if row != column:
+                hessian[column, row] += phi[1 + len(at) + k]
 
     rate = [*gradient[n:], *(-g for g in gradient[:n])]
     jacobian = {}
@@ -117,54 +118,39 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, in_field: bool) 
     return _render(n, m, len(parameters), switching, value, rate, jacobian, at)
 
 
-class _Printer(PythonCodePrinter):
-    """Printer of Python code in which all numbers are floats.
+# Names of the value, gradient and Hessian (upper triangle, by rows) of the proximity cost, by the number of states on
+# which it depends.
+PHI = {
+    0: (),
+    2: ("phi", "phi_x", "phi_y", "phi_xx", "phi_xy", "phi_yy"),
+    3: (
+        *("phi", "phi_x", "phi_y", "phi_h"),
+        *("phi_xx", "phi_xy", "phi_xh", "phi_yy", "phi_yh", "phi_hh"),
+    ),
+}
 
-    In compiled code a division of floats by zero raises no error, and large integers do not overflow.
+
+def obstacle_states(system: ControlAffineSystem, obstacles: Obstacles) -> list[int]:
+    """Return the indices of the states on which the proximity cost depends."""
+    if obstacles == "none" or system.position is None:
+        return []
+    heading = () if obstacles == "disc" else (system.heading,)
+    return [system.state.index(symbol) for symbol in (*system.position, *heading)]
+
+
+def call_proximity(at: Sequence[int], first: int) -> list[str]:
+    """Return the line that computes the proximity cost.
+
+    Args:
+        at: indices of the states on which it depends.
+        first: index of the first disc of a footprint in the data.
+
     """
-
-    def _print_Integer(self, expr: Any) -> str:  # noqa: N802
-        return f"{float(expr)!r}"
-
-    def _print_Rational(self, expr: Any) -> str:  # noqa: N802
-        return f"{float(expr)!r}"
-
-    def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802
-        base, exponent = expr.as_base_exp()
-        text = self.parenthesize(base, PRECEDENCE["Atom"])
-        if exponent.is_Integer and 0 < abs(int(exponent)) <= 4:
-            power = "*".join([text] * abs(int(exponent)))
-            return f"({power})" if exponent > 0 else f"(1.0/({power}))"
-        if exponent == sp.Rational(1, 2):
-            return f"math.sqrt({self.doprint(base)})"
-        if exponent == sp.Rational(-1, 2):
-            return f"(1.0/math.sqrt({self.doprint(base)}))"
-        return f"({text}**({self.doprint(exponent)}))"
-
-
-_PRINTER = _Printer({"fully_qualified_modules": True})
-
-
-def _check_same(plain: list[Any], shared: Sequence[tuple[Any, Any]], reduced: Sequence[Any]) -> None:
-    """Raise RuntimeError if an expression and its reduced form differ at a sample point.
-
-    A wrong flow would not be noticed later: the certificate is computed with the same flow.
-    """
-    symbols = sorted(set().union(*(e.free_symbols for e in plain)), key=str)
-    point = {symbol: sp.Float(0.3 + 0.61803398875 * k % 0.5) for k, symbol in enumerate(symbols)}
-    values = dict(point)
-    for symbol, definition in shared:
-        values[symbol] = sp.sympify(definition).xreplace(values)
-    for expression, short in zip(plain, reduced, strict=True):
-        expected, found = (complex(sp.sympify(e).xreplace(values).evalf()) for e in (expression, short))
-        if abs(expected - found) > 1e-9 * (1.0 + abs(expected)):
-            raise RuntimeError(f"the generated code does not compute {expression}: {found} instead of {expected}")
-
-
-def _smooth(expression: Any) -> Any:
-    """Replace the distributions in the second derivatives of |x| and max(x, 0) by their values away from x = 0."""
-    expression = expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
-    return expression.replace(sp.Heaviside, lambda x, *_: (1 + sp.sign(x)) / 2)
+    if not at:
+        return []
+    states = ", ".join(f"q{i}" for i in at)
+    call = f"proximity({states}, field)" if len(at) == 2 else f"footprint_proximity({states}, data, {first}, field)"
+    return [f"    {', '.join(PHI[len(at)])} = {call}"]
 
 
 def _render(
@@ -178,32 +164,13 @@ def _render(
     position: list[int],
 ) -> str:
     """Return the source of a module that computes the given expressions, with common subexpressions removed."""
-    names = [
-        *(f"p{j}" for j in range(m)),
-        "value",
-        *(f"rate{i}" for i in range(2 * n)),
-        *(f"A{a}_{b}" for a, b in jacobian),
-    ]
-    plain = [_smooth(sp.sympify(e)) for e in (*switching, value, *rate, *jacobian.values())]
-    # Common subtrees only: the optimisations of sympy.cse are known to have turned a sum into a product.
-    shared, reduced = tree_cse(plain, sp.numbered_symbols("w"), order="none")
-    _check_same(plain, shared, reduced)
-    expressions: dict[str, Any] = dict(zip(names, reduced, strict=True))
-
-    emitted: set[sp.Symbol] = set()
-
-    def assign(target: str, expression: sp.Expr, indent: str) -> list[str]:
-        lines: list[str] = []
-
-        def require(e: sp.Expr) -> None:
-            for symbol, definition in shared:
-                if symbol in e.free_symbols and symbol not in emitted:
-                    require(definition)
-                    emitted.add(symbol)
-                    lines.append(f"{indent}{symbol} = {_PRINTER.doprint(definition)}")
-
-        require(expression)
-        return [*lines, f"{indent}{target} = {_PRINTER.doprint(expression)}"]
+    expressions = {
+        **{f"p{j}": p for j, p in enumerate(switching)},
+        "value": value,
+        **{f"rate{i}": r for i, r in enumerate(rate)},
+        **{f"A{a}_{b}": entry for (a, b), entry in jacobian.items()},
+    }
+    assign = Assignments(expressions).assign
 
     unpack = [
         "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
@@ -212,7 +179,7 @@ def _render(
     ]
     controls: list[str] = []
     for j in range(m):
-        controls += assign(f"p{j}", expressions[f"p{j}"], "    ")
+        controls += assign(f"p{j}", f"p{j}", "    ")
         controls += [
             f"    u{j} = -p{j} / data[{j}]; slope{j} = 1.0 / data[{j}]",
             f"    if u{j} < data[{m + j}]: u{j} = data[{m + j}]; slope{j} = 0.0",
@@ -221,16 +188,13 @@ def _render(
     control_body = [*controls, *(f"    u[{j}] = u{j}" for j in range(m))]
 
     lines = [*unpack, *controls]
-    if position:
-        lines.append(
-            f"    phi, phi_x, phi_y, phi_xx, phi_xy, phi_yy = proximity(q{position[0]}, q{position[1]}, field)"
-        )
-    lines += assign("value", expressions["value"], "    ")
+    lines += call_proximity(position, 3 * m + parameters)
+    lines += assign("value", "value", "    ")
     for i in range(2 * n):
-        lines += assign(f"dz[{i}]", expressions[f"rate{i}"], "    ")
+        lines += assign(f"dz[{i}]", f"rate{i}", "    ")
     lines.append("    if S.shape[1] > 0:")
     for a, b in jacobian:
-        lines += assign(f"A{a}_{b}", expressions[f"A{a}_{b}"], "        ")
+        lines += assign(f"A{a}_{b}", f"A{a}_{b}", "        ")
     lines.append("        for c in range(S.shape[1]):")
     for a in range(2 * n):
         terms = [f"A{a}_{b} * S[{b}, c]" for b in range(2 * n) if (a, b) in jacobian]
@@ -243,7 +207,7 @@ def _render(
             '"""Generated by leapnav.experts.problem.generated_flow: extremal flow and sensitivities. Do not edit."""',
             "import math",
             "from leapnav.envs.kernels import kernel",
-            "from leapnav.envs.shapes.proximity import proximity",
+            "from leapnav.envs.shapes.proximity import footprint_proximity, proximity",
             "from leapnav.experts.numerics.flow import CONTROL_SIGNATURE, FLOW_SIGNATURE",
             "",
             "@kernel(FLOW_SIGNATURE)",

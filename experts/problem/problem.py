@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -14,7 +14,11 @@ from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
-from leapnav.experts.problem.system import ControlAffineSystem, as_expression, unicycle
+from leapnav.experts.problem.system import ControlAffineSystem, as_expression, state_cost_of, system_of
+
+if TYPE_CHECKING:
+    from leapnav.experts.problem.generated_dynamics import CompiledDynamics
+    from leapnav.experts.problem.generated_flow import Obstacles
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class OptimalControlProblem:
         control_bounds: m pairs (minimum, maximum); None for unbounded controls.
         field: packed obstacle field (`Scenario.field`) whose proximity cost is added to Phi at the system's position.
         parameters: values of the system's parameters, in the order of their declaration.
+        footprint: offset along the heading and radius (m) of each disc of the robot; None for one disc with the radius
+            of the field.
 
     Raises:
         ValueError: an argument has a wrong length or an invalid value.
@@ -73,6 +79,7 @@ class OptimalControlProblem:
     control_bounds: Sequence[tuple[float, float]] | None = None
     field: np.ndarray | None = None
     parameters: Sequence[float] = ()
+    footprint: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         n, m = self.system.n, self.system.m
@@ -120,13 +127,16 @@ class OptimalControlProblem:
         """Return the problem of a scenario, with the robot's limits as control bounds."""
         robot, cost = scenario.robot, scenario.cost
         return cls(
-            system=unicycle(),
-            start=scenario.start,
-            goal=scenario.goal,
+            system=system_of(type(robot)),
+            start=scenario.start_state,
+            goal=scenario.goal_state,
             horizon=scenario.horizon,
-            control_weight=(cost.speed_weight, cost.turn_weight),
-            control_bounds=((-robot.max_speed, robot.max_speed), (-robot.max_turn_rate, robot.max_turn_rate)),
+            control_weight=robot.control_weight(cost),
+            state_cost=state_cost_of(type(robot)),
+            control_bounds=tuple((-limit, limit) for limit in robot.limits()),
             field=scenario.field,
+            parameters=robot.parameters(cost),
+            footprint=None if robot.footprint is None else tuple(map(tuple, scenario.discs.tolist())),
         )
 
     def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:
@@ -140,9 +150,29 @@ class OptimalControlProblem:
                 goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
         return replace(self, goal=tuple(goal))
 
+    @property
+    def _obstacles(self) -> Obstacles:
+        if self.field is None:
+            return "none"
+        return "disc" if self.footprint is None else "footprint"
+
+    @property
+    def discs(self) -> np.ndarray:
+        """The discs of the robot (D, 2), offset along its heading and radius (m); (0, 2) without obstacles."""
+        if self.field is None:
+            return np.empty((0, 2))
+        return np.array(self.footprint if self.footprint is not None else [(0.0, self.field[2])], dtype=float)
+
+    @cached_property
+    def compiled_dynamics(self) -> CompiledDynamics:
+        """The compiled dynamics with controls as arguments, for direct transcription."""
+        from leapnav.experts.problem.generated_dynamics import compile_dynamics
+
+        return compile_dynamics(self.system, as_expression("state_cost", self.state_cost), self._obstacles)
+
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions cannot be pickled; the receiving process creates its own.
-        return {name: value for name, value in self.__dict__.items() if name != "arrays"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("arrays", "compiled_dynamics")}
 
     @cached_property
     def arrays(self) -> ProblemArrays:
@@ -151,12 +181,13 @@ class OptimalControlProblem:
 
         m = self.system.m
         state_cost = as_expression("state_cost", self.state_cost)
-        flow, control = compile_flow(self.system, state_cost, self.field is not None)
+        flow, control = compile_flow(self.system, state_cost, self._obstacles)
         bounds = np.array(
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
         goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
-        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *self.parameters])
+        discs = () if self._obstacles != "footprint" else self.discs.ravel().tolist()
+        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *self.parameters, *discs])
         field = _constant([]) if self.field is None else self.field
         return ProblemArrays(
             flow=ExtremalFlow(flow, data, field),
@@ -221,7 +252,7 @@ class ProblemArrays:
 
     @property
     def data(self) -> np.ndarray:
-        """Control weights (m,), lower and upper control bounds (2m,), and parameters."""
+        """Control weights (m,), lower and upper control bounds (2m,), parameters, and the discs of a footprint."""
         return self.flow.data
 
     @property

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from leapnav.envs.robots import DifferentialDrive, DynamicUnicycle, RobotModel, Unicycle
+
 if TYPE_CHECKING:
     import sympy as sp
 
@@ -28,6 +30,7 @@ class ControlAffineSystem:
             (`OptimalControlProblem.parameters`). A new value needs no compilation.
         labels: names of the n states and the m controls with their units, in Matplotlib's mathtext, for plots; by
             default the symbols of the states, and u_1, ..., u_m.
+        heading: the state symbol that is the heading, for systems with a footprint of several discs.
 
     Attributes:
         n: number of states.
@@ -51,6 +54,7 @@ class ControlAffineSystem:
     position: tuple[sp.Symbol, sp.Symbol] | None = None
     parameters: tuple[sp.Symbol, ...] = field(default=())
     labels: tuple[str, ...] = field(default=(), compare=False)
+    heading: sp.Symbol | None = None
 
     def __init__(
         self,
@@ -62,6 +66,7 @@ class ControlAffineSystem:
         parameters: Sequence[sp.Symbol] = (),
         *,
         labels: Sequence[str] = (),
+        heading: sp.Symbol | None = None,
     ) -> None:
         import sympy as sp
 
@@ -89,6 +94,7 @@ class ControlAffineSystem:
             "angles": tuple(angles),
             "position": None if position is None else tuple(position),
             "parameters": tuple(parameters),
+            "heading": heading,
         }
         for where, expressions in [
             ("drift", values["drift"]),
@@ -100,7 +106,8 @@ class ControlAffineSystem:
                     f"{where}: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {tuple(state)}, "
                     f"the parameters are {tuple(parameters)}"
                 )
-        for where, chosen in (("angles", values["angles"]), ("position", values["position"] or ())):
+        places = {"angles": values["angles"], "position": values["position"] or ()}
+        for where, chosen in (*places.items(), ("heading", () if heading is None else (heading,))):
             if not set(chosen) <= set(state):
                 raise ValueError(f"{where}: {chosen} is not among the state symbols {tuple(state)}")
         for name, value in values.items():
@@ -139,23 +146,32 @@ def as_expression(where: str, value: Any) -> sp.Expr:
     return expression
 
 
-POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
+@cache
+def system_of(model: type[RobotModel]) -> ControlAffineSystem:
+    """Return the system of a robot model."""
+    dynamics = model.dynamics()
+    x, y, heading = dynamics.state[:3]
+    return ControlAffineSystem(
+        state=dynamics.state,
+        drift=dynamics.drift,
+        fields=dynamics.fields,
+        angles=(heading, *(dynamics.state[model.state_names.index(name)] for name in model.heading_states)),
+        position=(x, y),
+        parameters=dynamics.parameters,
+        labels=dynamics.labels,
+        heading=heading,
+    )
 
 
 @cache
+def state_cost_of(model: type[RobotModel]) -> sp.Expr:
+    """Return the state cost of a robot model, without the proximity cost."""
+    return as_expression("state_cost", model.dynamics().state_cost)
+
+
 def unicycle() -> ControlAffineSystem:
     """Return the unicycle: q = (x, y, theta), u = (v, omega) in m/s and rad/s."""
-    import sympy as sp
-
-    x, y, theta = sp.symbols("x y theta")
-    return ControlAffineSystem(
-        state=(x, y, theta),
-        drift=(0, 0, 0),
-        fields=((sp.cos(theta), sp.sin(theta), 0), (0, 0, 1)),
-        angles=(theta,),
-        position=(x, y),
-        labels=(*POSE_LABELS, "$v$ (m/s)", r"$\omega$ (rad/s)"),
-    )
+    return system_of(Unicycle)
 
 
 def differential_drive() -> ControlAffineSystem:
@@ -163,33 +179,18 @@ def differential_drive() -> ControlAffineSystem:
 
     Its parameter `track` is the distance (m) between the wheels.
     """
-    import sympy as sp
-
-    x, y, theta, track = sp.symbols("x y theta track")
-    return ControlAffineSystem(
-        state=(x, y, theta),
-        drift=(0, 0, 0),
-        fields=(
-            (sp.cos(theta) / 2, sp.sin(theta) / 2, -1 / track),
-            (sp.cos(theta) / 2, sp.sin(theta) / 2, 1 / track),
-        ),
-        angles=(theta,),
-        position=(x, y),
-        labels=(*POSE_LABELS, "left wheel (m/s)", "right wheel (m/s)"),
-        parameters=(track,),
-    )
+    return system_of(DifferentialDrive)
 
 
 def unicycle_with_inertia() -> ControlAffineSystem:
     """Return the unicycle with inertia: q = (x, y, theta, v, omega), u = (dv/dt, domega/dt) in m/s^2 and rad/s^2."""
-    import sympy as sp
-
-    x, y, theta, v, omega = sp.symbols("x y theta v omega")
+    system = system_of(DynamicUnicycle)
     return ControlAffineSystem(
-        state=(x, y, theta, v, omega),
-        drift=(v * sp.cos(theta), v * sp.sin(theta), omega, 0, 0),
-        fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
-        angles=(theta,),
-        position=(x, y),
-        labels=(*POSE_LABELS, "$v$ (m/s)", r"$\omega$ (rad/s)", r"$\dot v$ (m/s$^2$)", r"$\dot\omega$ (rad/s$^2$)"),
+        state=system.state,
+        drift=system.drift,
+        fields=system.fields,
+        angles=system.angles,
+        position=system.position,
+        labels=system.labels,
+        heading=system.heading,
     )

@@ -9,8 +9,8 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, VECTOR, tuple_of
+from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW
 from leapnav.experts.numerics.integrator import (
     EXTRA_STAGES,
@@ -136,34 +136,53 @@ def trace(flow, control, times, Z, accuracy, record):
     return rows + 1, defect, conjugate
 
 
-@kernel(float64(CONSTANT, VECTOR, MATRIX, CUBE, int64, int64))
-def dense_clearance(field, times, starts, terms, ix, iy):
+@kernel(float64(CONSTANT, CONSTANT_MATRIX, INTEGERS, VECTOR, MATRIX, CUBE))
+def dense_clearance(field, discs, places, times, starts, terms):
     """Return the smallest clearance (m) along the interpolated path.
 
-    Clearance changes by at most the distance travelled, so parts of the path that cannot contain a smaller value are
-    skipped.
+    Clearance changes by at most the distance travelled by a disc, so parts of the path that cannot contain a smaller
+    value are skipped.
+
+    Args:
+        field: packed obstacle field.
+        discs (D, 2): offsets along the heading and radii (m) of the robot's discs.
+        places (3,): indices of x, y and the heading in the state; the heading may be -1 for one disc without an offset.
+        times, starts, terms: see `Extremal`.
+
     """
-    smallest, _ = clearance(starts[0, ix], starts[0, iy], field)
+    ix, iy, ih = places[0], places[1], places[2]
+    arm = 0.0
+    for d in range(len(discs)):
+        arm = max(arm, abs(discs[d, 0]))
+    smallest, _ = footprint_clearance(starts[0, ix], starts[0, iy], starts[0, ih], discs, field)
     for k in range(len(times) - 1):
         # An upper bound of the speed: the largest mean speed over an eighth of the step, with a safety factor of 1.5.
         length = 0.0
-        x, y = starts[k, ix], starts[k, iy]
+        x, y, heading = starts[k, ix], starts[k, iy], starts[k, ih]
         for part in range(1, 9):
             px = evaluate_interpolant(starts[k, ix], part / 8.0, terms[k], ix)
             py = evaluate_interpolant(starts[k, iy], part / 8.0, terms[k], iy)
-            length = max(length, 8.0 * math.hypot(px - x, py - y))
+            travelled = math.hypot(px - x, py - y)
+            if arm > 0.0:
+                turned = evaluate_interpolant(starts[k, ih], part / 8.0, terms[k], ih)
+                travelled += arm * abs(turned - heading)
+                heading = turned
+            length = max(length, 8.0 * travelled)
             x, y = px, py
         length = 1.5 * length + 1e-12
         s = 0.0
         while s < 1.0:
-            value, _ = clearance(
+            heading = evaluate_interpolant(starts[k, ih], s, terms[k], ih) if arm > 0.0 else 0.0
+            value, _ = footprint_clearance(
                 evaluate_interpolant(starts[k, ix], s, terms[k], ix),
                 evaluate_interpolant(starts[k, iy], s, terms[k], iy),
+                heading,
+                discs,
                 field,
             )
             smallest = min(smallest, value)
             # Advance by the distance to a smaller value, at least 0.1 to 5 mm. Over 5 mm the path deviates from a line
             # by about 0.01 mm; close to contact the steps are shorter.
             s += max(value - smallest, min(max(0.1 * smallest, 1e-4), 5e-3)) / length
-    value, _ = clearance(starts[-1, ix], starts[-1, iy], field)
+    value, _ = footprint_clearance(starts[-1, ix], starts[-1, iy], starts[-1, ih], discs, field)
     return min(smallest, value)

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from leapnav.envs.robots.moves import HEADINGS
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import (
-    HEADINGS,
     Limits,
     Metric,
     Nodes,
@@ -35,7 +35,6 @@ REACH = 1.3  # largest cost of a candidate relative to the cheapest, apart from 
 TURNING_FACTOR = 1.2  # initial estimate of the length of a path relative to the shortest path in the plane
 MAX_LOG_ENERGY_ERROR = 0.5  # error of log E above which E is corrected; the order of candidates hardly depends on E
 MIN_ENERGY = 1e-4
-MIN_TURN_LENGTH = 0.3  # smallest cost of 1 rad, as a distance in cells
 MIN_ENERGY_FRACTION = 0.3  # smallest E of a path, relative to its E for a small Phi
 LATTICE_ERROR = 1.07  # relative length error of lattice paths, see `suffices`; at most 1.067 in 200 scenarios
 # Nodes within this distance (cells, heading steps) of a candidate belong to it.
@@ -113,7 +112,7 @@ class CandidateSearch:
     @property
     def slack(self) -> float:
         """Cost of 1 m where Phi is zero; it admits manoeuvres, which are long compared with a short distance."""
-        return math.sqrt(2 * self.energy * self.lattice.scenario.cost.speed_weight)
+        return math.sqrt(2 * self.energy * self.lattice.weights[0])
 
     def candidates(self) -> Iterator[Candidate]:
         """Yield distinct paths in order of cost; none if the goal cannot be reached."""
@@ -165,13 +164,13 @@ class CandidateSearch:
     def _first_energy(self) -> float:
         """Estimate E from the shortest path in the plane; 0 if there is none."""
         scenario = self.lattice.scenario
-        weight, horizon = scenario.cost.speed_weight, scenario.horizon
+        weight, horizon = self.lattice.weights[0], scenario.horizon
         start, goal = scenario.start, scenario.goal
         energy = max(0.5 * weight * (math.dist(start[:2], goal[:2]) / horizon) ** 2, MIN_ENERGY)
         for _ in range(3):
             metric = self._metric(energy)
-            cost = _plane_costs(metric, self.lattice.nodes_around(*start, metric.speed))
-            targets = self.lattice.nodes_around(*goal, metric.speed).nodes // HEADINGS
+            cost = _plane_costs(metric, self.lattice.nodes_around(*start, metric.plane))
+            targets = self.lattice.nodes_around(*goal, metric.plane).nodes // HEADINGS
             shortest = float(cost[targets].min()) if len(targets) else math.inf
             if not math.isfinite(shortest):
                 return 0.0
@@ -184,16 +183,16 @@ class CandidateSearch:
 
     def _metric(self, energy: float) -> Metric:
         """Return the metric for a given E."""
-        cost, cell = self.lattice.scenario.cost, self.lattice.cell
-        # If rotation had almost no cost, all headings of a cell would be equivalent, and the search would not end.
-        turn_weight = max(cost.turn_weight, cost.speed_weight * (MIN_TURN_LENGTH * cell) ** 2)
-        return Metric(np.sqrt(2.0 * (energy + self.lattice.phi)), cell, cost.speed_weight, turn_weight)
+        lattice = self.lattice
+        speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
+        plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
+        return Metric(speed, plane, lattice.cell, lattice.weights[0], moves.targets, moves.lengths, moves.points)
 
     def _grow(self) -> None:
         """Compute the trees from the start and from the goal, and the nodes at which they meet, in order of cost."""
         scenario, metric = self.lattice.scenario, self._metric(self.energy)
-        seeds = self.lattice.nodes_around(*scenario.start, metric.speed)
-        ends = self.lattice.nodes_around(*scenario.goal, metric.speed)
+        seeds = self.lattice.nodes_around(*scenario.start, metric.plane)
+        ends = self.lattice.nodes_around(*scenario.goal, metric.plane)
         bound = _plane_costs(metric, seeds)
         limits = Limits(self._reach, self.slack, math.inf)
         cost_behind, behind, limit = tree(metric, ends, seeds, bound, False, limits)

@@ -6,11 +6,17 @@ from typing import Any
 
 import casadi
 import numpy as np
+import sympy as sp
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.transcription.direct import follow_controls
 
 TOLERANCE, MAX_ITERATIONS = 1e-6, 300
+
+
+# CasADi's functions by their names in SymPy.
+FUNCTIONS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
 
 
 class Transcription:
@@ -18,24 +24,41 @@ class Transcription:
 
     Args:
         scenario: the scenario.
+        problem: its optimal control problem.
         intervals: number of time intervals.
 
     """
 
-    def __init__(self, scenario: Scenario, intervals: int) -> None:
-        cost, robot = scenario.cost, scenario.robot
-        self._scenario, self._intervals = scenario, intervals
-        q, u = casadi.SX.sym("q", 3, intervals + 1), casadi.SX.sym("u", 2, intervals + 1)
-        goal = casadi.SX.sym("goal", 3)
+    def __init__(self, scenario: Scenario, problem: OptimalControlProblem, intervals: int) -> None:
+        system = problem.system
+        self._problem, self._intervals = problem, intervals
+        n, m = system.n, system.m
+        q, u = casadi.SX.sym("q", n, intervals + 1), casadi.SX.sym("u", m, intervals + 1)
+        goal = casadi.SX.sym("goal", n)
         h = scenario.horizon / intervals
-        v, w = u[0, :], u[1, :]
-        rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
-        running = (cost.speed_weight * v**2 + cost.turn_weight * w**2) / 2
-        running += cost.proximity_weight * _proximity(scenario, q[0, :], q[1, :])
+        functions = {name: getattr(casadi, name) for name in FUNCTIONS}
+        symbols = (*system.state, *system.parameters)
+
+        def evaluate(expression: Any) -> Any:
+            function = sp.lambdify(symbols, expression, modules=[functions, "math"], cse=True)
+            return function(*(q[i, :] for i in range(n)), *problem.parameters)
+
+        rates = casadi.vertcat(
+            *(
+                evaluate(a) + sum(u[j, :] * evaluate(system.fields[j][i]) for j in range(m))
+                for i, a in enumerate(system.drift)
+            )
+        )
+        running = evaluate(sp.sympify(problem.state_cost))
+        for j, weight in enumerate(problem.control_weight):
+            running += weight * u[j, :] ** 2 / 2
+        for offset, radius in scenario.discs.tolist():
+            x, y = q[0, :] + offset * casadi.cos(q[2, :]), q[1, :] + offset * casadi.sin(q[2, :])
+            running += scenario.cost.proximity_weight * _proximity(scenario, x, y, radius)
         steps = q[:, 1:] - q[:, :-1] - h / 2 * (rates[:, 1:] + rates[:, :-1])
-        fixed = 3 if scenario.goal[2] is not None else 2
+        fixed = [i for i, value in enumerate(problem.goal) if value is not None]
         constraints = casadi.vertcat(
-            casadi.vec(steps), q[:, 0] - np.array(scenario.start), q[:fixed, -1] - goal[:fixed]
+            casadi.vec(steps), q[:, 0] - np.array(problem.start), *(q[i, -1] - goal[i] for i in fixed)
         )
         program = {
             "x": casadi.vertcat(casadi.vec(q), casadi.vec(u)),
@@ -49,36 +72,35 @@ class Transcription:
         }
         self._solver: Any = casadi.nlpsol("solver", "ipopt", program, options)
         self._count = constraints.shape[0]
-        limits = [robot.max_speed, robot.max_turn_rate]
-        self._limits = np.concatenate([np.full(3 * (intervals + 1), np.inf), np.tile(limits, intervals + 1)])
+        limits = scenario.robot.limits()
+        self._limits = np.concatenate([np.full(n * (intervals + 1), np.inf), np.tile(limits, intervals + 1)])
 
     def solve(self, problem: OptimalControlProblem, path: Trajectory) -> Trajectory | None:
         """Solve from an initial guess.
 
         Args:
             problem: the problem, whose goal has the winding of the guess.
-            path: the initial guess.
+            path: the initial guess, in the states of the problem.
 
         Returns:
             A local optimum, None if IPOPT does not converge.
 
         """
-        times = np.linspace(0.0, self._scenario.horizon, self._intervals + 1)
+        times = np.linspace(0.0, problem.horizon, self._intervals + 1)
         states = path.resample(times).states
-        rates = np.gradient(states, times, axis=0)
-        speed = rates[:, 0] * np.cos(states[:, 2]) + rates[:, 1] * np.sin(states[:, 2])
-        guess = np.concatenate([states.ravel(), np.stack([speed, rates[:, 2]], axis=1).ravel()])
+        controls = follow_controls(problem, states, np.gradient(states, times, axis=0))
+        guess = np.concatenate([states.ravel(), controls.ravel()])
         zero = np.zeros(self._count)
         goal = problem.arrays.goal
         found = self._solver(x0=guess, p=goal, lbx=-self._limits, ubx=self._limits, lbg=zero, ubg=zero)
         if not self._solver.stats()["success"]:
             return None
-        return Trajectory(times, np.array(found["x"]).ravel()[: states.size].reshape(-1, 3))
+        return Trajectory(times, np.array(found["x"]).ravel()[: states.size].reshape(states.shape))
 
 
-def _proximity(scenario: Scenario, x: Any, y: Any) -> Any:
-    """The proximity cost divided by its weight, written independently of the kernels."""
-    sigma, radius = scenario.cost.proximity_scale, scenario.robot.radius
+def _proximity(scenario: Scenario, x: Any, y: Any, radius: float) -> Any:
+    """The proximity cost of a disc divided by its weight, written independently of the kernels."""
+    sigma = scenario.cost.proximity_scale
     x_min, y_min, x_max, y_max = scenario.arena
     total = 0
     for distance in (x - x_min, x_max - x, y - y_min, y_max - y):

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import label
 
+from leapnav.envs.robots.moves import ANGLES, HEADINGS, Moves
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.sampling import PointGrid, sample_grid
-from leapnav.experts.search.shortest_paths import ANGLES, BORDER, HEADINGS, Nodes
+from leapnav.experts.search.shortest_paths import Nodes
 
 # Smallest and largest cell (m), and number of cells from start to goal: small enough for manoeuvres over a short
 # distance. The obstacles are sampled at half of this resolution.
@@ -27,6 +28,7 @@ MAX_CELLS = 250  # per side; larger arenas have larger cells
 # two points, but no wall is thinner than the robot.
 TOLERATED_DEPTH = 0.4
 RELEVANT_DISTANCE = 12.0  # proximity scales, beyond which the proximity cost of an obstacle is negligible
+MIN_TURN_LENGTH = 0.3  # smallest cost of 1 rad, as a distance in cells
 SEED_ANGLE = math.radians(30)  # largest difference between the heading of a pose and that of a node next to it
 
 
@@ -62,7 +64,10 @@ class Lattice:
         origin: position (m) of cell (0, 0).
         columns: number of cells in x.
         lines: number of cells in y.
-        phi: (2 columns - 1, 2 lines - 1), proximity cost on the half-cell grid, infinite where the robot cannot be.
+        phi: (K, 2 columns - 1, 2 lines - 1), proximity cost on the half-cell grid, infinite where the robot cannot be;
+            one layer for all headings, or for a footprint of several discs one for each heading.
+        weights: weights of the squared speed and turn rate in the metric.
+        moves: motion primitives of the robot.
         cropped: whether the lattice covers only a part of the arena.
 
     """
@@ -75,10 +80,12 @@ class Lattice:
         whole: bool = False,
     ) -> None:
         self.scenario = scenario
-        depth = -TOLERATED_DEPTH * scenario.robot.radius if margin is None else margin
+        robot, discs = scenario.robot, scenario.discs
+        self._radius = float(discs[:, 1].min())
+        depth = -TOLERATED_DEPTH * self._radius if margin is None else margin
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
-        cell = min(max(distance / CELLS_PER_DISTANCE, MIN_CELL), MAX_CELL) / refinement
+        cell = min(max(distance / CELLS_PER_DISTANCE, MIN_CELL), MAX_CELL, robot.max_lattice_cell()) / refinement
         x, y, _ = scenario.start
         if not whole:  # limits the search to the surroundings of start and goal, so that the cells stay small
             half = max(cell * MAX_CELLS / 2, 0.75 * distance)
@@ -87,18 +94,34 @@ class Lattice:
             y_min, y_max = max(y_min, middle[1] - half), min(y_max, middle[1] + half)
         self.cropped = (x_min, y_min, x_max, y_max) != tuple(scenario.arena)
         self.cell = max(cell, (x_max - x_min) / MAX_CELLS, (y_max - y_min) / MAX_CELLS)
+        speed_weight, turn_weight = robot.metric(scenario.cost)
+        # If rotation had almost no cost, all headings of a cell would be equivalent, and the search would not end.
+        turn_weight = max(turn_weight, speed_weight * (MIN_TURN_LENGTH * self.cell) ** 2)
+        self.weights = speed_weight, turn_weight
+        self.moves: Moves = robot.lattice_moves(self.cell, speed_weight, turn_weight)
+        border = self.moves.border
         # The start is a lattice point.
-        left, below = int((x - x_min) / self.cell) + BORDER, int((y - y_min) / self.cell) + BORDER
-        right, above = int((x_max - x) / self.cell) + BORDER, int((y_max - y) / self.cell) + BORDER
+        left, below = int((x - x_min) / self.cell) + border, int((y - y_min) / self.cell) + border
+        right, above = int((x_max - x) / self.cell) + border, int((y_max - y) / self.cell) + border
         self.origin = (x - left * self.cell, y - below * self.cell)
         self.columns, self.lines = left + right + 1, below + above + 1
         band = max(RELEVANT_DISTANCE * scenario.cost.proximity_scale, 2.0 * depth, 0.1)
         grid = PointGrid(*self.origin, self.cell / 2, 2 * self.columns - 1, 2 * self.lines - 1)
-        phi, clearance = sample_grid(scenario.field, grid, band)
-        phi[clearance < depth] = np.inf
-        for side in (np.s_[: 2 * BORDER], np.s_[-2 * BORDER :]):
-            phi[side] = phi[:, side] = np.inf
-        self.phi = phi
+        outside = np.zeros((grid.columns, grid.lines), dtype=bool)
+        for side in (np.s_[: 2 * border], np.s_[-2 * border :]):
+            outside[side] = outside[:, side] = True
+        layers = []
+        for heading in ANGLES if scenario.robot.footprint is not None else ANGLES[:1]:
+            total = np.zeros(outside.shape)
+            for offset, radius in discs.tolist():
+                shift = offset * math.cos(heading), offset * math.sin(heading)
+                moved = grid._replace(x0=grid.x0 + shift[0], y0=grid.y0 + shift[1])
+                phi, clearance = sample_grid(scenario.field, radius, moved, band)
+                phi[clearance < depth] = np.inf
+                total += phi
+            total[outside] = np.inf
+            layers.append(total)
+        self.phi = np.stack(layers)
 
     def without(self, places: Sequence[Place]) -> Lattice:
         """Return the lattice with some places closed, in a radius that blocks a passage narrower than the robot."""
@@ -108,26 +131,28 @@ class Lattice:
         lattice.phi = self.phi.copy()
         spacing = self.cell / 2
         ends = np.array([self.scenario.start[:2], self.scenario.goal[:2]])
-        x, y = (self.origin[axis] + spacing * np.arange(count) for axis, count in enumerate(self.phi.shape))
+        x, y = (self.origin[axis] + spacing * np.arange(count) for axis, count in enumerate(self.phi.shape[1:]))
         for place in places:
-            radius = TOLERATED_DEPTH * self.scenario.robot.radius + spacing
+            radius = TOLERATED_DEPTH * self._radius + spacing
             if place.wide:  # the centre line of a passage next to it is farther away than this
-                radius = max(radius, 2.0 * self.scenario.robot.radius)
+                radius = max(radius, 2.0 * self._radius)
             if np.hypot(*(ends - (place.x, place.y)).T).min() <= radius + 2 * self.cell:
                 continue  # every path passes the start and the goal
             columns, lines = np.abs(x - place.x) <= radius, np.abs(y - place.y) <= radius
             is_close = np.hypot(x[columns, None] - place.x, y[lines] - place.y) <= radius
             closed = np.ix_(columns, lines)
-            lattice.phi[closed] = np.where(is_close, np.inf, lattice.phi[closed])
+            for layer in lattice.phi:
+                layer[closed] = np.where(is_close, np.inf, layer[closed])
         return lattice
 
     def metric_lengths(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return length in the metric of the weights, and Phi at the midpoint, of each step of a path (N, 3)."""
-        cost = self.scenario.cost
+        speed_weight, turn_weight = self.scenario.robot.metric(self.scenario.cost)
         step = np.diff(poses, axis=0)
-        lengths = np.sqrt(cost.speed_weight * (step[:, 0] ** 2 + step[:, 1] ** 2) + cost.turn_weight * step[:, 2] ** 2)
+        lengths = np.sqrt(speed_weight * (step[:, 0] ** 2 + step[:, 1] ** 2) + turn_weight * step[:, 2] ** 2)
         at = np.rint((poses[1:, :2] + poses[:-1, :2] - 2 * np.array(self.origin)) / self.cell).astype(int)
-        phi = self.phi[at[:, 0], at[:, 1]]
+        layer = np.abs((ANGLES - poses[:-1, 2, None] + np.pi) % (2 * np.pi) - np.pi).argmin(axis=1)
+        phi = self.phi[layer if len(self.phi) > 1 else 0, at[:, 0], at[:, 1]]
         return lengths, np.where(np.isfinite(phi), phi, 0.0)
 
     def nodes_around(self, x: float, y: float, heading: float | None, speed: np.ndarray) -> Nodes:
@@ -137,10 +162,10 @@ class Lattice:
             x: position (m).
             y: position (m).
             heading: heading (rad); None for all headings.
-            speed: sqrt(2 (E + Phi)) on the half-cell grid.
+            speed: sqrt(2 (E + Phi)) on the half-cell grid, minimum over the headings.
 
         """
-        cost = self.scenario.cost
+        speed_weight, turn_weight = self.scenario.robot.metric(self.scenario.cost)
         fi, fj = (x - self.origin[0]) / self.cell, (y - self.origin[1]) / self.cell
         nodes, costs = [], []
         turns = np.zeros(HEADINGS) if heading is None else np.abs((ANGLES - heading + np.pi) % (2 * np.pi) - np.pi)
@@ -151,7 +176,7 @@ class Lattice:
                     continue
                 shift = self.cell * math.hypot(i - fi, j - fj)
                 nodes.append((i * self.lines + j) * HEADINGS + headings)
-                lengths = np.sqrt(cost.speed_weight * shift**2 + cost.turn_weight * turns[headings] ** 2)
+                lengths = np.sqrt(speed_weight * shift**2 + turn_weight * turns[headings] ** 2)
                 costs.append(lengths * speed[2 * i, 2 * j])
         if not nodes:
             return Nodes(np.empty(0, dtype=np.int64), np.empty(0))
@@ -171,10 +196,13 @@ class Lattice:
 
 
 def is_connected(scenario: Scenario) -> bool:
-    """Return whether a collision-free path from start to goal exists, at the resolution of a fine grid.
+    """Return whether a collision-free path may exist from start to goal, at the resolution of a fine grid.
 
-    The robot is a disc that can rotate in place, so only the position of its centre matters.
+    A path of the robot is also one of a disc around (x, y) in its footprint, which can rotate in place, so that only
+    the position matters.
     """
+    discs = scenario.discs
+    radius = max(float((discs[:, 1] - np.abs(discs[:, 0])).max()), 1e-3)
     x_min, y_min, x_max, y_max = scenario.arena
     spacing = max(MIN_SPACING, (x_max - x_min) / MAX_POINTS, (y_max - y_min) / MAX_POINTS)
     connected = False
@@ -184,7 +212,7 @@ def is_connected(scenario: Scenario) -> bool:
         left, below = int((x - x_min) / spacing), int((y - y_min) / spacing)
         columns, lines = left + int((x_max - x) / spacing) + 1, below + int((y_max - y) / spacing) + 1
         origin = x - left * spacing, y - below * spacing
-        free = sample_grid(scenario.field, PointGrid(*origin, spacing, columns, lines), spacing)[1] > 0
+        free = sample_grid(scenario.field, radius, PointGrid(*origin, spacing, columns, lines), spacing)[1] > 0
         other = scenario.goal if (x, y) == scenario.start[:2] else scenario.start
         at = min(max(round((other[0] - origin[0]) / spacing), 0), columns - 1)
         up = min(max(round((other[1] - origin[1]) / spacing), 0), lines - 1)

@@ -14,14 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.search.direct import DirectPath, discretise, optimise
 from leapnav.experts.search.lattice import TOLERATED_DEPTH, Place
+from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.nodes import SolverOptions
+from leapnav.experts.transcription.direct import DirectPath, discretise, optimise
 
 TOLERANCE = 1e-9
 # Newton iterations of the last attempt, and of the attempts before it, after which the path is refined.
@@ -72,7 +73,9 @@ class LocalOptima:
 
     def __init__(self, scenario: Scenario, problem: OptimalControlProblem, budget: float = math.inf) -> None:
         self.scenario, self.problem, self._budget = scenario, problem, budget
-        self._slight_depth = MAX_SLIGHT_DEPTH * scenario.robot.radius
+        radius = float(scenario.discs[:, 1].min())
+        self._slight_depth = MAX_SLIGHT_DEPTH * radius
+        self._lift = Lifting(scenario, problem)
         self._duplicate_distance = DUPLICATE_DISTANCE * min(
             1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE
         )
@@ -84,7 +87,7 @@ class LocalOptima:
         self._deep: list[_Failure] = []
         self._failed_evaluations = 0
         self._closing = True
-        self._place_radius = SAME_PLACE * scenario.robot.radius
+        self._place_radius = SAME_PLACE * radius
         self.closed_places: list[Place] = []
 
     def reset_failure_budget(self) -> None:
@@ -104,10 +107,15 @@ class LocalOptima:
         """Compute the local optima of candidate paths, in order of the cost of their direct paths."""
         solved = []
         for path in paths:
-            problem = self.problem.with_winding_of(path.states)
-            solved.append((problem, optimise(problem, discretise(path))))
+            lifted = self._lift(path)
+            if lifted is not None:
+                problem = self.problem.with_winding_of(lifted.states)
+                solved.append((problem, self._optimise(problem, discretise(problem, lifted))))
         for problem, direct in sorted(solved, key=lambda entry: entry[1].cost):
             self.add_direct(problem, direct)
+
+    def _optimise(self, problem: OptimalControlProblem, guess: DirectPath) -> DirectPath:
+        return optimise(problem, guess, self.scenario.cost.speed_weight)
 
     def add_direct(self, problem: OptimalControlProblem, direct: DirectPath) -> None:
         """Compute the extremal of a direct path, unless the path is a duplicate or unlikely to lead to a useful one."""
@@ -117,7 +125,7 @@ class LocalOptima:
         if self._is_discarded(problem, direct, direct, DIRECT_ERROR):
             return
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
-        refined = optimise(problem, direct.refined())
+        refined = self._optimise(problem, direct.refined())
         is_duplicate = self._is_seen(refined)
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if is_duplicate:
@@ -184,7 +192,7 @@ class LocalOptima:
         n_attempts = MAX_ATTEMPTS if is_clear else MAX_ATTEMPTS - 1  # less effort for a path in collision
         for attempt in range(n_attempts):
             if attempt > 0:
-                direct = optimise(problem, direct.refined())
+                direct = self._optimise(problem, direct.refined())
                 for extremal in (*self.certified, *self.refused):
                     if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
                         return extremal, total
@@ -195,12 +203,14 @@ class LocalOptima:
             total += evaluations
             if status is Status.SUCCESS:
                 options = SolverOptions(TOLERANCE, iterations)
-                return confirm(problem, times, nodes, status, history, total, options), total
+                found = confirm(problem, times, nodes, status, history, total, options)
+                if len(found.times):  # otherwise re-integration diverged
+                    return found, total
         return None, total
 
     def _clearances(self, path: DirectPath) -> np.ndarray:
         """Return the clearance (m) at each point of a path."""
-        return clearances(path.states, self.scenario.field)
+        return footprint_clearances(path.states, self.scenario.discs, self.scenario.field)
 
     def _is_expensive(self, path: DirectPath, error: float) -> bool:
         """Return whether a path costs more than the best extremal by more than the relative error of its cost."""
@@ -210,7 +220,7 @@ class LocalOptima:
     def _close_place(self, path: DirectPath, clearance: np.ndarray) -> None:
         """Close the place where a path is deepest in an obstacle, unless it is closed or the depth is negligible."""
         if self._closing and clearance.min() < -MIN_CLOSED_DEPTH * self._slight_depth:
-            x, y, _ = path.states[int(clearance.argmin())].tolist()
+            x, y = path.states[int(clearance.argmin()), :2].tolist()
             is_slight = clearance.min() >= -self._slight_depth
             close = [p for p in self.closed_places if math.hypot(x - p.x, y - p.y) <= 0.5 * self._place_radius]
             if not any((p.clearance >= -self._slight_depth) == is_slight for p in close):
@@ -252,7 +262,7 @@ class LocalOptima:
         if self.refused:
             return min(self.refused, key=lambda extremal: extremal.cost)
         _, problem, direct = min(self._deep or self._stalled, key=lambda failure: failure.cost)
-        extremal = self._extremal(problem, optimise(problem, direct.refined()))[0] if self._deep else None
+        extremal = self._extremal(problem, self._optimise(problem, direct.refined()))[0] if self._deep else None
         return extremal or _stalled(problem, direct)
 
     def doubts(self, cost: float) -> tuple[Extremal, ...]:
@@ -284,7 +294,8 @@ def _shooting_nodes(
     at = np.rint(np.linspace(0, intervals, segments + 1)).astype(int)
     times, nodes = direct.times[at], np.concatenate([direct.states[at], direct.costates[at]], axis=1)
     arrays = problem.arrays
-    nodes[-1, :3] = np.where(arrays.free, nodes[-1, :3], arrays.goal)
+    n = problem.system.n
+    nodes[-1, :n] = np.where(arrays.free, nodes[-1, :n], arrays.goal)
     return times, nodes
 
 

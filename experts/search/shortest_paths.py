@@ -2,8 +2,8 @@
 
 A node is a cell (i, j) with one of 16 headings; its index is (i * lines + j) * HEADINGS + heading. `speed` is
 sqrt(2 (E + Phi)) on the half-cell grid, infinite where the robot cannot be. The cost of an edge is its length in the
-metric of the weights times the mean speed along it, by Simpson's rule. The BORDER outermost cells are never free, so no
-move leaves the grid.
+metric of the weights times the mean speed along it, by Simpson's rule. The outermost cells are never free, so no move
+leaves the grid.
 """
 
 from __future__ import annotations
@@ -15,37 +15,9 @@ import numpy as np
 from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import FLAGS, INDICES, INTEGERS, LINKS, MATRIX, NOTHING, VECTOR, tuple_of
+from leapnav.envs.kernels.types import CUBE, FLAGS, INDICES, INTEGERS, LINKS, MATRIX, NOTHING, VECTOR, tuple_of
+from leapnav.envs.robots.moves import DIRECTIONS, HEADINGS
 
-# 16 headings whose directions are exact lattice vectors, so a straight move stays exactly on its line.
-_QUADRANT = np.array([(1, 0), (2, 1), (1, 1), (1, 2)], dtype=np.int64)
-_QUARTER_TURN = np.array([(0, 1), (-1, 0)], dtype=np.int64)
-DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
-ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
-HEADINGS = len(ANGLES)
-BORDER = 2  # cells, the length of the longest move
-
-
-def _moves() -> np.ndarray:
-    """Return the moves from each heading, (HEADINGS, 12, 3): rows of cells in x, cells in y, heading steps.
-
-    Forward and backward: straight, or with one heading step to either side, along the old or the new heading. Each of
-    these two is the reverse of the other, so the graph is symmetric. Then one heading step in place to either side.
-    """
-    table = []
-    for heading in range(HEADINGS):
-        rows = []
-        for mode in (1, -1):
-            rows.append((*(mode * DIRECTIONS[heading]), 0))
-            for change in (1, -1):
-                rows.append((*(mode * DIRECTIONS[heading]), change))
-                rows.append((*(mode * DIRECTIONS[(heading + change) % HEADINGS]), change))
-        table.append([*rows, (0, 0, 1), (0, 0, -1)])
-    return np.array(table, dtype=np.int64)
-
-
-MOVES = _moves()
-MOVES.flags.writeable = False
 # Number of buckets of the circular bucket queue, and number of buckets that cover the cost of the shortest path.
 BUCKETS, BUCKETS_PER_COST = 4096, 2000
 MAX_BUCKET_INDEX = 1e15  # before the conversion to an integer: costs deep in an obstacle may reach 1e40
@@ -87,17 +59,22 @@ class Metric(NamedTuple):
     """The metric of the lattice.
 
     Attributes:
-        speed: sqrt(2 (E + Phi)) on the half-cell grid, infinite where the robot cannot be.
+        speed: (K, ...), sqrt(2 (E + Phi)) on the half-cell grid, infinite where the robot cannot be; one layer for all
+            headings, or one for each.
+        plane: its minimum over the layers.
         cell: side of a cell (m).
         speed_weight: weight of squared distances.
-        turn_weight: weight of squared changes of the heading.
+        targets, lengths, points: the robot's moves, see `leapnav.envs.robots.moves.Moves`.
 
     """
 
     speed: np.ndarray
+    plane: np.ndarray
     cell: float
     speed_weight: float
-    turn_weight: float
+    targets: np.ndarray
+    lengths: np.ndarray
+    points: np.ndarray
 
 
 class Nodes(NamedTuple):
@@ -128,7 +105,16 @@ class Limits(NamedTuple):
     limit: float
 
 
-METRIC = record_type(Metric, speed=MATRIX, cell=float64, speed_weight=float64, turn_weight=float64)
+METRIC = record_type(
+    Metric,
+    speed=CUBE,
+    plane=MATRIX,
+    cell=float64,
+    speed_weight=float64,
+    targets=int64[:, :, ::1],
+    lengths=MATRIX,
+    points=int64[:, :, :, ::1],
+)
 NODES = record_type(Nodes, nodes=INTEGERS, costs=VECTOR)
 LIMITS = record_type(Limits, reach=float64, slack=float64, limit=float64)
 
@@ -139,7 +125,7 @@ def plane_costs(metric, seeds):
 
     This is a label-correcting search with a bucket queue; it gives the same costs as Dijkstra's algorithm.
     """
-    speed = metric.speed
+    speed = metric.plane
     lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
     size = (speed.shape[0] + 1) // 2 * lines
     flat = speed.ravel()
@@ -180,39 +166,39 @@ def plane_costs(metric, seeds):
 
 
 @kernel(tuple_of(VECTOR, INDICES, float64)(METRIC, NODES, NODES, VECTOR, boolean, LIMITS))
-def tree(metric, seeds, targets, rest, exact, limits):
+def tree(metric, seeds, ends, rest, exact, limits):
     """Compute the tree of shortest paths from the seeds by A* search with the lower bounds `rest`.
 
-    `rest` is a lower bound of the remaining cost to the targets, per cell, or per node if `exact`. Nodes are omitted if
-    the paths through them cost more than the limit. Once the cost of the best target is known, the limit is `reach`
+    `rest` is a lower bound of the remaining cost to the ends, per cell, or per node if `exact`. Nodes are omitted if
+    the paths through them cost more than the limit. Once the cost of the best end is known, the limit is `reach`
     times that cost plus `slack`.
 
     Returns the cost of each node, its predecessor (-1 for none), and the limit.
     """
-    speed, cell, speed_weight, turn_weight = metric.speed, metric.cell, metric.speed_weight, metric.turn_weight
+    speed, targets = metric.speed, metric.targets
     reach, slack, limit = limits.reach, limits.slack, limits.limit
-    lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
+    lines, stride = (speed.shape[2] + 1) // 2, speed.shape[2]
     flat = speed.ravel()
-    size = (speed.shape[0] + 1) // 2 * lines * HEADINGS
+    size = (speed.shape[1] + 1) // 2 * lines * HEADINGS
+    layer = 0 if len(speed) == 1 else speed.shape[1] * stride
     cost = np.full(size, np.inf)
     parent = np.full(size, -1, dtype=np.int32)
     arrival = np.full(size, np.inf)
-    for k in range(len(targets.nodes)):
-        arrival[targets.nodes[k]] = min(arrival[targets.nodes[k]], targets.costs[k])
-    count = MOVES.shape[1]
+    for k in range(len(ends.nodes)):
+        arrival[ends.nodes[k]] = min(arrival[ends.nodes[k]], ends.costs[k])
+    count, n_points = targets.shape[1], metric.points.shape[2]
     ahead, cells = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count), np.int64)
-    middle, length = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count))
+    offsets, length = np.empty((HEADINGS, count, n_points), np.int64), np.empty((HEADINGS, count))
     for k in range(HEADINGS):
         for move in range(count):
-            dx, dy, change = MOVES[k, move]
+            dx, dy, change = targets[k, move]
             other = (k + change) % HEADINGS
-            turn = abs(ANGLES[other] - ANGLES[k])
-            turn = min(turn, 2.0 * math.pi - turn)
             cells[k, move] = dx * lines + dy
             ahead[k, move] = (dx * lines + dy) * HEADINGS + other - k
-            middle[k, move] = dx * stride + dy
-            square = speed_weight * (dx * dx + dy * dy) * cell * cell + turn_weight * turn * turn
-            length[k, move] = math.sqrt(square) / 6.0
+            length[k, move] = metric.lengths[k, move] / (3.0 * (n_points - 1.0))
+            for i in range(n_points):
+                a, b = metric.points[k, move, i]
+                offsets[k, move, i] = layer * (k if 2 * i <= n_points else other) + a * stride + b
     first = np.inf
     for k in range(len(seeds.nodes)):
         node = seeds.nodes[k]
@@ -227,7 +213,7 @@ def tree(metric, seeds, targets, rest, exact, limits):
     for k in range(len(seeds.nodes)):
         node = seeds.nodes[k]
         bound = seeds.costs[k] + (rest[node] if exact else rest[node // HEADINGS])
-        # `rest` is infinite for a seed without a path to the targets, and so is the limit while it is unknown.
+        # `rest` is infinite for a seed without a path to the ends, and so is the limit while it is unknown.
         if seeds.costs[k] < cost[node] and bound <= limit and bound < np.inf:
             cost[node] = seeds.costs[k]
             waiting += _enqueue(bucket, links, node, int(min((bound - first) / width, BUCKETS - 1.0)))
@@ -249,8 +235,11 @@ def tree(metric, seeds, targets, rest, exact, limits):
         here = 2 * (position // lines) * stride + 2 * (position % lines)
         for move in range(count):
             following = node + ahead[k, move]
-            between = middle[k, move]
-            total = key + length[k, move] * (flat[here] + 4.0 * flat[here + between] + flat[here + 2 * between])
+            at = offsets[k, move]
+            speeds = flat[here + at[0]] + 4.0 * flat[here + at[1]]
+            for i in range(2, n_points - 1, 2):
+                speeds += 2.0 * flat[here + at[i]] + 4.0 * flat[here + at[i + 1]]
+            total = key + length[k, move] * (speeds + flat[here + at[n_points - 1]])
             if total < cost[following]:
                 bound = total + (rest[following] if exact else rest[position + cells[k, move]])
                 if bound <= limit and bound < np.inf:

@@ -1,4 +1,7 @@
-"""Sequential quadratic programming on the discretised problem (kernels)."""
+"""Sequential quadratic programming on the discretised problem of any robot (kernels).
+
+`leapnav.experts.transcription.arcs_descent` is the same for the unicycle, whose steps are exact arcs.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR, tuple_of
-from leapnav.experts.search.riccati import MODEL, Model, Regularisation, backward, end_multipliers
-from leapnav.experts.search.transcription import (
+from leapnav.experts.transcription.arcs_riccati import Regularisation
+from leapnav.experts.transcription.midpoint import (
     DISCRETE_PROBLEM,
     EXPANSION,
     Expansion,
@@ -18,6 +21,7 @@ from leapnav.experts.search.transcription import (
     expand,
     violations,
 )
+from leapnav.experts.transcription.riccati import MODEL, Model, backward, end_multipliers
 
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of the horizon (s)
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
@@ -30,10 +34,10 @@ class _Step(NamedTuple):
     """A step of the iteration.
 
     Attributes:
-        dq: (N + 1, 3), changes of the states.
-        du: (N, 2), changes of the controls.
-        multipliers: (N + 1, 3), multipliers of the dynamics, which are the new costates.
-        nu: (3,), multipliers of the end conditions.
+        dq: (N + 1, n), changes of the states.
+        du: (N, m), changes of the controls.
+        multipliers: (N + 1, n), multipliers of the dynamics, which are the new costates.
+        nu: (n,), multipliers of the end conditions.
 
     """
 
@@ -52,20 +56,23 @@ def _forward(problem, expansion, model, step):
     h, A, B, defects = problem.h, expansion.A, expansion.B, expansion.defects
     dq, du, multipliers, nu = step.dq, step.du, step.multipliers, step.nu
     largest = 0.0
+    n, m = dq.shape[1], du.shape[1]
     for k in range(len(h)):
-        for j in range(2):
+        for j in range(m):
             du[k, j] = -model.step[k, j]
-            for i in range(3):
+            for i in range(n):
                 du[k, j] -= model.gain[k, j, i] * dq[k, i] + model.end_gain[k, j, i] * nu[i]
-        for i in range(2):
-            dq[k + 1, i] = dq[k, i] + A[k, i] * dq[k, 2] + defects[k, i]
-            dq[k + 1, i] += B[k, i, 0] * du[k, 0] + B[k, i, 1] * du[k, 1]
-        dq[k + 1, 2] = dq[k, 2] + h[k] * du[k, 1] + defects[k, 2]
-        largest = max(largest, abs(dq[k + 1, 0]), abs(dq[k + 1, 1]), abs(dq[k + 1, 2]))
+        for i in range(n):
+            dq[k + 1, i] = defects[k, i]
+            for r in range(n):
+                dq[k + 1, i] += A[k, i, r] * dq[k, r]
+            for j in range(m):
+                dq[k + 1, i] += B[k, i, j] * du[k, j]
+            largest = max(largest, abs(dq[k + 1, i]))
     for k in range(len(h) + 1):
-        for i in range(3):
+        for i in range(n):
             multipliers[k, i] = model.p[k, i]
-            for j in range(3):
+            for j in range(n):
                 multipliers[k, i] += model.P[k, i, j] * dq[k, j] + model.F[k, i, j] * nu[j]
     return largest
 
@@ -73,59 +80,65 @@ def _forward(problem, expansion, model, step):
 @kernel(boolean(DISCRETE_PROBLEM, MATRIX, EXPANSION, _STEP, SIGNS))
 def _update_active_set(problem, u, expansion, step, held):
     """Hold controls that would leave their limits, release those that reduce the cost; return if any changed."""
-    h, limits, B, multipliers = problem.h, problem.limits, expansion.B, step.multipliers
+    h, data, B, multipliers = problem.h, problem.data, expansion.B, step.multipliers
+    n, m = multipliers.shape[1], u.shape[1]
     changed = False
     for k in range(len(h)):
-        for j in range(2):
-            weight = h[k] if j == 0 else h[k] * problem.turn_weight
-            value = u[k, j] + step.du[k, j]
+        for j in range(m):
+            value, low, high = u[k, j] + step.du[k, j], data[m + j], data[2 * m + j]
             if held[k, j] != 0:
-                slope = weight * value + B[k, 0, j] * multipliers[k + 1, 0] + B[k, 1, j] * multipliers[k + 1, 1]
-                slope += h[k] * multipliers[k + 1, 2] if j == 1 else 0.0
+                slope = problem.unit * h[k] * data[j] * value
+                for i in range(n):
+                    slope += B[k, i, j] * multipliers[k + 1, i]
                 if held[k, j] * slope > 0.0:  # moving away from the limit reduces the cost
                     held[k, j], changed = 0, True
-            elif abs(value) > limits[j] * (1.0 + 1e-9):
-                held[k, j], changed = (1 if value > 0.0 else -1), True
+            elif value > high + 1e-9 * abs(high):
+                held[k, j], changed = 1, True
+            elif value < low - 1e-9 * abs(low):
+                held[k, j], changed = -1, True
     return changed
 
 
 @kernel(tuple_of(boolean, float64, float64)(DISCRETE_PROBLEM, MATRIX, MATRIX, MATRIX, float64, int64))
 def descend(problem, q, u, costates, tolerance, max_iterations):
-    """Apply sequential quadratic programming to states (N + 1, 3), controls (N, 2) and costates (N + 1, 3), in place.
+    """Apply sequential quadratic programming to states (N + 1, n), controls (N, m) and costates (N + 1, n), in place.
 
-    Returns (converged, cost in units of the speed weight, sum of the constraint violations).
+    The costates are multiplied by the unit of the problem. Returns (converged, cost times the unit, sum of the
+    constraint violations).
     """
-    h, limits = problem.h, problem.limits
-    intervals = len(h)
+    h, data = problem.h, problem.data
+    intervals, m = u.shape
+    n = q.shape[1]
     horizon = h.sum()
     first_shift, max_shift = FIRST_SHIFT / horizon**2, MAX_SHIFT / horizon**2
     expansion = Expansion(
-        np.empty((intervals + 1, 5)),
-        np.empty((intervals, 2)),
-        np.empty((intervals, 2, 2)),
-        np.empty((intervals, 3)),
-        np.empty((intervals, 3, 3)),
+        np.empty((intervals + 1, n)),
+        np.empty((intervals + 1, n, n)),
+        np.empty((intervals, n, n)),
+        np.empty((intervals, n, m)),
+        np.empty((intervals, n)),
+        np.empty((intervals, n + m, n + m)),
     )
     model = Model(
-        np.empty((intervals + 1, 3, 3)),
-        np.empty((intervals + 1, 3)),
-        np.empty((intervals + 1, 3, 3)),
-        np.empty((intervals, 2)),
-        np.empty((intervals, 2, 3)),
-        np.empty((intervals, 2, 3)),
-        np.empty((3, 3)),
-        np.empty(3),
+        np.empty((intervals + 1, n, n)),
+        np.empty((intervals + 1, n)),
+        np.empty((intervals + 1, n, n)),
+        np.empty((intervals, m)),
+        np.empty((intervals, m, n)),
+        np.empty((intervals, m, n)),
+        np.empty((n, n)),
+        np.empty(n),
     )
-    step = _Step(np.zeros((intervals + 1, 3)), np.empty((intervals, 2)), np.zeros((intervals + 1, 3)), np.zeros(3))
+    step = _Step(np.zeros((intervals + 1, n)), np.empty((intervals, m)), np.zeros((intervals + 1, n)), np.zeros(n))
     dq, du, multipliers, nu = step.dq, step.du, step.multipliers, step.nu
-    new_q, new_u = np.empty((intervals + 1, 3)), np.empty((intervals, 2))
-    held = np.zeros((intervals, 2), dtype=np.int8)
+    new_q, new_u = np.empty((intervals + 1, n)), np.empty((intervals, m))
+    held = np.zeros((intervals, m), dtype=np.int8)
     for k in range(intervals):
-        for j in range(2):
-            u[k, j] = min(max(u[k, j], -limits[j]), limits[j])
+        for j in range(m):
+            u[k, j] = min(max(u[k, j], data[m + j]), data[2 * m + j])
     is_cold_start = True  # without costates
     for k in range(intervals + 1):
-        for i in range(3):
+        for i in range(n):
             is_cold_start = is_cold_start and costates[k, i] == 0.0
     current = discrete_cost(problem, q, u)
     shift, largest, cost, violation = 0.0, 0.0, np.inf, np.inf
@@ -156,11 +169,11 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
         cost, violation = np.inf, np.inf
         for _ in range(MAX_STEP_LENGTHS):
             for k in range(intervals + 1):
-                for i in range(3):
+                for i in range(n):
                     new_q[k, i] = q[k, i] + damping * dq[k, i]
             for k in range(intervals):
-                for j in range(2):
-                    new_u[k, j] = min(max(u[k, j] + damping * du[k, j], -limits[j]), limits[j])
+                for j in range(m):
+                    new_u[k, j] = min(max(u[k, j] + damping * du[k, j], data[m + j]), data[2 * m + j])
             cost = discrete_cost(problem, new_q, new_u)
             violation, weighted, squares = violations(problem, new_q, new_u, multipliers, nu)
             descends = cost + weighted + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
@@ -175,11 +188,11 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
         current = cost
         fraction = 1.0 if is_cold_start else damping
         for k in range(intervals + 1):
-            for i in range(3):
+            for i in range(n):
                 q[k, i] = new_q[k, i]
                 costates[k, i] += fraction * (multipliers[k, i] - costates[k, i])
         for k in range(intervals):
-            for j in range(2):
+            for j in range(m):
                 u[k, j] = new_u[k, j]
         if damping == 1.0 and largest < tolerance and shift <= first_shift:
             return True, cost, violation

@@ -16,7 +16,7 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CUBE, MATRIX, SIGNS, VECTOR
 from leapnav.experts.numerics.flow import END_CONDITION
 from leapnav.experts.numerics.linear import eliminate, substitute
-from leapnav.experts.search.transcription import DISCRETE_PROBLEM, EXPANSION
+from leapnav.experts.transcription.arcs import DISCRETE_PROBLEM, EXPANSION
 
 
 class Model(NamedTuple):

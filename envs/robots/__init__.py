@@ -1,0 +1,19 @@
+"""Robot models: one file each, see `leapnav.envs.robots.base`."""
+
+from leapnav.envs.robots.base import Disc, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.robots.car import Car
+from leapnav.envs.robots.differential_drive import DifferentialDrive
+from leapnav.envs.robots.dynamic_unicycle import DynamicUnicycle
+from leapnav.envs.robots.unicycle import Unicycle
+
+__all__ = [
+    "Car",
+    "DifferentialDrive",
+    "Disc",
+    "DynamicUnicycle",
+    "Dynamics",
+    "RobotModel",
+    "Symmetry",
+    "Unicycle",
+    "register",
+]

@@ -1,0 +1,264 @@
+"""The interface of a robot model, and the registry of models by name.
+
+A model is one file: its parameters, its dynamics for the expert (SymPy), its motion under held controls for the
+simulation (a kernel), and the motion primitives of the search. `register` adds a model from outside the package.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self
+
+import numpy as np
+from numba import types
+from pydantic import Field, model_serializer, model_validator
+
+from leapnav.envs.kernels.types import CONSTANT, NOTHING, VECTOR
+from leapnav.envs.robots.moves import Moves, rotating_moves
+from leapnav.envs.utils.records import Finite, Frozen, Positive
+from leapnav.envs.utils.validation import suggestion
+
+if TYPE_CHECKING:
+    import sympy as sp
+
+# advance(q, u, h, parameters, new): write the state (n,) after the controls u (m,) were held for the time h (s) to
+# `new`. `new` may be `q`.
+ADVANCE_SIGNATURE = NOTHING(VECTOR, VECTOR, types.float64, CONSTANT, VECTOR)
+# state_cost(q, parameters) -> the part of the running cost that depends on the state, without the proximity cost.
+STATE_COST_SIGNATURE = types.float64(VECTOR, CONSTANT)
+# How the simulation moves a robot: along circular arcs, by speed and turn rate or by wheel speeds, or by `advance`.
+ARCS, WHEELS, GENERAL = range(3)
+POSE = ("x", "y", "heading")  # the first states of every robot
+
+
+class CostWeights(Protocol):
+    """The weights of the running cost that robot models read, see `leapnav.envs.Cost`."""
+
+    @property
+    def speed_weight(self) -> float: ...  # noqa: D102
+    @property
+    def turn_weight(self) -> float: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """The dynamics q' = a(q) + sum_j u_j b_j(q) of a model in SymPy symbols.
+
+    Attributes:
+        state: the n state symbols; the first three are x, y and the heading.
+        drift: a(q), n expressions.
+        fields: b_j(q), n expressions for each of the m controls.
+        parameters: the symbols of the model's `parameters`.
+        state_cost: part of the running cost that depends on the state, in the symbols of state and parameters.
+        labels: names of the states and controls with units, in Matplotlib's mathtext.
+
+    """
+
+    state: tuple[sp.Symbol, ...]
+    drift: tuple[Any, ...]
+    fields: tuple[tuple[Any, ...], ...]
+    parameters: tuple[sp.Symbol, ...] = ()
+    state_cost: Any = 0
+    labels: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """How a symmetry of the plane changes the motion of a robot.
+
+    Attributes:
+        motion: factors (n - 3) of the further states; a heading is relative to that of the robot.
+        controls: rows (m, m) of the matrix that maps the controls.
+
+    """
+
+    motion: tuple[float, ...]
+    controls: tuple[tuple[float, ...], ...]
+
+
+class Disc(Frozen):
+    """A disc of a footprint: offset of its centre along the robot's axis, positive ahead, and radius (m)."""
+
+    offset: Finite = 0.0
+    radius: Positive
+
+
+class RobotModel(Frozen):
+    """A wheeled robot: the base class of all models.
+
+    The state is q = (x, y, heading, further states), the action the control u divided by its largest absolute value.
+
+    Args:
+        model: name of the model.
+        radius: radius (m) of a robot that is one disc around (x, y).
+        footprint: discs along the robot's axis that cover another outline; instead of `radius`.
+
+    Attributes:
+        state_names: names of the n states, those of POSE first. Further states are observed as `motion`.
+        control_names: names of the m controls.
+        state_units, control_units: their units.
+        goal_motion: goal values of the further states; None leaves a state free.
+        cost_fields: names of the weights of `leapnav.envs.Cost` that the model uses, besides the proximity cost.
+        advance: kernel of ADVANCE_SIGNATURE, exact or to 1e-9.
+        state_cost: kernel of STATE_COST_SIGNATURE, or None without a state cost.
+        heading_states: names of the further states that are headings in the plane, such as that of a trailer. They are
+            observed relative to the robot's heading, and their goals hold modulo 2 pi.
+        mirror: the mirror image (left and right exchanged) of a path of the robot is also one, with these changes;
+            None if that is no symmetry.
+        reversal: the same for all headings rotated by 180 degrees: the robot follows the same path backwards.
+        velocity_states: names of the further states that are the speed and the turn rate, which a contact changes, or
+            None.
+        drive: ARCS, WHEELS or GENERAL.
+        is_kinematic: whether a shortest path in the metric of the control weights, on the lattice of `lattice_moves`,
+            approximates an optimum. Otherwise candidates are optimised for a unicycle first, and then lifted.
+
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = POSE
+    control_names: ClassVar[tuple[str, ...]]
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad")
+    control_units: ClassVar[tuple[str, ...]]
+    goal_motion: ClassVar[tuple[float | None, ...]] = ()
+    cost_fields: ClassVar[tuple[str, ...]] = ("speed_weight", "turn_weight")
+    advance: ClassVar[Any]
+    state_cost: ClassVar[Any] = None
+    heading_states: ClassVar[tuple[str, ...]] = ()
+    mirror: ClassVar[Symmetry | None] = None
+    reversal: ClassVar[Symmetry | None] = None
+    velocity_states: ClassVar[tuple[str, str] | None] = None
+    drive: ClassVar[int] = GENERAL
+    is_kinematic: ClassVar[bool] = False
+
+    model: str
+    radius: Positive = 0.25
+    footprint: Annotated[tuple[Disc, ...], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _check_footprint(self) -> Self:
+        if self.footprint is not None and "radius" in self.model_fields_set:
+            raise ValueError("radius: cannot be combined with footprint, whose discs have radii of their own")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, handler: Any) -> dict[str, Any]:
+        fields = handler(self)
+        if self.footprint is not None:
+            del fields["radius"]
+        return fields
+
+    @classmethod
+    @abstractmethod
+    def dynamics(cls) -> Dynamics:
+        """Return the dynamics. SymPy is imported here, not with the module."""
+
+    @abstractmethod
+    def limits(self) -> tuple[float, ...]:
+        """Return the largest absolute values (m,) of the controls."""
+
+    @abstractmethod
+    def control_weight(self, cost: CostWeights) -> tuple[float, ...]:
+        """Return the weights (m,) of the squared controls in the running cost."""
+
+    def parameters(self, cost: CostWeights) -> tuple[float, ...]:
+        """Return the values of the parameters of `dynamics`."""
+        return ()
+
+    def discs(self) -> np.ndarray:
+        """Return the footprint as an array (D, 2) of offsets and radii (m)."""
+        if self.footprint is None:
+            return np.array([[0.0, self.radius]])
+        return np.array([[disc.offset, disc.radius] for disc in self.footprint])
+
+    def metric(self, cost: CostWeights) -> tuple[float, float]:
+        """Return the weights of the squared speed and turn rate in the metric of the lattice."""
+        return cost.speed_weight, cost.turn_weight
+
+    def speed_limits(self) -> tuple[float, float]:
+        """Return bounds of the speed (m/s) and of the turn rate (rad/s); infinite if there are none."""
+        return math.inf, math.inf
+
+    def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:
+        """Return the motion primitives on a lattice with cells of the given side (m), in the given metric."""
+        return rotating_moves(cell, speed_weight, turn_weight)
+
+    def max_lattice_cell(self) -> float:
+        """Return the largest side (m) of a cell with which the moves approximate the motion."""
+        return math.inf
+
+    def lift(self, times: np.ndarray, poses: np.ndarray, start: Sequence[float]) -> np.ndarray | None:
+        """Return states (N, n) whose poses are those of a path.
+
+        Args:
+            times: (N,), s.
+            poses: (N, 3), x, y (m) and unwrapped heading (rad).
+            start: the initial state (n,).
+
+        Returns:
+            The states; None integrates the further states along the path.
+
+        """
+        return None
+
+    def outline(self) -> np.ndarray | None:
+        """Return the outline as a polygon (K, 2) in the robot's frame (m), or None for that of the footprint."""
+        return None
+
+    @classmethod
+    def sizes(cls) -> tuple[int, int]:
+        """Return the numbers of states and of controls."""
+        return len(cls.state_names), len(cls.control_names)
+
+    @classmethod
+    def name(cls) -> str:
+        """Return the name of the model."""
+        return str(cls.model_fields["model"].default)
+
+
+MODELS: dict[str, type[RobotModel]] = {}
+
+
+def register(model: type[RobotModel]) -> type[RobotModel]:
+    """Register a robot model under the default of its field `model`; usable as a class decorator.
+
+    Processes that read its scenarios must import the file that defines it.
+
+    Raises:
+        ValueError: another class has this name, or the names, units or signs have inconsistent lengths.
+
+    """
+    name = model.name()
+    known = MODELS.get(name)
+    if known is not None and known.__qualname__ != model.__qualname__:
+        raise ValueError(f"model: {name!r} is the name of {known.__module__}.{known.__qualname__}")
+    n, m = model.sizes()
+    if model.state_names[:3] != POSE:
+        raise ValueError(f"state_names: expected {', '.join(POSE)} first, got {model.state_names!r}")
+    lengths: dict[str, tuple[tuple[Any, ...], int]] = {
+        "state_units": (model.state_units, n),
+        "control_units": (model.control_units, m),
+        "goal_motion": (model.goal_motion, n - 3),
+    }
+    for attribute, symmetry in (("mirror", model.mirror), ("reversal", model.reversal)):
+        if symmetry is not None:
+            lengths[f"{attribute}.motion"] = symmetry.motion, n - 3
+            lengths[f"{attribute}.controls"] = symmetry.controls, m
+    for attribute, (values, length) in lengths.items():
+        if len(values) != length:
+            raise ValueError(f"{attribute}: expected {length} entries for {name!r}, got {values!r}")
+    MODELS[name] = model
+    return model
+
+
+def robot_class(name: Any) -> type[RobotModel]:
+    """Return the class of a model.
+
+    Raises:
+        ValueError: there is no such model.
+
+    """
+    if not isinstance(name, str) or name not in MODELS:
+        raise ValueError(f"expected one of {', '.join(MODELS)}, got {name!r}{suggestion(name, MODELS)}")
+    return MODELS[name]

@@ -1,0 +1,135 @@
+"""The car: the kinematic bicycle with a limited steering angle and steering rate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, sinc
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, POSE, CostWeights, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.robots.moves import Moves, curved_moves
+from leapnav.envs.robots.unicycle import POSE_LABELS
+from leapnav.envs.utils.records import Positive
+
+MAX_LATTICE_CELL = 0.25  # minimum turning radii: larger cells would make the lattice's turns much too wide
+
+
+@kernel(ADVANCE_SIGNATURE)
+def advance(q, u, h, parameters, new):
+    """Integrate exactly: the heading in closed form, the position by Gauss's rule."""
+    x, y, heading, steering = q[0], q[1], q[2], q[3]
+    speed, rate, curvature = u[0], u[1], parameters[0]
+    # With s = steering + rate t, the integral of sin(s) from 0 to t is t sin(s at t / 2) sinc(rate t / 2).
+    scale = speed * curvature
+    panels = max(math.ceil(abs(scale * h) / MAX_PANEL_TURN), math.ceil(abs(rate * h) / MAX_PANEL_TURN))
+    panels = max(panels, 1)
+    dx = dy = 0.0
+    for panel in range(panels):
+        for k in range(len(GAUSS_NODES)):
+            t = (panel + GAUSS_NODES[k]) / panels * h
+            half = 0.5 * rate * t
+            angle = heading + scale * t * math.sin(steering + half) * sinc(half)
+            dx += GAUSS_WEIGHTS[k] * math.cos(angle)
+            dy += GAUSS_WEIGHTS[k] * math.sin(angle)
+    half = 0.5 * rate * h
+    new[0], new[1] = x + speed * h / panels * dx, y + speed * h / panels * dy
+    new[2] = heading + scale * h * math.sin(steering + half) * sinc(half)
+    new[3] = steering + rate * h
+
+
+@register
+class Car(RobotModel):
+    """A car with the kinematics of a bicycle: q = (x, y, theta, s), u = (v, s').
+
+    (x, y) is the middle of the rear axle, x' = v cos(theta), y' = v sin(theta), theta' = v tan(delta) / wheelbase. The
+    steering angle delta is limited through the steering state s, tan(delta) = tan(max_steering) sin(s), so that no
+    state constraint is needed. The running cost is 1/2 (speed_weight v^2 + steering_weight s'^2).
+
+    Args:
+        model: "car".
+        radius, footprint: see `RobotModel`.
+        wheelbase: distance between the axles (m).
+        max_steering: largest steering angle (rad), below pi / 2.
+        max_speed: largest speed (m/s), forwards and backwards.
+        max_steering_rate: largest rate of the steering state (rad/s).
+        steering_weight: cost weight of the squared rate of the steering state.
+
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = (*POSE, "steering")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "rad")
+    control_names: ClassVar[tuple[str, ...]] = ("speed", "steering_rate")
+    control_units: ClassVar[tuple[str, ...]] = ("m/s", "rad/s")
+    goal_motion: ClassVar[tuple[float | None, ...]] = (None,)
+    cost_fields: ClassVar[tuple[str, ...]] = ("speed_weight",)
+    advance: ClassVar = advance
+    mirror: ClassVar[Symmetry | None] = Symmetry((-1,), ((1, 0), (0, -1)))
+    # With the negated speed, the same turn rate needs the opposite steering.
+    reversal: ClassVar[Symmetry | None] = Symmetry((-1,), ((-1, 0), (0, -1)))
+    is_kinematic: ClassVar[bool] = True
+
+    model: Literal["car"] = "car"
+    wheelbase: Positive = 0.5
+    max_steering: Annotated[float, Field(gt=0, lt=math.pi / 2)] = 0.6
+    max_speed: Positive = 2.0
+    max_steering_rate: Positive = 4.0
+    steering_weight: Positive = 0.2
+
+    @classmethod
+    def dynamics(cls) -> Dynamics:  # noqa: D102 (the interface is documented in the base class)
+        import sympy as sp
+
+        x, y, theta, s, curvature = sp.symbols("x y theta s curvature")
+        return Dynamics(
+            state=(x, y, theta, s),
+            drift=(0, 0, 0, 0),
+            fields=((sp.cos(theta), sp.sin(theta), curvature * sp.sin(s), 0), (0, 0, 0, 1)),
+            parameters=(curvature,),
+            labels=(*POSE_LABELS, "$s$ (rad)", "$v$ (m/s)", r"$\dot s$ (rad/s)"),
+        )
+
+    @property
+    def max_curvature(self) -> float:
+        """Largest curvature of the path (1/m)."""
+        return math.tan(self.max_steering) / self.wheelbase
+
+    def limits(self) -> tuple[float, ...]:  # noqa: D102
+        return self.max_speed, self.max_steering_rate
+
+    def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
+        return cost.speed_weight, self.steering_weight
+
+    def parameters(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
+        return (self.max_curvature,)
+
+    def metric(self, cost: CostWeights) -> tuple[float, float]:  # noqa: D102
+        # The cost of rotation is that of the arcs, which the moves contain; a part of it for changes at start and goal.
+        return cost.speed_weight, 0.25 * cost.speed_weight / self.max_curvature**2
+
+    def speed_limits(self) -> tuple[float, float]:  # noqa: D102
+        return self.max_speed, self.max_speed * self.max_curvature
+
+    def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
+        return curved_moves(cell, speed_weight, 1.0 / self.max_curvature, 0.0)
+
+    def max_lattice_cell(self) -> float:  # noqa: D102
+        return MAX_LATTICE_CELL / self.max_curvature
+
+    def lift(self, times: np.ndarray, poses: np.ndarray, start: Sequence[float]) -> np.ndarray:
+        """Return the path with the steering of its curvature, limited and smoothed."""
+        step = np.diff(poses, axis=0)
+        middle = (poses[1:, 2] + poses[:-1, 2]) / 2
+        along = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
+        distance = np.hypot(step[:, 0], step[:, 1])
+        curvature = np.where(along < 0, -1.0, 1.0) * step[:, 2] / np.maximum(distance, 1e-9)
+        sine = np.clip(curvature / self.max_curvature, -1.0, 1.0)
+        # Means over three steps: a lattice path alternates between straight and curved moves.
+        sine = np.convolve(np.pad(sine, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+        steering = np.arcsin(np.interp(times, (times[1:] + times[:-1]) / 2, sine))
+        steering[0] = start[3]
+        return np.column_stack([poses, steering])

@@ -1,0 +1,121 @@
+"""The dynamic unicycle: a robot with inertia, commanded by its accelerations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN
+from leapnav.envs.robots.base import (
+    ADVANCE_SIGNATURE,
+    POSE,
+    STATE_COST_SIGNATURE,
+    CostWeights,
+    Dynamics,
+    RobotModel,
+    Symmetry,
+    register,
+)
+from leapnav.envs.robots.unicycle import POSE_LABELS
+from leapnav.envs.utils.records import Positive
+
+
+@kernel(ADVANCE_SIGNATURE)
+def advance(q, u, h, parameters, new):
+    """Integrate exactly: speed, turn rate and heading in closed form, the position by Gauss's rule."""
+    x, y, heading, speed, turn_rate = q[0], q[1], q[2], q[3], q[4]
+    panels = math.ceil((abs(turn_rate) + abs(u[1]) * h) * h / MAX_PANEL_TURN)
+    panels = max(panels, 1)
+    dx = dy = 0.0
+    for panel in range(panels):
+        for k in range(len(GAUSS_NODES)):
+            t = (panel + GAUSS_NODES[k]) / panels * h
+            angle = heading + (turn_rate + 0.5 * u[1] * t) * t
+            driven = GAUSS_WEIGHTS[k] * (speed + u[0] * t)
+            dx += driven * math.cos(angle)
+            dy += driven * math.sin(angle)
+    new[0], new[1] = x + h / panels * dx, y + h / panels * dy
+    new[2] = heading + (turn_rate + 0.5 * u[1] * h) * h
+    new[3], new[4] = speed + u[0] * h, turn_rate + u[1] * h
+
+
+@kernel(STATE_COST_SIGNATURE)
+def state_cost(q, parameters):
+    """Return the cost of speed and turn rate."""
+    return 0.5 * (parameters[0] * q[3] * q[3] + parameters[1] * q[4] * q[4])
+
+
+@register
+class DynamicUnicycle(RobotModel):
+    """A unicycle with inertia: q = (x, y, theta, v, omega), u = (v', omega').
+
+    It starts at rest and has to be at rest at the horizon. The running cost is 1/2 (speed_weight v^2 + turn_weight
+    omega^2 + acceleration_weight v'^2 + angular_acceleration_weight omega'^2).
+
+    Args:
+        model: "dynamic_unicycle".
+        radius, footprint: see `RobotModel`.
+        max_acceleration: largest acceleration (m/s^2) along the heading.
+        max_angular_acceleration: largest angular acceleration (rad/s^2).
+        acceleration_weight: cost weight of the squared acceleration.
+        angular_acceleration_weight: cost weight of the squared angular acceleration.
+
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = (*POSE, "speed", "turn_rate")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad", "m/s", "rad/s")
+    control_names: ClassVar[tuple[str, ...]] = ("acceleration", "angular_acceleration")
+    control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "rad/s^2")
+    goal_motion: ClassVar[tuple[float | None, ...]] = (0.0, 0.0)
+    velocity_states: ClassVar[tuple[str, str] | None] = ("speed", "turn_rate")
+    advance: ClassVar = advance
+    state_cost: ClassVar = state_cost
+    mirror: ClassVar[Symmetry | None] = Symmetry((1, -1), ((1, 0), (0, -1)))
+    reversal: ClassVar[Symmetry | None] = Symmetry((-1, 1), ((-1, 0), (0, 1)))
+
+    model: Literal["dynamic_unicycle"] = "dynamic_unicycle"
+    max_acceleration: Positive = 3.0
+    max_angular_acceleration: Positive = 12.0
+    acceleration_weight: Positive = 0.1
+    angular_acceleration_weight: Positive = 0.02
+
+    @classmethod
+    def dynamics(cls) -> Dynamics:  # noqa: D102 (the interface is documented in the base class)
+        import sympy as sp
+
+        x, y, theta, v, omega = state = sp.symbols("x y theta v omega")
+        weights = speed_weight, turn_weight = sp.symbols("speed_weight turn_weight")
+        labels = ("$v$ (m/s)", r"$\omega$ (rad/s)", r"$\dot v$ (m/s$^2$)", r"$\dot\omega$ (rad/s$^2$)")
+        return Dynamics(
+            state=state,
+            drift=(v * sp.cos(theta), v * sp.sin(theta), omega, 0, 0),
+            fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
+            parameters=weights,
+            state_cost=(speed_weight * v**2 + turn_weight * omega**2) / 2,
+            labels=(*POSE_LABELS, *labels),
+        )
+
+    def limits(self) -> tuple[float, ...]:  # noqa: D102
+        return self.max_acceleration, self.max_angular_acceleration
+
+    def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
+        return self.acceleration_weight, self.angular_acceleration_weight
+
+    def parameters(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
+        return cost.speed_weight, cost.turn_weight
+
+    def lift(self, times: np.ndarray, poses: np.ndarray, start: Sequence[float]) -> np.ndarray:
+        """Return the path with the speed and turn rate of its motion, at rest at its ends."""
+        step, interval = np.diff(poses, axis=0), np.diff(times)
+        middle = (poses[1:, 2] + poses[:-1, 2]) / 2
+        speed = (step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)) / interval
+        motion = []
+        for k, values in enumerate((speed, step[:, 2] / interval)):
+            at_times = np.interp(times, (times[1:] + times[:-1]) / 2, values)
+            at_times[0], at_times[-1] = start[3 + k], 0.0
+            motion.append(at_times)
+        return np.column_stack([poses, *motion])

@@ -1,0 +1,124 @@
+"""Motion primitives on a lattice of cells and headings, from which candidate paths of a robot are composed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+# 16 headings whose directions are exact lattice vectors, so a straight move stays exactly on its line.
+_QUADRANT = np.array([(1, 0), (2, 1), (1, 1), (1, 2)], dtype=np.int64)
+_QUARTER_TURN = np.array([(0, 1), (-1, 0)], dtype=np.int64)
+DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
+ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
+HEADINGS = len(ANGLES)
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """Motion primitives of a robot, the same number `count` from each heading. The reverse of a move is a move, too.
+
+    Attributes:
+        targets: (HEADINGS, count, 3), int64: cells in x, cells in y, heading steps.
+        lengths: (HEADINGS, count), length in the metric of the control weights, in the units of sqrt(cost * s).
+        points: (HEADINGS, count, P, 2), int64: offsets (half cells) of the points at which the cost is evaluated, from
+            the start of the move to its end; P is odd, for Simpson's rule.
+
+    """
+
+    targets: np.ndarray
+    lengths: np.ndarray
+    points: np.ndarray
+
+    @property
+    def border(self) -> int:
+        """Largest number of cells that a move covers in x or y."""
+        return int(np.abs(self.points).max() + 1) // 2
+
+
+def turn_angle(heading: int, change: int) -> float:
+    """Return the angle (rad, not negative) of a change by heading steps."""
+    turn = abs(float(ANGLES[(heading + change) % HEADINGS] - ANGLES[heading]))
+    return min(turn, 2.0 * math.pi - turn)
+
+
+def rotating_moves(cell: float, speed_weight: float, turn_weight: float) -> Moves:
+    """Return the moves of a robot that can rotate in place.
+
+    Forward and backward: straight, or with one heading step to either side, along the old or the new heading. Each of
+    these two is the reverse of the other, so the graph is symmetric. Then one heading step in place to either side.
+
+    Args:
+        cell: side of a cell (m).
+        speed_weight: weight of the squared speed.
+        turn_weight: weight of the squared turn rate.
+
+    """
+    targets, points, squares, turns = _rotating_table()
+    lengths = np.sqrt(speed_weight * squares * cell * cell + turn_weight * turns * turns)
+    return Moves(targets, lengths, points)
+
+
+@cache
+def _rotating_table() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return targets, points, squared distances (cells) and angles (rad) of `rotating_moves`."""
+    table = []
+    for heading in range(HEADINGS):
+        rows = []
+        for mode in (1, -1):
+            rows.append((*(mode * DIRECTIONS[heading]), 0))
+            for change in (1, -1):
+                rows.append((*(mode * DIRECTIONS[heading]), change))
+                rows.append((*(mode * DIRECTIONS[(heading + change) % HEADINGS]), change))
+        table.append([*rows, (0, 0, 1), (0, 0, -1)])
+    targets = np.array(table, dtype=np.int64)
+    turns = np.array([[turn_angle(k, change) for change in targets[k, :, 2].tolist()] for k in range(HEADINGS)])
+    points = np.stack([0 * targets[:, :, :2], targets[:, :, :2], 2 * targets[:, :, :2]], axis=2)
+    return targets, points, targets[:, :, 0] ** 2 + targets[:, :, 1] ** 2, turns
+
+
+def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: float) -> Moves:
+    """Return the moves of a robot with a minimum turning radius.
+
+    Forward and backward: straight, or along the old and then along the new heading, both so far that an arc of the
+    radius fits into the corner between them.
+
+    Args:
+        cell: side of a cell (m).
+        speed_weight: weight of the squared speed.
+        radius: minimum turning radius (m).
+        turn_length: length in the metric that a heading step adds (steering).
+
+    """
+    steps: list[list[list[tuple[int, int]]]] = []
+    changes = [0, 0, 1, 1, -1, -1]
+    for heading in range(HEADINGS):
+        rows = []
+        for change in (0, 1, -1):
+            for mode in (1, -1):
+                path = [tuple((mode * DIRECTIONS[heading]).tolist())]
+                if change:
+                    leg = radius * math.tan(turn_angle(heading, change) / 2.0)
+                    path = []
+                    for k in (heading, (heading + change) % HEADINGS):
+                        count = max(1, math.ceil(leg / (cell * math.hypot(*DIRECTIONS[k])) - 1e-9))
+                        path += [tuple((mode * DIRECTIONS[k]).tolist())] * count
+                rows.append(path)
+        steps.append(rows)
+    n_steps = max(len(path) for rows in steps for path in rows)
+    shape = (HEADINGS, len(changes))
+    targets, lengths = np.zeros((*shape, 3), dtype=np.int64), np.empty(shape)
+    points = np.zeros((*shape, 2 * n_steps + 1, 2), dtype=np.int64)
+    for heading in range(HEADINGS):
+        for move, (path, change) in enumerate(zip(steps[heading], changes, strict=True)):
+            corners = np.concatenate([[(0, 0)], np.cumsum(path, axis=0)])
+            distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
+            targets[heading, move] = (*corners[-1], change)
+            at = np.linspace(0.0, distance[-1], 2 * n_steps + 1)
+            between = np.stack([np.interp(at, distance, 2 * column) for column in corners.T], axis=1)
+            points[heading, move] = np.rint(between)
+            driven = math.sqrt(speed_weight) * distance[-1] * cell
+            lengths[heading, move] = math.hypot(driven, turn_length if change else 0.0)
+    return Moves(targets, lengths, points)

@@ -1,0 +1,66 @@
+"""The unicycle: a robot with two driven wheels, commanded by speed and turn rate."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.robots.arcs import advance_arc
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, ARCS, CostWeights, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.utils.records import Positive
+
+POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
+
+
+@kernel(ADVANCE_SIGNATURE)
+def advance(q, u, h, parameters, new):
+    """Follow a circular arc."""
+    new[0], new[1], new[2] = advance_arc(q[0], q[1], q[2], u[0] * h, u[1] * h)
+
+
+@register
+class Unicycle(RobotModel):
+    """A robot that drives along its heading and rotates in place: q = (x, y, theta), u = (v, omega).
+
+    x' = v cos(theta), y' = v sin(theta), theta' = omega, with the cost 1/2 (speed_weight v^2 + turn_weight omega^2).
+
+    Args:
+        model: "unicycle".
+        radius, footprint: see `RobotModel`.
+        max_speed: largest speed (m/s), forwards and backwards.
+        max_turn_rate: largest turn rate (rad/s), to either side.
+
+    """
+
+    control_names: ClassVar[tuple[str, ...]] = ("speed", "turn_rate")
+    control_units: ClassVar[tuple[str, ...]] = ("m/s", "rad/s")
+    advance: ClassVar = advance
+    mirror: ClassVar[Symmetry | None] = Symmetry((), ((1, 0), (0, -1)))
+    reversal: ClassVar[Symmetry | None] = Symmetry((), ((-1, 0), (0, 1)))
+    drive: ClassVar[int] = ARCS
+    is_kinematic: ClassVar[bool] = True
+
+    model: Literal["unicycle"] = "unicycle"
+    max_speed: Positive = 2.0
+    max_turn_rate: Positive = 3.0
+
+    @classmethod
+    def dynamics(cls) -> Dynamics:  # noqa: D102 (the interface is documented in the base class)
+        import sympy as sp
+
+        x, y, theta = sp.symbols("x y theta")
+        return Dynamics(
+            state=(x, y, theta),
+            drift=(0, 0, 0),
+            fields=((sp.cos(theta), sp.sin(theta), 0), (0, 0, 1)),
+            labels=(*POSE_LABELS, "$v$ (m/s)", r"$\omega$ (rad/s)"),
+        )
+
+    def limits(self) -> tuple[float, ...]:  # noqa: D102
+        return self.max_speed, self.max_turn_rate
+
+    def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
+        return cost.speed_weight, cost.turn_weight
+
+    def speed_limits(self) -> tuple[float, float]:  # noqa: D102
+        return self.max_speed, self.max_turn_rate

@@ -1,0 +1,172 @@
+"""Paths of any robot during a control period (kernels): first contact, clearance, proximity and state cost.
+
+The path is that of the model's `advance` with held controls. `leapnav.envs.simulation.arcs` is the same for circular
+arcs of a disc, for which the distances are known in closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import float64, types
+
+from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
+from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.shapes.proximity import proximity_values
+from leapnav.envs.simulation.arcs import (
+    CLEARANCE_TOLERANCE,
+    CONTACT_TOLERANCE,
+    MAX_PANELS,
+    PANEL_LENGTH,
+    RELATIVE_CLEARANCE_TOLERANCE,
+)
+
+ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
+STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
+SAMPLES = 4  # parts of a path whose mean speeds bound the speed, with a safety factor
+SPEED_SAFETY = 1.1
+
+
+class RobotMotion(NamedTuple):
+    """The kernels of a robot's model.
+
+    Attributes:
+        advance: see `leapnav.envs.robots.base.ADVANCE_SIGNATURE`.
+        state_cost: see `leapnav.envs.robots.base.STATE_COST_SIGNATURE`.
+
+    """
+
+    advance: FunctionPointer
+    state_cost: FunctionPointer
+
+
+MOTION = record_type(RobotMotion, advance=ADVANCE_FUNCTION, state_cost=STATE_COST_FUNCTION)
+
+
+@kernel(STATE_COST_SIGNATURE)
+def no_state_cost(q, parameters):
+    """Return the state cost of a robot without one."""
+    return 0.0
+
+
+@kernel(float64(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, VECTOR))
+def max_disc_speed(motion, q, u, duration, parameters, discs, new):
+    """Return an upper bound of the speed (m/s) of the footprint's discs; `new` becomes the state at the end."""
+    arm = 0.0
+    for k in range(len(discs)):
+        arm = max(arm, abs(discs[k, 0]))
+    x, y, heading, largest = q[0], q[1], q[2], 0.0
+    for part in range(1, SAMPLES + 1):
+        motion.advance(q, u, duration * part / SAMPLES, parameters, new)
+        travelled = math.hypot(new[0] - x, new[1] - y) + arm * abs(new[2] - heading)
+        largest = max(largest, travelled)
+        x, y, heading = new[0], new[1], new[2]
+    return SPEED_SAFETY * largest * SAMPLES / duration
+
+
+@kernel(types.UniTuple(float64, 3)(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, VECTOR))
+def follow_path(motion, q, u, duration, parameters, discs, field, new):
+    """Find the smallest clearance along a path, and the first contact.
+
+    Args:
+        motion: kernels of the robot's model.
+        q: state at the start.
+        u: held controls.
+        duration: duration of the period (s), positive.
+        parameters: parameters of the model.
+        discs (D, 2): footprint.
+        field: packed obstacle field.
+        new: overwritten by the state at the end of the path.
+
+    Returns:
+        The smallest clearance (m), the fraction of the period before the first contact, and the clearance (m) at the
+        end, with the errors of `leapnav.envs.simulation.arcs.follow_arc`.
+
+    """
+    before = footprint_clearance(q[0], q[1], q[2], discs, field)[0]
+    if before <= 0.0:
+        for i in range(len(q)):
+            new[i] = q[i]
+        return before, 0.0, before
+    # Clearance is Lipschitz continuous with constant 1 in the distance travelled, which is at most `total`.
+    total = max_disc_speed(motion, q, u, duration, parameters, discs, new) * duration
+    s0, c0 = 0.0, before
+    s1, c1 = total, footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+    c_end = c1
+    lowest = min(before, c1)
+    while s0 < total and lowest > 0.0:
+        if (c0 + c1 - (s1 - s0)) / 2 >= lowest - max(CLEARANCE_TOLERANCE, RELATIVE_CLEARANCE_TOLERANCE * lowest):
+            s0, c0 = s1, c1
+            s1, c1 = total, c_end
+        else:
+            s1 = (s0 + s1) / 2
+            motion.advance(q, u, duration * s1 / total, parameters, new)
+            c1 = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+            lowest = min(lowest, c1)
+    if lowest > 0.0:
+        motion.advance(q, u, duration, parameters, new)
+        return lowest, 1.0, c_end
+    # As for arcs: steps of at most the clearance, then bisection.
+    for _ in range(200):
+        s = min(s0 + 0.999 * c0, total)
+        motion.advance(q, u, duration * s / total, parameters, new)
+        following = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+        if following <= 0.0:
+            break
+        s0, c0 = s, following
+        if c0 < CONTACT_TOLERANCE or s0 >= total:
+            break
+    while c0 >= CONTACT_TOLERANCE and s1 - s0 > 1e-12 * total:
+        middle = (s0 + s1) / 2
+        motion.advance(q, u, duration * middle / total, parameters, new)
+        following = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+        if following <= 0.0:
+            s1 = middle
+        else:
+            s0, c0 = middle, following
+    fraction = min(s0 / total, 1.0 - 1e-15)
+    motion.advance(q, u, duration * fraction, parameters, new)
+    return min(lowest, 0.0), fraction, c0
+
+
+@kernel(types.UniTuple(float64, 2)(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, VECTOR))
+def path_costs(motion, q, u, duration, parameters, discs, field, work):
+    """Return the means of the proximity cost and of the state cost over a path, by three-point Gauss rules.
+
+    The panels are at most 1.5 proximity scales long. `work` (n,) is overwritten; the other arguments are those of
+    `follow_path`.
+    """
+    travelled = max_disc_speed(motion, q, u, duration, parameters, discs, work) / SPEED_SAFETY * duration
+    panels = min(max(math.ceil(travelled / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
+    width = 1.0 / panels
+    offset = 0.5 * math.sqrt(0.6) * width
+    proximity, state_cost = 0.0, 0.0
+    poses = np.empty((3, 4))
+    for panel in range(int(panels)):
+        middle = (panel + 0.5) * width
+        for k in range(3):
+            motion.advance(q, u, duration * (middle + (k - 1) * offset), parameters, work)
+            state_cost += (8.0 if k == 1 else 5.0) * motion.state_cost(work, parameters)
+            poses[k, 0], poses[k, 1] = work[0], work[1]
+            poses[k, 2], poses[k, 3] = math.cos(work[2]), math.sin(work[2])
+        for d in range(len(discs)):
+            a, radius = discs[d, 0], discs[d, 1]
+            if radius <= 0.0:
+                continue
+            first, second, third = proximity_values(
+                poses[0, 0] + a * poses[0, 2],
+                poses[0, 1] + a * poses[0, 3],
+                poses[1, 0] + a * poses[1, 2],
+                poses[1, 1] + a * poses[1, 3],
+                poses[2, 0] + a * poses[2, 2],
+                poses[2, 1] + a * poses[2, 3],
+                radius,
+                field,
+            )
+            proximity += 5.0 * first + 8.0 * second + 5.0 * third
+    return proximity / 18.0 * width, state_cost / 18.0 * width

@@ -1,0 +1,20 @@
+"""Validated, immutable records: the base class of everything that a scenario file contains, and its field types."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+# Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
+MAX_MAGNITUDE = 1e6
+Finite = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
+Point = tuple[Finite, Finite]
+
+
+class Frozen(BaseModel):
+    """An immutable record that accepts no unknown fields and converts no types."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)

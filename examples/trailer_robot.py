@@ -1,0 +1,55 @@
+"""A robot of one's own: a unicycle with a trailer, registered from outside the package."""
+
+import math
+from typing import ClassVar, Literal
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.robots import Dynamics, Symmetry, Unicycle, register
+from leapnav.envs.robots.arcs import advance_arc
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, GENERAL, POSE
+
+STEPS = 8  # Runge-Kutta steps per control period of 0.05 s; the error of the trailer's heading is below 1e-9 rad
+
+
+@kernel(ADVANCE_SIGNATURE)
+def advance(q, u, h, parameters, new):
+    heading, trailer, speed, turn_rate = q[2], q[3], u[0] / parameters[0], u[1]
+    step = h / STEPS
+    for k in range(STEPS):
+        here = heading + turn_rate * step * k
+        k1 = speed * math.sin(here - trailer)
+        k2 = speed * math.sin(here + turn_rate * step / 2 - trailer - k1 * step / 2)
+        k3 = speed * math.sin(here + turn_rate * step / 2 - trailer - k2 * step / 2)
+        k4 = speed * math.sin(here + turn_rate * step - trailer - k3 * step)
+        trailer += step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    new[0], new[1], new[2] = advance_arc(q[0], q[1], heading, u[0] * h, turn_rate * h)
+    new[3] = trailer
+
+
+@register
+class Trailer(Unicycle):
+    """A unicycle that pulls a trailer: q = (x, y, theta, theta_1) with theta_1' = v sin(theta - theta_1) / length."""
+
+    state_names: ClassVar = (*POSE, "trailer_heading")
+    state_units: ClassVar = ("m", "m", "rad", "rad")
+    goal_motion: ClassVar = (None,)  # the heading of the trailer is free at the goal
+    heading_states: ClassVar = ("trailer_heading",)
+    mirror: ClassVar = Symmetry(motion=(-1,), controls=((1, 0), (0, -1)))
+    reversal: ClassVar = None  # the trailer is not at the other end of the robot
+    advance: ClassVar = advance
+    drive: ClassVar = GENERAL
+    is_kinematic: ClassVar = False
+
+    model: Literal["trailer"] = "trailer"
+    length: float = 0.6  # m, from the robot to the trailer's axle
+
+    @classmethod
+    def dynamics(cls) -> Dynamics:
+        import sympy as sp
+
+        x, y, theta, trailer, length = sp.symbols("x y theta theta_1 length")
+        forwards = (sp.cos(theta), sp.sin(theta), 0, sp.sin(theta - trailer) / length)
+        return Dynamics((x, y, theta, trailer), (0, 0, 0, 0), (forwards, (0, 0, 1, 0)), parameters=(length,))
+
+    def parameters(self, cost) -> tuple[float, ...]:
+        return (self.length,)

@@ -1,0 +1,71 @@
+"""Initial guesses in the state space of the robot, from the poses of candidate paths."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from leapnav.envs.robots import Unicycle
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.transcription.direct import discretise, optimise
+
+MAX_LIMIT = 1e3  # m/s or rad/s, for robots without a limit of the speed or the turn rate
+# Two paths of the unicycle are duplicates if they stay within this distance of each other (m, and rad).
+DUPLICATE_DISTANCE = 0.05
+COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 33)  # of the horizon
+
+
+class Lifting:
+    """The paths of a robot from paths of poses.
+
+    Candidates of a robot that is not kinematic are optimised for a unicycle with the same footprint and weights first:
+    a lattice path has corners, which the robot cannot follow.
+
+    Args:
+        scenario: the scenario.
+        problem: its optimal control problem.
+
+    """
+
+    def __init__(self, scenario: Scenario, problem: OptimalControlProblem) -> None:
+        self._scenario, self._problem = scenario, problem
+        self._companion: OptimalControlProblem | None = None
+        self._seen: list[np.ndarray] = []
+        robot = scenario.robot
+        if not robot.is_kinematic:
+            speed, turn_rate = (min(limit, MAX_LIMIT) for limit in robot.speed_limits())
+            body = {"radius": robot.radius} if robot.footprint is None else {"footprint": robot.footprint}
+            unicycle = Unicycle(**body, max_speed=speed, max_turn_rate=turn_rate)
+            update = {"robot": unicycle, "start_motion": None, "goal_motion": None}
+            self._companion = OptimalControlProblem.from_scenario(scenario.model_copy(update=update))
+
+    def __call__(self, path: Trajectory) -> Trajectory | None:
+        """Return the path in the robot's states, or None for a duplicate of an earlier path."""
+        if path.states.shape[1] > 3:
+            return path
+        if self._companion is not None:
+            companion = self._companion.with_winding_of(path.states)
+            direct = optimise(companion, discretise(companion, path), self._scenario.cost.speed_weight)
+            path = Trajectory(direct.times, direct.states)
+            shape = path.resample(COMPARED_FRACTIONS * path.times[-1]).states
+            if any(np.abs(shape - other).max() < DUPLICATE_DISTANCE for other in self._seen):
+                return None
+            self._seen.append(shape)
+        if self._problem.system.n == 3:
+            return path
+        start = self._scenario.start_state
+        states = self._scenario.robot.lift(path.times, path.states, start)
+        return Trajectory(path.times, self._integrated(path, start) if states is None else states)
+
+    def _integrated(self, path: Trajectory, start: tuple[float, ...]) -> np.ndarray:
+        """Return the path with the further states that result from controls which follow its poses best."""
+        poses, times = path.states, path.times
+        states = np.column_stack([poses, np.tile(start[3:], (len(poses), 1))])
+        for k in range(len(times) - 1):
+            step = times[k + 1] - times[k]
+            row = states[k : k + 1].copy()
+            row[0, :3] = 0.5 * (poses[k] + poses[k + 1])
+            (drift,), (fields,) = self._problem.dynamics(row)
+            controls = np.linalg.lstsq(fields[:3], (poses[k + 1] - poses[k]) / step - drift[:3], rcond=None)[0]
+            states[k + 1, 3:] = states[k, 3:] + step * (drift + fields @ controls)[3:]
+        return states

@@ -1,0 +1,1 @@
+"""Direct transcription: local optima of a discretised problem by sequential quadratic programming."""
