@@ -144,7 +144,7 @@ def ipopt(scenario, transcription: Transcription, candidates: int = N_CANDIDATES
         seconds += time.perf_counter() - start
         if solution is not None and clearances(np.ascontiguousarray(solution.states), scenario.field).min() > 0:
             # The cost of the nearest path of the direct transcription has a smaller error than the trapezoidal rule.
-            best = min(best, optimise(problem, discretise(solution)).cost)
+            best = min(best, optimise(problem, discretise(problem, solution)).cost)
     return best, seconds
 
 

@@ -1,7 +1,8 @@
 """Gymnasium environments of a wheeled robot among obstacles, and the scenarios played in them."""
 
 from leapnav.deprecated import deprecated_names
-from leapnav.envs.navigation import NavigateEnv, NavigateGoalEnv
+from leapnav.envs.goal_navigation import NavigateGoalEnv
+from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario

@@ -1,8 +1,7 @@
-"""The environments `leapnav/Navigate-v0` and `leapnav/NavigateGoal-v0` (goal-conditioned)."""
+"""The environment `leapnav/Navigate-v0`."""
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from leapnav.envs.checks import check_actions, check_options, check_render_mode
-from leapnav.envs.goals import GoalConditioned
+from leapnav.envs.keys import keys_to_action
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
@@ -23,10 +22,7 @@ from leapnav.envs.simulation.simulator import BatchSimulator
 if TYPE_CHECKING:
     from leapnav.envs.simulation.rendering import Window
 
-__all__ = ["NavigateEnv", "NavigateGoalEnv"]
-
 NOISE_STREAM = 1  # of the environment's seed; the stream of the scenarios is the seed itself
-KEY_ACTION = 0.5  # fraction of the maximum speed and turn rate when a person drives by keys
 
 
 class NavigateEnv(gym.Env[Any, np.ndarray]):
@@ -323,19 +319,10 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     def get_keys_to_action(self) -> dict[str | tuple[str | int, ...], np.ndarray]:
         """Return the actions of keys, with which `gymnasium.utils.play.play` lets a person drive.
 
-        W and S or the arrow keys drive forwards and backwards, A and D or the arrow keys turn; at half of the maximum
-        speed and turn rate. Without a key the robot stands still.
+        W and S or the arrow keys drive forwards and backwards, A and D or the arrow keys turn, at half of the limits;
+        for other robots than those with speeds as controls, they are the first two controls.
         """
-        import pygame
-
-        # Gymnasium takes the empty text for "no key"; an empty tuple is an error.
-        actions: dict[str | tuple[str | int, ...], np.ndarray] = {"": np.zeros(2, np.float32)}
-        for keys in (("w", "s", "a", "d"), (pygame.K_UP, pygame.K_DOWN, pygame.K_LEFT, pygame.K_RIGHT)):
-            for ahead, turn in itertools.product((0, 1, -1), repeat=2):
-                pressed = [keys[0 if ahead > 0 else 1]] * (ahead != 0) + [keys[2 if turn > 0 else 3]] * (turn != 0)
-                if pressed:
-                    actions[tuple(pressed)] = KEY_ACTION * np.array([ahead, turn], dtype=np.float32)
-        return actions
+        return keys_to_action(self.settings.model)
 
     @property
     def family(self) -> str:
@@ -410,46 +397,6 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_window": None}  # windows cannot be pickled
-
-
-class NavigateGoalEnv(GoalConditioned, NavigateEnv):
-    """`NavigateEnv` for goal-conditioned learners, such as hindsight experience replay.
-
-    ## Observation space
-    A `Dict` of three boxes, as in Gymnasium-Robotics:
-
-    | Key | Index | Observation | Unit | Range |
-    |---|---|---|---|---|
-    | `achieved_goal` | 0, 1 | position | m | -1000 to 1000 |
-    | | 2, 3 | cosine and sine of the heading | 1 | -1 to 1 |
-    | `desired_goal` | 0, 1 | goal position | m | -1000 to 1000 |
-    | | 2, 3 | cosine and sine of the goal heading; 0, 0 if the goal heading is free | 1 | -1 to 1 |
-    | `observation` | 0 | time left | s | 0 to 10000 |
-    | | 1 ... | the parts of `NavigateEnv` without `goal` | | |
-
-    ## Rewards
-    | `reward` | Value |
-    |---|---|
-    | `"sparse"` (the default) | 1 for each step that ends at the goal, within the tolerances; otherwise 0 |
-    | `"cost"` | that of `NavigateEnv`; `compute_reward` then needs the infos of the steps |
-
-    The sensing noise of a `Disturbance` affects the lidar but not the goals, which determine the reward. The `info` of
-    a step also contains `terminated` and `at_horizon`. Everything else is the same as in `NavigateEnv`.
-    """
-
-    _goal_conditioned = True
-
-    def __init__(self, *args: Any, reward: str = "sparse", **arguments: Any) -> None:
-        super().__init__(*args, reward=reward, **arguments)
-
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Hold an action for one control period, see `NavigateEnv.step`; the reward is that of `compute_reward`."""
-        playing = bool(self._playing[0])
-        observation, _, terminated, truncated, info = super().step(action)
-        info["terminated"], info["at_horizon"] = terminated, self._simulator.at_horizon(0)
-        reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
-        reward = float(reward) if playing else 0.0
-        return observation, reward, terminated, truncated, info
 
 
 def make_noise_generator(seed: int | None) -> np.random.Generator:

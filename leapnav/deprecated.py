@@ -38,7 +38,7 @@ _EXPERTS = {
     "collocation": "solvers.collocation",
     "conjugate_points": "problem.conjugate_points",
     "demonstrations": "data.demonstrations",
-    "direct": "search.direct",
+    "direct": "transcription.direct",
     "dynamics": "problem.dynamics",
     "extremal": "problem.extremal",
     "feasible_path": "solvers.feasible_path",

@@ -14,7 +14,8 @@ import pytest
 
 import leapnav
 from leapnav.envs import FAMILIES, BankError, ScenarioBank, sample_scenario
-from leapnav.envs.scenarios.bank import SPLITS, VERSION, BankEntry, write_bank
+from leapnav.envs.scenarios.bank import SPLITS, VERSION
+from leapnav.envs.scenarios.bank_writing import BankEntry, write_bank
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import ExpertPolicy, Trajectory, build_bank, find_optimum, solve
 from leapnav.experts.data.banks import Rejection, draw, judge

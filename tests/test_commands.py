@@ -117,9 +117,9 @@ import sys
 from leapnav.cli import main
 from leapnav.commands.installation import compile
 from leapnav.envs.kernels import compilation
-from leapnav.envs.simulation.arcs import arc_point, sinc
+from leapnav.envs.robots.arcs import advance_arc, sinc
 
-compilation.all_kernels = lambda: [arc_point, sinc]
+compilation.all_kernels = lambda: [advance_arc, sinc]
 compile._compile_unicycle_flow = lambda: None
 sys.exit(main(["compile", "--jobs", "1", "--json", "-"]))
 """
@@ -131,6 +131,6 @@ def test_missing_kernels_are_compiled(tmp_path):
     command = [sys.executable, "-c", COMPILING]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     found = json.loads(done.stdout)
-    assert found["compiled"] == {"envs.simulation.arcs": ["arc_point", "sinc"]}
+    assert found["compiled"] == {"envs.robots.arcs": ["advance_arc", "sinc"]}
     assert Path(found["cache"]).parent == tmp_path
-    assert "envs.simulation.arcs: arc_point, sinc\ncompiled 2 kernels in " in done.stderr
+    assert "envs.robots.arcs: advance_arc, sinc\ncompiled 2 kernels in " in done.stderr

@@ -6,10 +6,10 @@ from leapnav.envs import Scenario
 from leapnav.experts import OptimalControlProblem, Trajectory, find_optimum
 from leapnav.experts.numerics.flow import EndCondition
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.transcription.arcs_descent import descend
-from leapnav.experts.transcription.direct import discretise, optimise
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.transcription.arcs import DiscreteProblem
+from leapnav.experts.transcription.arcs_descent import descend
+from leapnav.experts.transcription.direct import discretise, optimise
 
 BEST_KNOWN = best_known()
 
@@ -26,7 +26,7 @@ def test_it_converges_to_the_extremal_with_order_two(scenario):
     path = Trajectory(
         np.linspace(0.0, scenario.horizon, 65), optimum.evaluate(np.linspace(0.0, scenario.horizon, 65))[0]
     )
-    direct = optimise(optimum.problem, discretise(path))
+    direct = optimise(optimum.problem, discretise(optimum.problem, path))
     errors = []
     for _ in range(4):
         assert direct.converged
@@ -44,7 +44,7 @@ def test_it_converges_to_the_extremal_with_order_two(scenario):
 def test_every_step_of_the_path_is_an_exact_arc_and_ends_at_the_goal():
     scenario = BEST_KNOWN[0][0]
     problem, path = first_candidate(scenario)
-    direct = optimise(problem, discretise(path))
+    direct = optimise(problem, discretise(problem, path))
     assert direct.states[0] == pytest.approx(scenario.start)
     assert direct.states[-1] == pytest.approx(problem.goal, abs=1e-5)
     for k, (v, omega) in enumerate(direct.controls):
@@ -62,7 +62,7 @@ def test_controls_stay_within_the_robot_s_limits():
     fields["goal"] = [6.0, 4.0, 2.0]
     scenario = Scenario.from_dict(fields)
     problem, path = first_candidate(scenario)
-    direct = optimise(problem, discretise(path))
+    direct = optimise(problem, discretise(problem, path))
     assert direct.converged
     assert np.abs(direct.controls[:, 0]).max() == pytest.approx(1.3)
     assert np.abs(direct.controls[:, 1]).max() <= 0.8
@@ -74,7 +74,7 @@ def test_a_free_goal_heading_has_no_costate_at_the_end():
     del fields["goal"][2]
     scenario = Scenario.from_dict({**fields, "goal": [8.0, 8.0, None]})
     problem, path = first_candidate(scenario)
-    direct = optimise(problem, discretise(path))
+    direct = optimise(problem, discretise(problem, path))
     assert direct.converged
     assert direct.costates[-1, 2] == pytest.approx(0.0, abs=1e-6)
 
@@ -82,7 +82,7 @@ def test_a_free_goal_heading_has_no_costate_at_the_end():
 def test_weights_in_other_units_change_the_cost_and_not_the_path():
     def refined(fields):
         problem, path = first_candidate(Scenario.from_dict(fields))
-        return optimise(problem, optimise(problem, discretise(path)).refined())
+        return optimise(problem, optimise(problem, discretise(problem, path)).refined())
 
     fields = scenario_fields()
     one = refined(fields)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from leapnav.envs import Unicycle, Scenario, ScenarioError
+from leapnav.envs import Scenario, ScenarioError, Unicycle
 from leapnav.envs.scenarios.maps import read_movingai, rectangles
 from leapnav.experts import find_optimum
 

@@ -103,8 +103,10 @@ def test_values_alone_and_by_three_are_those_with_derivatives(scenario):
         dx, dy = rng.normal(0, 0.2, 2)
         three = (x - dx, y - dy), (x, y), (x + dx, y + dy)
         expected = [proximity(*point, scenario.field)[0] for point in three]
-        assert [proximity_value(*point, scenario.field) for point in three] == pytest.approx(expected, abs=1e-9)
-        found = proximity_values(*three[0], *three[1], *three[2], scenario.field)
+        assert [proximity_value(*point, scenario.robot.radius, scenario.field) for point in three] == pytest.approx(
+            expected, abs=1e-9
+        )
+        found = proximity_values(*three[0], *three[1], *three[2], scenario.robot.radius, scenario.field)
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 

@@ -5,7 +5,7 @@ import pytest
 from helpers import best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
-from leapnav.envs import FAMILIES, Unicycle, Scenario, sample_scenario
+from leapnav.envs import FAMILIES, Scenario, Unicycle, sample_scenario
 from leapnav.experts import Status, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice, Place, is_connected

@@ -110,7 +110,7 @@ FAULTS = [
     ({"arena": [0, 0, 0, 10]}, "arena", "(0, 0, 0, 10)"),
     ({"speed": 3}, "speed", "3"),
     ({"robot": {"radius": 0.2, "colour": "red"}}, "robot.colour", "'red'"),
-    ({"robot": {"model": "car"}}, "robot.model", "'car'"),
+    ({"robot": {"model": "boat"}}, "robot.model", "'boat'"),
     ({"robot": {"radius": 0}}, "robot.radius", "got 0"),
     ({"cost": {"proximity_scale": 0.0}}, "cost.proximity_scale", "got 0.0"),
     ({"self": 1}, "self", "unknown field"),

@@ -54,12 +54,15 @@ def test_ipopt_finds_the_same_optimum_by_other_means(scenario):
     pytest.importorskip("casadi")
     from leapnav.experts.search.ipopt import Transcription
 
-    for other in (scenario, sample_scenario("polygons", 3)):
+    robots = ("unicycle", "car", "dynamic_unicycle", "differential_drive")
+    others = (sample_scenario("polygons", 3, robot) for robot in robots)
+    for other in (scenario, *others):
         optimum = find_optimum(other)
         times = np.linspace(0.0, other.horizon, 101)
         rng = np.random.default_rng(0)
-        guess = Trajectory(times, optimum.evaluate(times)[0] + 0.02 * rng.normal(size=(101, 3)))
+        states = optimum.evaluate(times)[0]
+        guess = Trajectory(times, states + 0.02 * rng.normal(size=states.shape))
         problem = OptimalControlProblem.from_scenario(other).with_winding_of(guess.states)
-        solution = Transcription(other, 100).solve(problem, guess)
+        solution = Transcription(other, problem, 100).solve(problem, guess)
         assert solution is not None
-        assert np.abs(solution.states - optimum.evaluate(times)[0]).max() < 0.05
+        assert np.abs(solution.states - states)[:, :3].max() < 0.05

@@ -4,7 +4,7 @@ import sympy as sp
 from helpers import best_known, published_problems
 
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, solve
-from leapnav.experts.problem.generated_flow import _check_same
+from leapnav.experts.problem.code_generation import _check_same
 from leapnav.experts.solve import METHODS
 from leapnav.experts.solvers.initial_paths import initial_paths
 

@@ -14,6 +14,7 @@ _QUARTER_TURN = np.array([(0, 1), (-1, 0)], dtype=np.int64)
 DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
 ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
 HEADINGS = len(ANGLES)
+SIMPSON = np.array([1.0, 4.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,15 +23,16 @@ class Moves:
 
     Attributes:
         targets: (HEADINGS, count, 3), int64: cells in x, cells in y, heading steps.
-        lengths: (HEADINGS, count), length in the metric of the control weights, in the units of sqrt(cost * s).
-        points: (HEADINGS, count, P, 2), int64: offsets (half cells) of the points at which the cost is evaluated, from
-            the start of the move to its end; P is odd, for Simpson's rule.
+        points: (HEADINGS, count, P, 2), int64: offsets (half cells) of the points at which the speed of the metric is
+            evaluated, from the start of the move to its end.
+        weights: (HEADINGS, count, P), weights of these speeds: the length of the move, in the units of sqrt(cost * s),
+            times the weights of Simpson's rule on each of its straight parts.
 
     """
 
     targets: np.ndarray
-    lengths: np.ndarray
     points: np.ndarray
+    weights: np.ndarray
 
     @property
     def border(self) -> int:
@@ -58,7 +60,7 @@ def rotating_moves(cell: float, speed_weight: float, turn_weight: float) -> Move
     """
     targets, points, squares, turns = _rotating_table()
     lengths = np.sqrt(speed_weight * squares * cell * cell + turn_weight * turns * turns)
-    return Moves(targets, lengths, points)
+    return Moves(targets, points, (lengths / 6.0)[:, :, None] * SIMPSON)
 
 
 @cache
@@ -109,16 +111,18 @@ def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: f
         steps.append(rows)
     n_steps = max(len(path) for rows in steps for path in rows)
     shape = (HEADINGS, len(changes))
-    targets, lengths = np.zeros((*shape, 3), dtype=np.int64), np.empty(shape)
-    points = np.zeros((*shape, 2 * n_steps + 1, 2), dtype=np.int64)
+    targets = np.zeros((*shape, 3), dtype=np.int64)
+    points, weights = np.zeros((*shape, 2 * n_steps + 1, 2), dtype=np.int64), np.zeros((*shape, 2 * n_steps + 1))
     for heading in range(HEADINGS):
         for move, (path, change) in enumerate(zip(steps[heading], changes, strict=True)):
+            lengths = math.sqrt(speed_weight) * cell * np.hypot(*np.array(path).T)
+            lengths *= math.hypot(lengths.sum(), turn_length if change else 0.0) / lengths.sum()
             corners = np.concatenate([[(0, 0)], np.cumsum(path, axis=0)])
-            distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
             targets[heading, move] = (*corners[-1], change)
-            at = np.linspace(0.0, distance[-1], 2 * n_steps + 1)
-            between = np.stack([np.interp(at, distance, 2 * column) for column in corners.T], axis=1)
-            points[heading, move] = np.rint(between)
-            driven = math.sqrt(speed_weight) * distance[-1] * cell
-            lengths[heading, move] = math.hypot(driven, turn_length if change else 0.0)
-    return Moves(targets, lengths, points)
+            # The points after the end of a shorter move have no weight.
+            points[heading, move] = 2 * corners[-1]
+            points[heading, move, : 2 * len(path) + 1 : 2] = 2 * corners
+            points[heading, move, 1 : 2 * len(path) : 2] = corners[:-1] + corners[1:]
+            for k, length in enumerate(lengths.tolist()):
+                weights[heading, move, 2 * k : 2 * k + 3] += length / 6.0 * SIMPSON
+    return Moves(targets, points, weights)

@@ -42,16 +42,14 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.utils.files import atomic_path
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 FORMAT, VERSION = "leapnav-bank", 4
 # Bytes. A larger dataset is verified when it is first read, because that takes 1 s per GB; the others on opening.
 MAX_VERIFIED_ON_OPENING = 32_000_000
-MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
 SPLITS = ("train", "test")
 BANK_DIRECTORY = Path(__file__).parent / "banks"  # of the included banks
-_TYPES = {
+TYPES = {
     "scenarios": "u1",
     "scenario_ends": "<i8",
     "tasks": "<f8",
@@ -93,27 +91,6 @@ class Reference:
     second_cost: float | None
     certificate: tuple[float, float, float, float]
     times: np.ndarray
-    states: np.ndarray
-    controls: np.ndarray
-    costates: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class BankEntry:
-    """The data of one scenario in a bank.
-
-    Attributes:
-        scenario: the scenario as JSON text.
-        draw: index of the random draw that produced it.
-        cost, second_cost, certificate, states, controls, costates: see `Reference`.
-
-    """
-
-    scenario: str
-    draw: int
-    cost: float
-    second_cost: float | None
-    certificate: tuple[float, float, float, float]
     states: np.ndarray
     controls: np.ndarray
     costates: np.ndarray
@@ -174,17 +151,17 @@ class ScenarioBank(Sequence[Scenario]):
                         f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads "
                         f"{VERSION}; build the bank again with `leapnav bank build`"
                     )
-                locations = {name: _locate(file[name], name) for name in _TYPES}
+                locations = {name: _locate(file[name], name) for name in TYPES}
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
             self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
             self.rejected = dict(json.loads(attributes["rejected"]))
             content = np.asarray(np.memmap(self.path, dtype="u1", mode="r"))
             arrays = {
-                name: content[start : start + size].view(_TYPES[name]).reshape(shape)
+                name: content[start : start + size].view(TYPES[name]).reshape(shape)
                 for name, (start, size, shape) in locations.items()
             }
             self._checksums: dict[str, str] = dict(json.loads(attributes.pop("checksums")))
-            self._verify("attributes", _attribute_bytes(attributes))
+            self._verify("attributes", attribute_bytes(attributes))
             for name, array in arrays.items():
                 if array.nbytes <= MAX_VERIFIED_ON_OPENING:
                     self._verify(name, array)
@@ -225,7 +202,7 @@ class ScenarioBank(Sequence[Scenario]):
             BankError: they differ.
 
         """
-        if _digest(content) != self._checksums.get(name):
+        if digest(content) != self._checksums.get(name):
             raise BankError(f"{self.path}: damaged: the checksum of {name} differs; copy or build the bank again")
 
     def _array(self, name: str) -> np.ndarray:
@@ -366,13 +343,13 @@ def _shipped(name: str, split: str) -> ScenarioBank:
     return ScenarioBank(BANK_DIRECTORY / f"{name}-{split}.bank")
 
 
-def _digest(content: np.ndarray | bytes) -> str:
+def digest(content: np.ndarray | bytes) -> str:
     """Return the BLAKE2b digest (16 bytes) of the bytes of an array."""
     data = content if isinstance(content, bytes) else np.ascontiguousarray(content).reshape(-1).view("u1").data
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-def _attribute_bytes(attributes: Mapping[str, Any]) -> bytes:
+def attribute_bytes(attributes: Mapping[str, Any]) -> bytes:
     """Return the attributes of a file, except the checksums, in a form that does not depend on their types in HDF5."""
     return json.dumps({name: str(value) for name, value in sorted(attributes.items())}).encode()
 
@@ -380,7 +357,7 @@ def _attribute_bytes(attributes: Mapping[str, Any]) -> bytes:
 def _locate(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
     """Return the first byte of a dataset in the file, its number of bytes, and its shape."""
     if (
-        dataset.dtype != np.dtype(_TYPES[name])
+        dataset.dtype != np.dtype(TYPES[name])
         or dataset.chunks is not None
         or len(dataset.shape) != (2 if name in _TABLES else 1)
     ):
@@ -399,75 +376,3 @@ def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
         last = int(arrays[ends][-1]) if count else 0
         if (np.diff(arrays[ends], prepend=0) <= 0).any() or any(len(arrays[name]) != last for name in contents):
             raise ValueError(f"{ends}: not the ends of {' and '.join(contents)}")
-
-
-def point_times(horizon: float) -> np.ndarray:
-    """Return the times (N,) at which a bank stores the points of an optimum (s)."""
-    return np.linspace(0.0, horizon, math.ceil(horizon / MAX_POINT_INTERVAL - 1e-6) + 1)
-
-
-def write_bank(
-    path: str | os.PathLike[str],
-    entries: Sequence[BankEntry],
-    *,
-    family: str,
-    seed: int,
-    drawn: int,
-    rejected: Mapping[str, int],
-    software: str,
-) -> None:
-    """Write a bank atomically; the same arguments give the same bytes.
-
-    Args:
-        path: the file.
-        entries: the scenarios with their optima.
-        family, seed, drawn, rejected, software: see `ScenarioBank`.
-
-    Raises:
-        ValueError: the scenarios have different robot models.
-
-    """
-    import h5py
-
-    texts = [entry.scenario.encode() for entry in entries]
-    scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
-    models = sorted({scenario.robot.model for scenario in scenarios})
-    if len(models) > 1:
-        raise ValueError(f"entries: expected one robot model for all scenarios, got {', '.join(models)}")
-    n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
-    columns: dict[str, Any] = {
-        "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
-        "scenario_ends": np.cumsum([len(text) for text in texts]),
-        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(len(scenarios), -1 if scenarios else 11),
-        "fields": np.concatenate([np.empty(0), *(scenario.field for scenario in scenarios)]),
-        "field_ends": np.cumsum([len(scenario.field) for scenario in scenarios]),
-        "draws": [entry.draw for entry in entries],
-        "costs": [entry.cost for entry in entries],
-        "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],
-        "certificates": np.array([entry.certificate for entry in entries]).reshape(-1, 4),
-        "path_ends": np.cumsum([len(entry.states) for entry in entries]),
-        "states": np.concatenate([np.empty((0, n)), *(entry.states for entry in entries)]),
-        "controls": np.concatenate([np.empty((0, m)), *(entry.controls for entry in entries)]),
-        "costates": np.concatenate([np.empty((0, n)), *(entry.costates for entry in entries)]),
-    }
-    arrays = {name: np.asarray(values, dtype=_TYPES[name]) for name, values in columns.items()}
-    attributes = {
-        "format": FORMAT,
-        "version": VERSION,
-        "family": family,
-        "seed": seed,
-        "drawn": drawn,
-        "rejected": json.dumps(dict(sorted(rejected.items()))),
-        "software": software,
-    }
-    checksums = {name: _digest(array) for name, array in arrays.items()}
-    # Alignment in the file makes the memory-mapped arrays aligned.
-    with (
-        atomic_path(path) as partial,
-        h5py.File(partial, "w", alignment_threshold=1, alignment_interval=64) as file,
-    ):
-        for name, value in attributes.items():
-            file.attrs[name] = value
-        file.attrs["checksums"] = json.dumps({**checksums, "attributes": _digest(_attribute_bytes(attributes))})
-        for name, array in arrays.items():
-            file.create_dataset(name, data=array)

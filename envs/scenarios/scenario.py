@@ -10,17 +10,17 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
 
 from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
+from leapnav.envs.scenarios.faults import fault, one_line, shorten
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
@@ -31,21 +31,6 @@ from leapnav.envs.utils.validation import check_positive, suggestion
 # goal heading NaN if free), the horizon, the limits (m) and weights (m) of the controls, the further states (n - 3) at
 # the start and at the goal (NaN if free), and the parameters (k).
 START, GOAL, HORIZON, LIMITS = 0, 3, 6, 7
-MAX_FAULTS = 8  # faults in one message
-# Messages for the types of pydantic's errors.
-EXPECTED = {
-    "greater_than": "expected a number > {gt:g}",
-    "greater_than_equal": "expected a number >= {ge:g}",
-    "less_than_equal": "expected a number <= {le:g}",
-    "finite_number": "expected a finite number",
-    "float_type": "expected a number",
-    "float_parsing": "expected a number",
-    "string_type": "expected text",
-    "literal_error": "expected {expected}",
-    "tuple_type": "expected a list",
-    "model_type": "expected an object",
-    "model_attributes_type": "expected an object",
-}
 
 
 class ScenarioError(ValueError):
@@ -148,9 +133,9 @@ class Scenario(Frozen):
         try:
             super().__init__(**fields)
         except ValidationError as error:
-            faults += [_fault(details) for details in error.errors(include_url=False)]
+            faults += [fault(details, _known_fields) for details in error.errors(include_url=False)]
         if faults:
-            raise ScenarioError(_one_line(fields.get("name", "scenario"), faults)) from None
+            raise ScenarioError(one_line(fields.get("name", "scenario"), faults)) from None
 
     @field_validator("arena")
     @classmethod
@@ -274,11 +259,11 @@ class Scenario(Frozen):
 
         """
         if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
-            raise ScenarioError(f"a scenario is a JSON object, got {_shorten(fields)}")
+            raise ScenarioError(f"a scenario is a JSON object, got {shorten(fields)}")
         try:
             return cls(**_tuples(fields))
         except RecursionError:
-            raise ScenarioError(f"Scenario {_shorten(fields.get('name'))}: the fields are nested too deeply") from None
+            raise ScenarioError(f"Scenario {shorten(fields.get('name'))}: the fields are nested too deeply") from None
 
     @classmethod
     def from_json(cls, path_or_text: str | Path) -> Scenario:
@@ -394,7 +379,7 @@ def check_robot(value: RobotModel | Mapping[str, Any] | str) -> RobotModel:
     if isinstance(value, str):
         value = {"model": value}
     if not isinstance(value, Mapping):
-        raise ValueError(f"robot: expected the name of a model, a dict of its fields or a robot, got {_shorten(value)}")
+        raise ValueError(f"robot: expected the name of a model, a dict of its fields or a robot, got {shorten(value)}")
     robot, faults = _read_robot(value)
     if faults:
         raise ValueError("; ".join(faults))
@@ -410,7 +395,10 @@ def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
     try:
         return model(**_tuples(dict(fields))), []
     except ValidationError as error:
-        return Unicycle(), [_fault(details, model) for details in error.errors(include_url=False)]
+        return Unicycle(), [
+            fault(details, partial(_known_fields, robot=model), ("robot",))
+            for details in error.errors(include_url=False)
+        ]
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -457,40 +445,7 @@ def check_headings(scenario: Scenario) -> None:
         raise ScenarioError(f"Scenario {scenario.name!r}: {' '.join(faults)}")
 
 
-def _shorten(value: Any) -> str:
-    text = repr(value).replace("\n", " ")
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _one_line(name: Any, faults: list[str]) -> str:
-    """Return all faults as one line: scenario, then field, fault and value of each."""
-    hidden = len(faults) - MAX_FAULTS
-    text = "; ".join(faults[:MAX_FAULTS]) + (f"; and {hidden} more faults" if hidden > 0 else "")
-    return " ".join(f"Scenario {_shorten(name)}: {text}".splitlines())  # an unknown key may contain line breaks
-
-
-def _fault(details: ErrorDetails, robot: type[BaseModel] | None = None) -> str:
-    """Return one fault, of the scenario or of a robot of the given class: field, what is expected, and the value."""
-    location, context, kind = details["loc"], details.get("ctx", {}), details["type"]
-    if robot is not None:
-        location = ("robot", *location)
-    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".")
-    if kind == "extra_forbidden":
-        hint = suggestion(location[-1], _known_fields(location[:-1], robot or Unicycle))
-        return f"{path}: unknown field, got {_shorten(details['input'])}{hint}"
-    if kind == "missing":
-        return f"{path}: missing"
-    if kind in ("too_long", "tuple_too_long"):
-        message = f"expected {context.get('max_length')} numbers"
-    elif kind == "value_error":
-        message = details["msg"].removeprefix("Value error, ")
-    else:
-        message = EXPECTED.get(kind, details["msg"]).format(**context)
-    # The messages of whole-scenario checks contain field and value.
-    return f"{path}: {message}, got {_shorten(details['input'])}" if path else message
-
-
-def _known_fields(location: Sequence[Any], robot: type[BaseModel]) -> tuple[str, ...]:
+def _known_fields(location: Sequence[Any], robot: type[RobotModel] = Unicycle) -> tuple[str, ...]:
     """Return the fields of the part of a scenario at a location."""
     parts: dict[Any, type[BaseModel]] = {
         "robot": robot,

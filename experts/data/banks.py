@@ -16,7 +16,8 @@ from joblib import Parallel
 
 import leapnav
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.bank import VERSION, BankEntry, BankError, ScenarioBank, point_times, write_bank
+from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank
+from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
 from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.envs.utils.progress import advance, progress_bar

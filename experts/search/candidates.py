@@ -186,7 +186,7 @@ class CandidateSearch:
         lattice = self.lattice
         speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
         plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
-        return Metric(speed, plane, lattice.cell, lattice.weights[0], moves.targets, moves.lengths, moves.points)
+        return Metric(speed, plane, lattice.cell, lattice.weights[0], moves.targets, moves.points, moves.weights)
 
     def _grow(self) -> None:
         """Compute the trees from the start and from the goal, and the nodes at which they meet, in order of cost."""

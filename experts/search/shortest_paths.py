@@ -64,7 +64,7 @@ class Metric(NamedTuple):
         plane: its minimum over the layers.
         cell: side of a cell (m).
         speed_weight: weight of squared distances.
-        targets, lengths, points: the robot's moves, see `leapnav.envs.robots.moves.Moves`.
+        targets, points, weights: the robot's moves, see `leapnav.envs.robots.moves.Moves`.
 
     """
 
@@ -73,8 +73,8 @@ class Metric(NamedTuple):
     cell: float
     speed_weight: float
     targets: np.ndarray
-    lengths: np.ndarray
     points: np.ndarray
+    weights: np.ndarray
 
 
 class Nodes(NamedTuple):
@@ -112,8 +112,8 @@ METRIC = record_type(
     cell=float64,
     speed_weight=float64,
     targets=int64[:, :, ::1],
-    lengths=MATRIX,
     points=int64[:, :, :, ::1],
+    weights=CUBE,
 )
 NODES = record_type(Nodes, nodes=INTEGERS, costs=VECTOR)
 LIMITS = record_type(Limits, reach=float64, slack=float64, limit=float64)
@@ -189,13 +189,14 @@ def tree(metric, seeds, ends, rest, exact, limits):
     count, n_points = targets.shape[1], metric.points.shape[2]
     ahead, cells = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count), np.int64)
     offsets, length = np.empty((HEADINGS, count, n_points), np.int64), np.empty((HEADINGS, count))
+    is_straight = n_points == 3  # one application of Simpson's rule, with fewer multiplications
     for k in range(HEADINGS):
         for move in range(count):
             dx, dy, change = targets[k, move]
             other = (k + change) % HEADINGS
             cells[k, move] = dx * lines + dy
             ahead[k, move] = (dx * lines + dy) * HEADINGS + other - k
-            length[k, move] = metric.lengths[k, move] / (3.0 * (n_points - 1.0))
+            length[k, move] = metric.weights[k, move, 0]
             for i in range(n_points):
                 a, b = metric.points[k, move, i]
                 offsets[k, move, i] = layer * (k if 2 * i <= n_points else other) + a * stride + b
@@ -236,10 +237,12 @@ def tree(metric, seeds, ends, rest, exact, limits):
         for move in range(count):
             following = node + ahead[k, move]
             at = offsets[k, move]
-            speeds = flat[here + at[0]] + 4.0 * flat[here + at[1]]
-            for i in range(2, n_points - 1, 2):
-                speeds += 2.0 * flat[here + at[i]] + 4.0 * flat[here + at[i + 1]]
-            total = key + length[k, move] * (speeds + flat[here + at[n_points - 1]])
+            if is_straight:
+                total = key + length[k, move] * (flat[here + at[0]] + 4.0 * flat[here + at[1]] + flat[here + at[2]])
+            else:
+                total = key
+                for i in range(n_points):
+                    total += metric.weights[k, move, i] * flat[here + at[i]]
             if total < cost[following]:
                 bound = total + (rest[following] if exact else rest[position + cells[k, move]])
                 if bound <= limit and bound < np.inf:

@@ -99,16 +99,17 @@ def follow_controls(problem: OptimalControlProblem, states: np.ndarray, rates: n
     return np.linalg.solve(gram, np.einsum("kij,ki->kj", fields, rates - drift)[:, :, None])[:, :, 0]
 
 
-def optimise(problem: OptimalControlProblem, guess: DirectPath, speed_weight: float) -> DirectPath:
+def optimise(problem: OptimalControlProblem, guess: DirectPath, speed_weight: float | None = None) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
 
     Args:
         problem: the problem of a scenario, with the winding of the goal heading chosen.
         guess: initial guess; its states, controls and costates need not be consistent.
-        speed_weight: cost weight of the squared speed, the unit of the costs.
+        speed_weight: cost weight of the squared speed, the unit of the costs; None for that of the first control.
 
     """
     arrays = problem.arrays
+    speed_weight = speed_weight or problem.control_weight[0]
     scale = max(math.dist(problem.start[:2], arrays.goal[:2]) / 5.0, 0.1)
     tolerance = STEP_TOLERANCE * min(scale, 1.0)
     states, controls = guess.states.copy(), guess.controls.copy()

@@ -1,0 +1,112 @@
+"""Writing of scenario banks, see `leapnav.envs.scenarios.bank` for the format."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from leapnav.envs.robots import Unicycle
+from leapnav.envs.scenarios.bank import FORMAT, TYPES, VERSION, attribute_bytes, digest
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.files import atomic_path
+
+MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
+
+
+@dataclass(frozen=True, eq=False)
+class BankEntry:
+    """The data of one scenario in a bank.
+
+    Attributes:
+        scenario: the scenario as JSON text.
+        draw: index of the random draw that produced it.
+        cost, second_cost, certificate, states, controls, costates: see `Reference`.
+
+    """
+
+    scenario: str
+    draw: int
+    cost: float
+    second_cost: float | None
+    certificate: tuple[float, float, float, float]
+    states: np.ndarray
+    controls: np.ndarray
+    costates: np.ndarray
+
+
+def point_times(horizon: float) -> np.ndarray:
+    """Return the times (N,) at which a bank stores the points of an optimum (s)."""
+    return np.linspace(0.0, horizon, math.ceil(horizon / MAX_POINT_INTERVAL - 1e-6) + 1)
+
+
+def write_bank(
+    path: str | os.PathLike[str],
+    entries: Sequence[BankEntry],
+    *,
+    family: str,
+    seed: int,
+    drawn: int,
+    rejected: Mapping[str, int],
+    software: str,
+) -> None:
+    """Write a bank atomically; the same arguments give the same bytes.
+
+    Args:
+        path: the file.
+        entries: the scenarios with their optima.
+        family, seed, drawn, rejected, software: see `ScenarioBank`.
+
+    Raises:
+        ValueError: the scenarios have different robot models.
+
+    """
+    import h5py
+
+    texts = [entry.scenario.encode() for entry in entries]
+    scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
+    models = sorted({scenario.robot.model for scenario in scenarios})
+    if len(models) > 1:
+        raise ValueError(f"entries: expected one robot model for all scenarios, got {', '.join(models)}")
+    n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
+    columns: dict[str, Any] = {
+        "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
+        "scenario_ends": np.cumsum([len(text) for text in texts]),
+        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(len(scenarios), -1 if scenarios else 11),
+        "fields": np.concatenate([np.empty(0), *(scenario.field for scenario in scenarios)]),
+        "field_ends": np.cumsum([len(scenario.field) for scenario in scenarios]),
+        "draws": [entry.draw for entry in entries],
+        "costs": [entry.cost for entry in entries],
+        "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],
+        "certificates": np.array([entry.certificate for entry in entries]).reshape(-1, 4),
+        "path_ends": np.cumsum([len(entry.states) for entry in entries]),
+        "states": np.concatenate([np.empty((0, n)), *(entry.states for entry in entries)]),
+        "controls": np.concatenate([np.empty((0, m)), *(entry.controls for entry in entries)]),
+        "costates": np.concatenate([np.empty((0, n)), *(entry.costates for entry in entries)]),
+    }
+    arrays = {name: np.asarray(values, dtype=TYPES[name]) for name, values in columns.items()}
+    attributes = {
+        "format": FORMAT,
+        "version": VERSION,
+        "family": family,
+        "seed": seed,
+        "drawn": drawn,
+        "rejected": json.dumps(dict(sorted(rejected.items()))),
+        "software": software,
+    }
+    checksums = {name: digest(array) for name, array in arrays.items()}
+    # Alignment in the file makes the memory-mapped arrays aligned.
+    with (
+        atomic_path(path) as partial,
+        h5py.File(partial, "w", alignment_threshold=1, alignment_interval=64) as file,
+    ):
+        for name, value in attributes.items():
+            file.attrs[name] = value
+        file.attrs["checksums"] = json.dumps({**checksums, "attributes": digest(attribute_bytes(attributes))})
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)

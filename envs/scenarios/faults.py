@@ -1,0 +1,65 @@
+"""Messages of the faults of a scenario: one line with field, expectation and value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from pydantic_core import ErrorDetails
+
+from leapnav.envs.utils.validation import suggestion
+
+MAX_FAULTS = 8  # faults in one message
+# Messages for the types of pydantic's errors.
+EXPECTED = {
+    "greater_than": "expected a number > {gt:g}",
+    "greater_than_equal": "expected a number >= {ge:g}",
+    "less_than_equal": "expected a number <= {le:g}",
+    "finite_number": "expected a finite number",
+    "float_type": "expected a number",
+    "float_parsing": "expected a number",
+    "string_type": "expected text",
+    "literal_error": "expected {expected}",
+    "tuple_type": "expected a list",
+    "model_type": "expected an object",
+    "model_attributes_type": "expected an object",
+}
+
+
+def shorten(value: Any) -> str:
+    """Return a value as text of at most 80 characters."""
+    text = repr(value).replace("\n", " ")
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def one_line(name: Any, faults: list[str]) -> str:
+    """Return all faults as one line: scenario, then field, fault and value of each."""
+    hidden = len(faults) - MAX_FAULTS
+    text = "; ".join(faults[:MAX_FAULTS]) + (f"; and {hidden} more faults" if hidden > 0 else "")
+    return " ".join(f"Scenario {shorten(name)}: {text}".splitlines())  # an unknown key may contain line breaks
+
+
+def fault(details: ErrorDetails, known: Callable[[Sequence[Any]], Iterable[str]], within: tuple[str, ...] = ()) -> str:
+    """Return one fault: field, what is expected, and the value.
+
+    Args:
+        details: the error.
+        known: function from the location of an object in the scenario to the names of its fields.
+        within: location of the object that was validated.
+
+    """
+    location, context, kind = (*within, *details["loc"]), details.get("ctx", {}), details["type"]
+    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location).lstrip(".")
+    if kind == "extra_forbidden":
+        hint = suggestion(location[-1], known(location[:-1]))
+        return f"{path}: unknown field, got {shorten(details['input'])}{hint}"
+    if kind == "missing":
+        return f"{path}: missing"
+    if kind in ("too_long", "tuple_too_long"):
+        message = f"expected {context.get('max_length')} numbers"
+    elif kind == "value_error":
+        message = details["msg"].removeprefix("Value error, ")
+    else:
+        message = EXPECTED.get(kind, details["msg"]).format(**context)
+    # The messages of whole-scenario checks contain field and value.
+    return f"{path}: {message}, got {shorten(details['input'])}" if path else message
