@@ -18,14 +18,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from leapnav.envs import FAMILIES, Unicycle, Scenario, sample_scenario
+from leapnav.envs import FAMILIES, Scenario, Unicycle, sample_scenario
 from leapnav.envs.scenarios.scenario import Circle, Obstacle, Polygon
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import OptimalControlProblem, Trajectory, build_bank, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.transcription.direct import discretise, optimise
 from leapnav.experts.search.ipopt import Transcription
 from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.transcription.direct import discretise, optimise
 
 N_CANDIDATES, N_INTERVALS = 12, 60
 COST_TOLERANCE = 5e-3  # relative; the discretisation error of IPOPT's cost

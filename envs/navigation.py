@@ -273,7 +273,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         """
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        values = check_actions(action, self.action_space.shape)
+        values = check_actions(action, self.settings.model.sizes()[1:])
         self._simulator.step(values.reshape(1, -1), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)

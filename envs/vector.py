@@ -201,7 +201,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """
         if self._choices[0] is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        values = check_actions(actions, self.action_space.shape)
+        values = check_actions(actions, (self.num_envs, self.settings.model.sizes()[1]))
         restarting = self._ended.copy()
         if self.autoreset_mode is AutoresetMode.DISABLED and restarting.any():
             raise gym.error.ResetNeeded(f"robot {int(np.argmax(restarting))}: its episode has ended; reset it first")

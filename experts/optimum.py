@@ -166,17 +166,17 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
 
 
 def find_reached_optimum(
-    scenario: Scenario, pose: Sequence[float] | np.ndarray, cost: float, guess: Trajectory | Extremal | None = None
+    scenario: Scenario, state: Sequence[float] | np.ndarray, cost: float, guess: Trajectory | Extremal | None = None
 ) -> Extremal:
-    """Find the optimum to the pose that an episode has reached, with which the cost of the episode is compared.
+    """Find the optimum to the state that an episode has reached, with which the cost of the episode is compared.
 
     An episode that stops short of the goal, within the tolerances, can cost less than the optimum of the scenario.
-    Multiple shooting from the guess solves the problem with the reached pose as the goal. If it fails, or if the
+    Multiple shooting from the guess solves the problem with the reached state as the goal. If it fails, or if the
     episode costs less than its result (the episode is then in a better path class), the full search follows.
 
     Args:
         scenario: the scenario of the episode.
-        pose: the last pose of the episode: x, y (m), heading (rad; any winding).
+        state: the last state (n,) of the episode: x, y (m), heading (rad; any winding), further states of the robot.
         cost: the cost of the episode.
         guess: the optimum of the scenario; without it the full search is made.
 
@@ -184,12 +184,17 @@ def find_reached_optimum(
         The optimum; without `success` if nothing is certified.
 
     Raises:
-        ScenarioError: the robot is in contact with an obstacle at the pose.
+        ScenarioError: the robot is in contact with an obstacle at the state.
 
     """
-    x, y, heading = (float(value) for value in pose)
-    goal = (x, y, None if scenario.goal[2] is None else math.remainder(heading, 2 * math.pi))
-    reached = scenario.model_copy(update={"goal": goal})
+    x, y, heading, *motion = (float(value) for value in state)
+    update: dict[str, Any] = {
+        "goal": (x, y, None if scenario.goal[2] is None else math.remainder(heading, 2 * math.pi))
+    }
+    if motion:  # states that are free at the goal stay free
+        fixed = zip(motion, scenario.goal_state[3:], strict=True)
+        update["goal_motion"] = tuple(None if goal is None else value for value, goal in fixed)
+    reached = scenario.model_copy(update=update)
     followed = None if guess is None else solve(reached, "multiple_shooting", guess=guess)
     if followed is not None and followed.success and followed.cost <= cost:
         return followed

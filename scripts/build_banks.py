@@ -17,12 +17,19 @@ from leapnav.experts import build_bank
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
 # Number of scenarios, and seed. Different seeds give independent scenarios, so no scenario is in both splits.
 SPLITS = {"train": (400, 0), "test": (200, 1)}
+# Robots besides the unicycle: models, families, and number of scenarios of each split.
+ROBOTS, ROBOT_FAMILIES, ROBOT_COUNT = ("car", "dynamic_unicycle"), ("clutter", "rooms"), 200
 
 
 def build(directory: Path, workers: int) -> None:
     for family in FAMILIES:
         for split, (count, seed) in SPLITS.items():
             build_bank(family, count, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
+    for robot in ROBOTS:
+        for family in ROBOT_FAMILIES:
+            for split, (_, seed) in SPLITS.items():
+                path = directory / f"{robot}-{family}-{split}.bank"
+                build_bank(family, ROBOT_COUNT, path, robot=robot, seed=seed, workers=workers)
 
 
 def check(workers: int) -> int:

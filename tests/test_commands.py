@@ -22,7 +22,7 @@ def test_watch_films_the_policy(tmp_path, capsys, monkeypatch):
     arguments = ["watch", "--family", "rooms", "--index", "11", "--episodes", "2", "--video", str(video)]
     assert main(arguments) == 0
     first, second, last = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"rooms-1-11: success after [\d.]+ s, cost [\d.]+, optimum for the pose reached [\d.]+", first)
+    assert re.fullmatch(r"rooms-1-11: success after [\d.]+ s, cost [\d.]+, optimum for the state reached [\d.]+", first)
     assert second.startswith("rooms-1-12: success")
     assert last == f"wrote {video}"
     frames = iio.imread(video)

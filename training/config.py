@@ -20,6 +20,8 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(
 
 # A literal, so that the command line shows and completes the choices; a test compares it with `FAMILIES`.
 FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
+# A literal, so that the help texts show the choices; a robot registered by the user is text as well.
+RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 
@@ -108,6 +110,8 @@ class RunConfig:
     """Run directory: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
     family: FamilyName = "clutter"
     """Family of the scenarios."""
+    robot: RobotName = "unicycle"
+    """Model of the robot."""
     seed: int = 0
     """Random seed."""
     resume: bool = False
@@ -123,7 +127,8 @@ class RunConfig:
     @property
     def environment(self) -> dict[str, Any]:
         """Arguments of the environment that determine the observation."""
-        return {"lidar_beams": self.lidar_beams}
+        robot = {} if self.robot == "unicycle" else {"robot": self.robot}
+        return {"lidar_beams": self.lidar_beams, **robot}
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, **changes: Any) -> Self:

@@ -132,7 +132,7 @@ class RobotModel(Frozen):
     drive: ClassVar[int] = GENERAL
     is_kinematic: ClassVar[bool] = False
 
-    model: str
+    model: Any = ""  # a literal in each model
     radius: Positive = 0.25
     footprint: Annotated[tuple[Disc, ...], Field(min_length=1)] | None = None
 

@@ -87,11 +87,11 @@ class DynamicUnicycle(RobotModel):
     def dynamics(cls) -> Dynamics:  # noqa: D102 (the interface is documented in the base class)
         import sympy as sp
 
-        x, y, theta, v, omega = state = sp.symbols("x y theta v omega")
+        x, y, theta, v, omega = sp.symbols("x y theta v omega")
         weights = speed_weight, turn_weight = sp.symbols("speed_weight turn_weight")
         labels = ("$v$ (m/s)", r"$\omega$ (rad/s)", r"$\dot v$ (m/s$^2$)", r"$\dot\omega$ (rad/s$^2$)")
         return Dynamics(
-            state=state,
+            state=(x, y, theta, v, omega),
             drift=(v * sp.cos(theta), v * sp.sin(theta), omega, 0, 0),
             fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
             parameters=weights,

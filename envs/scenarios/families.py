@@ -146,8 +146,8 @@ def sample_scenario(
     Args:
         family: one of `FAMILIES`, or "all" to sample the family, too.
         seed: an integer, or a random generator.
-        robot: name of a robot model, a dict of its fields with `model`, or a robot. Obstacles and poses are the same for
-            robots with the same footprint.
+        robot: name of a robot model, a dict of its fields with `model`, or a robot. Robots with the same footprint
+            get the same obstacles and poses.
 
     Raises:
         ValueError: the family or the robot is invalid.

@@ -72,7 +72,9 @@ class ScenarioSource:
         given_by = (
             self.scenario.robot if self.scenario is not None else self.bank.robot if self.bank is not None else None
         )
-        if robot is not None and given_by is not None and given_by != chosen:
+        # A name selects the model only.
+        agrees = given_by is None or (given_by.model == robot if isinstance(robot, str) else given_by == chosen)
+        if robot is not None and not agrees:
             place = "scenario" if self.scenario is not None else "bank"
             raise ValueError(f"robot: expected that of the {place}, {given_by!r}, got {chosen!r}")
         self.robot: RobotModel = given_by or chosen

@@ -56,7 +56,7 @@ def exponential(x):
     fastmath={"contract", "nsz", "reassoc"},
 )
 def grid_proximity(x, y, radius, field):
-    """Return, for a disc of a radius (m), (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy) of the obstacles in the grid, without the walls."""
+    """Return the proximity cost of a disc without the walls, from the obstacles in the grid; as `disc_proximity`."""
     k, steepness = field[0], 1.0 / field[1]
     grid = np.uint64(field[GRID])
     columns, lines = int(field[grid + 3]), int(field[grid + 4])

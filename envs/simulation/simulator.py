@@ -153,7 +153,7 @@ class BatchSimulator:
             wider = np.zeros((len(self.fields), 16 * math.ceil(longest / 16) + 8))
             wider[:, : self.fields.shape[1]] = self.fields
             self.fields, self._record = wider, None
-        for i, choice, field in zip(indices.tolist(), choices, fields, strict=True):
+        for i, field in zip(indices.tolist(), fields, strict=True):
             self.fields[i, : len(field)] = field
             self._lengths[i] = len(field)
         m = self._controls.shape[1]

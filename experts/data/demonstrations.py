@@ -239,9 +239,9 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: s
             author="leapnav",
             author_email="",
             code_permalink="",
-            description="Certified optima driven in the environment. Infos: state (x, y, heading, further "
-            "states of the robot), control, executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's scenario is "
-            "options['scenario'] as JSON. Reference scores: random actions and the optimum.",
+            description="Certified optima driven in the environment. Infos: state (x, y, heading, further states of "
+            "the robot), control, executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's "
+            "scenario is options['scenario'] as JSON. Reference scores: random actions and the optimum.",
             requirements=[f"leapnav=={leapnav.__version__}"],
         )
         scores = {"ref_min_score": _random_score(env, scenarios), "ref_max_score": float(np.mean(returns))}

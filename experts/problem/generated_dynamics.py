@@ -77,7 +77,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
     rename = dict(zip((*system.state, *system.parameters), (*q, *parameters), strict=True))
     fields = [[sp.sympify(e).xreplace(rename) for e in column] for column in system.fields]
     rates = [
-        sp.sympify(a).xreplace(rename) + sum(u[j] * fields[j][i] for j in range(m)) for i, a in enumerate(system.drift)
+        sp.sympify(a).xreplace(rename) + sp.Add(*(u[j] * fields[j][i] for j in range(m)))
+        for i, a in enumerate(system.drift)
     ]
     weighted = sum((p * f for p, f in zip(lam, rates, strict=True)), sp.Integer(0))
     cost = sp.sympify(state_cost).xreplace(rename)
@@ -91,7 +92,7 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
         for i in range(len(at)):
             gradient[at[i]] += phi[1 + i]
         for i, pair in enumerate(combinations_with_replacement(at, 2)):
-            hessian[tuple(sorted(pair))] += phi[1 + len(at) + i]
+            hessian[min(pair), max(pair)] += phi[1 + len(at) + i]
 
     unpack_q = "    " + "; ".join(f"q{i} = q[{i}]" for i in range(n))
     unpack_u = "    " + "; ".join(f"u{j} = u[{j}]" for j in range(m))

@@ -25,8 +25,8 @@ GENERATOR_VERSION = "5"  # part of the file name; to be increased whenever the g
 IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.numerics.flow"
 
 
-# What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or that
-# of the discs of a footprint.
+# What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or
+# that of the discs of a footprint.
 Obstacles = Literal["none", "disc", "footprint"]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from leapnav.envs.robots import Unicycle
@@ -34,8 +36,11 @@ class Lifting:
         robot = scenario.robot
         if not robot.is_kinematic:
             speed, turn_rate = (min(limit, MAX_LIMIT) for limit in robot.speed_limits())
-            body = {"radius": robot.radius} if robot.footprint is None else {"footprint": robot.footprint}
-            unicycle = Unicycle(**body, max_speed=speed, max_turn_rate=turn_rate)
+            limits: dict[str, Any] = {"max_speed": speed, "max_turn_rate": turn_rate}
+            if robot.footprint is None:
+                unicycle = Unicycle(radius=robot.radius, **limits)
+            else:
+                unicycle = Unicycle(footprint=robot.footprint, **limits)
             update = {"robot": unicycle, "start_motion": None, "goal_motion": None}
             self._companion = OptimalControlProblem.from_scenario(scenario.model_copy(update=update))
 

@@ -1,12 +1,12 @@
 """Direct transcription of a scenario's problem: local optima of a discretisation, in 0.2 to 2 ms each.
 
 The controls are constant on each interval, and the state cost is integrated by the trapezoidal rule. The unicycle moves
-along exact circular arcs (`arcs`), other robots by steps of the midpoint rule (`midpoint`). The discretised problem is solved by sequential quadratic programming. Each step is
-computed by a Riccati recursion, linear in the number of intervals, with multipliers for the end conditions (A. E.
-Bryson and Y.-C. Ho, Applied Optimal Control, 1975, section 5.3). The Hessian is exact, and shifted until the recursion
-shows that it is positive definite, so that steps descend and leave saddle points. The line search uses the augmented
-Lagrangian, which does not stall on curved constraints as a penalty function does (J. Nocedal and S. J. Wright,
-Numerical Optimization, 2nd ed., ch. 15, 17 and 18).
+along exact circular arcs (`arcs`), other robots by steps of the midpoint rule (`midpoint`). The discretised problem is
+solved by sequential quadratic programming. Each step is computed by a Riccati recursion, linear in the number of
+intervals, with multipliers for the end conditions (A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975, section
+5.3). The Hessian is exact, and shifted until the recursion shows that it is positive definite, so that steps descend
+and leave saddle points. The line search uses the augmented Lagrangian, which does not stall on curved constraints as a
+penalty function does (J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., ch. 15, 17 and 18).
 
 The result is not an extremal: the error of its cost is quadratic in the interval, about 1e-3 by default. It ranks paths
 and identifies duplicates, and its multipliers are costates from which multiple shooting converges in three or four
@@ -116,7 +116,7 @@ def optimise(problem: OptimalControlProblem, guess: DirectPath, speed_weight: fl
     states[0] = arrays.start
     h = np.diff(guess.times)
     costates = guess.costates / speed_weight
-    within_limits = True
+    converged, cost, violation, within_limits = False, math.inf, math.inf, True
     on_arcs = _on_arcs(problem)
     if on_arcs is not None:
         turn_weight, limits, wheels = on_arcs

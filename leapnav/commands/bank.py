@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from leapnav.commands.options import Family
+from leapnav.commands.options import Family, Robot
 from leapnav.durations import SECONDS_PER_SECOND_OPINION, announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -31,6 +31,8 @@ class Build:
     """Output file of the bank."""
     family: Family = "clutter"
     """Family of the scenarios."""
+    robot: Robot = "unicycle"
+    """Model of the robot."""
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
@@ -46,7 +48,7 @@ class Build:
         from leapnav.experts.data.banks import build_bank
 
         announce(of_scenarios(self.family, self.count, self.workers), "finding the optima")
-        bank = build_bank(self.family, self.count, self.out, seed=self.seed, workers=self.workers)
+        bank = build_bank(self.family, self.count, self.out, robot=self.robot, seed=self.seed, workers=self.workers)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         print(f"wrote {self.out}: {len(bank)} of {bank.drawn} sampled scenarios{f' ({rejected})' if rejected else ''}")
         summary = {"scenarios": len(bank), "drawn": bank.drawn, "rejected": dict(bank.rejected)}

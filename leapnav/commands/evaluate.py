@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.commands.options import EnvironmentOption, FamilyOrAll, parse_environment
+from leapnav.commands.options import EnvironmentOption, FamilyOrAll, Robot, parse_environment
 from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
@@ -27,6 +27,8 @@ class Evaluate:
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
     family: FamilyOrAll = "clutter"
     """Family of the scenarios."""
+    robot: Robot = "unicycle"
+    """Model of the robot of the included banks."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None
@@ -87,4 +89,4 @@ class Evaluate:
         if self.bank is not None:
             return [ScenarioBank(self.bank)]
         families = FAMILIES if self.family == ALL else (self.family,)
-        return [ScenarioBank.shipped(family, self.split) for family in families]
+        return [ScenarioBank.shipped(family, self.split, self.robot) for family in families]

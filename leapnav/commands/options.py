@@ -6,11 +6,12 @@ import json
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from leapnav.training.config import FamilyName
+from leapnav.training.config import FamilyName, RobotName
 
 # Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
 Family = Literal["open", "clutter", "polygons", "rooms", "slalom"]
 FamilyOrAll = FamilyName
+Robot = RobotName
 PolicyName = Literal["expert", "go-to-goal", "random", "open", "clutter", "polygons", "rooms", "slalom"] | str
 EnvironmentOption = tuple[str, ...]
 

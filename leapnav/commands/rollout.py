@@ -6,7 +6,7 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from leapnav.commands.options import FamilyOrAll
+from leapnav.commands.options import FamilyOrAll, Robot
 from leapnav.durations import announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -25,6 +25,8 @@ class Rollout:
     """Output directory of the dataset."""
     family: FamilyOrAll = "clutter"
     """Family of the scenarios."""
+    robot: Robot = "unicycle"
+    """Model of the robot."""
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000
@@ -63,6 +65,7 @@ class Rollout:
             self.family,
             self.count,
             self.out,
+            robot=self.robot,
             seed=self.seed,
             recoveries=self.recoveries,
             noise=self.noise,
@@ -75,7 +78,8 @@ class Rollout:
             f"({summary.unsolved} scenarios without a certified optimum and "
             f"{summary.failed_replays} failed replays left out)"
         )
-        print(f"load it with minari.load_dataset({dataset_id(self.family)!r}) and MINARI_DATASETS_PATH={self.out}")
+        name = dataset_id(self.family, self.robot)
+        print(f"load it with minari.load_dataset({name!r}) and MINARI_DATASETS_PATH={self.out}")
         write_json(asdict(summary), self.json)
         return 0
 

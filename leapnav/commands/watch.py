@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from leapnav.commands.options import Family, PolicyName
+from leapnav.commands.options import Family, PolicyName, Robot
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ class Watch:
     (.zip)."""
     family: Family = "clutter"
     """Family of the scenarios."""
+    robot: Robot = "unicycle"
+    """Model of the robot, for the expert and the baselines; a learned policy has its own."""
     split: Literal["train", "test", "fresh"] = "test"
     """Split of the included banks, or "fresh" for newly sampled scenarios."""
     index: int | None = None
@@ -96,7 +98,7 @@ class Watch:
         from leapnav.training.policies.files import policy_environment
         from leapnav.training.scoring.policy_specs import BASELINES
 
-        return {} if self.policy in BASELINES else policy_environment(self.policy)
+        return {"robot": self.robot} if self.policy in BASELINES else policy_environment(self.policy)
 
     def _make(self, render_mode: str) -> gym.Env[Any, Any]:
         import gymnasium as gym
@@ -135,10 +137,10 @@ class Watch:
             measured: dict[str, Any] = {name: float(info[name]) for name in ("time", "cost")}
             text = f"{scenario}: {result} after {info['time']:.1f} s, cost {info['cost']:.3f}"
             if info["is_success"]:
-                optimum = find_reached_optimum(inner.scenario, info["pose"], measured["cost"])
+                optimum = find_reached_optimum(inner.scenario, inner.state, measured["cost"])
                 measured["optimal_cost"] = optimum.cost if optimum.success else None
                 if optimum.success:
-                    text += f", optimum for the pose reached {optimum.cost:.3f}"
+                    text += f", optimum for the state reached {optimum.cost:.3f}"
             print(text)
             results.append({"scenario": scenario, "result": result, **measured, "reference_cost": reference})
         write_json(results, self.json)

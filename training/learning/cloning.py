@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from torch.optim.lr_scheduler import LambdaLR
 
-from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.envs.simulation.observations import GOAL_ENTRIES, motion_entries
 from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -27,6 +28,7 @@ from leapnav.envs.utils.validation import (
     check_positive,
 )
 from leapnav.experts.data.demonstrations import Demonstration
+from leapnav.experts.problem.switching import switching_functions
 from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.symmetries import mirror, time_reverse
@@ -128,8 +130,14 @@ class Cloning:
     def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig, stream: int = 0) -> None:
         check_cloning(config)
         check_observations(policy, dataset)
-        beams = dataset.observations.shape[1] - GOAL_ENTRIES
-        if config.augment and beams % 2:
+        model = dataset.settings.model
+        beams = dataset.observations.shape[1] - GOAL_ENTRIES - motion_entries(dataset.settings)
+        can_reverse = model.reversal is not None and dataset.is_reversible
+        self._symmetries = [
+            *([partial(mirror, model=model)] if model.mirror is not None else []),
+            *([partial(time_reverse, model=model)] if can_reverse else []),
+        ]
+        if config.augment and can_reverse and beams % 2:
             raise ValueError(f"augment: expected an even number of lidar beams, got {beams}; set augment=False")
         self.config, self.losses = config, []
         self._policy = policy
@@ -180,7 +188,9 @@ class Cloning:
         self._policy.set_training_mode(True)
         order = th.randperm(len(self._train), generator=self._rng)
         for chosen in order.split(self.batch_size):
-            loss = self._loss(self._train.augmented(chosen, self._rng) if config.augment else self._train.at(chosen))
+            loss = self._loss(
+                self._train.augmented(chosen, self._symmetries, self._rng) if config.augment else self._train.at(chosen)
+            )
             if not th.isfinite(loss):
                 raise ValueError(
                     f"learning_rate: the fit diverged in epoch {len(self.losses) + 1} at {config.learning_rate!r}; "
@@ -272,12 +282,14 @@ class _Samples:
     def batches(self, size: int) -> list[tuple[th.Tensor, ...]]:
         return list(zip(*(column.split(size) for column in self.columns), strict=True))
 
-    def augmented(self, chosen: th.Tensor, rng: th.Generator) -> tuple[th.Tensor, ...]:
-        """Return samples after a random one of the four combinations of mirroring and time reversal."""
+    def augmented(
+        self, chosen: th.Tensor, symmetries: Sequence[Callable[..., tuple[th.Tensor, th.Tensor]]], rng: th.Generator
+    ) -> tuple[th.Tensor, ...]:
+        """Return samples after a random combination of the robot's symmetries."""
         observations, actions, slopes, weights = self.at(chosen)
-        combination = int(th.randint(4, (1,), generator=rng))
-        for bit, transform in ((1, mirror), (2, time_reverse)):
-            if combination & bit:
+        combination = int(th.randint(2 ** len(symmetries), (1,), generator=rng))
+        for number, transform in enumerate(symmetries):
+            if combination & 2**number:
                 _, slopes = transform(observations, slopes)  # the slopes change sign with the actions
                 observations, actions = transform(observations, actions)
         return observations, actions, slopes, weights
@@ -311,19 +323,17 @@ def _hamiltonian_loss(error: th.Tensor, slopes: th.Tensor, weights: th.Tensor) -
     is the cost of moving away from the limit; an action beyond the limit is not rewarded.
 
     Args:
-        error (B, 2): action minus the expert's action.
-        slopes (B, 2): p + r u*, per unit of the action.
-        weights (B, 2): r, per square unit of the action.
+        error (B, m): action minus the expert's action.
+        slopes (B, m): p + r u*, per unit of the action.
+        weights (B, m): r, per square unit of the action.
 
     """
     return 0.5 * weights * error.square() + functional.relu(slopes * error)
 
 
 def action_slopes(dataset: Dataset) -> np.ndarray:
-    """dH/du (N, 2) at the expert's actions, per unit of the action; zero for actions that no limit bounds."""
-    heading = dataset.states[:, 2]
-    costates = dataset.costates
-    p = np.stack([np.cos(heading) * costates[:, 0] + np.sin(heading) * costates[:, 1], costates[:, 2]], axis=1)
+    """dH/du (N, m) at the expert's actions, per unit of the action; zero for actions that no limit bounds."""
+    p = switching_functions(dataset.settings.model, dataset.states, dataset.costates, dataset.parameters)
     slopes = (p + dataset.weights * dataset.limits * dataset.actions) * dataset.limits
     # The expert's action belongs to the middle of the control period, the costate to its beginning. Inside the limits
     # the difference of the two is not meaningful, and at a limit dH/du must point outwards.
@@ -332,12 +342,12 @@ def action_slopes(dataset: Dataset) -> np.ndarray:
 
 
 def _scale(samples: _Samples, loss: str) -> th.Tensor:
-    """Factors (2,) of the components of the loss with which the mean action has the loss 1."""
+    """Factors (m,) of the components of the loss with which the mean action has the loss 1."""
     _, actions, slopes, weights = samples.columns
     error = actions.mean(dim=0) - actions
     if loss == "action":
         return 0.5 / _action_loss(error).mean(dim=0).clamp(min=1e-6)
-    return (1.0 / _hamiltonian_loss(error, slopes, weights).sum(dim=1).mean()).clamp(max=1e6).repeat(2)
+    return (1.0 / _hamiltonian_loss(error, slopes, weights).sum(dim=1).mean()).clamp(max=1e6).repeat(actions.shape[1])
 
 
 def _split(dataset: Dataset, fraction: float, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -30,6 +30,7 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.progress import advance, progress_bar, stop_early
 from leapnav.envs.utils.validation import check_at_least, check_not_negative, check_positive
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
+from leapnav.experts.data.demonstrations import state_of
 from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.learning.cloning import Cloning, check_observations
 from leapnav.training.learning.dataset import Dataset
@@ -212,8 +213,8 @@ class DAgger:
         driving = f"{name}: driving"
         with progress_bar(total=self.config.max_failures, label=driving, unit="failures", show=progress) as bar:
             while failures < self.config.max_failures and len(episodes) < self.config.max_episodes:
-                for path, pose in zip(paths, self._venv.venv.poses, strict=True):
-                    path.append(pose)
+                for path, state in zip(paths, self._venv.venv.states, strict=True):
+                    path.append(state)
                 actions, _ = self._policy.predict(observations, deterministic=True)
                 stepped, _, dones, infos = self._venv.step(actions)
                 observations = np.asarray(stepped)
@@ -266,17 +267,17 @@ class DAgger:
 
 @dataclass(frozen=True)
 class _Episode:
-    """An episode of the learner: its scenario, the poses (K, 3) before its K actions, and its outcome."""
+    """An episode of the learner: its scenario, the states (K, n) before its K actions, and its outcome."""
 
     scenario: Scenario
-    poses: np.ndarray
+    states: np.ndarray
     success: bool
     collision: bool
 
 
 def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> list[Scenario]:
     """Return scenarios for the rest of an episode, each from a takeover, with decreasing horizons."""
-    end, horizon = len(episode.poses) * period, episode.scenario.horizon
+    end, horizon = len(episode.states) * period, episode.scenario.horizon
     if episode.success:
         times = rng.uniform(0.0, end, 1)
     elif episode.collision:
@@ -286,10 +287,13 @@ def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> li
         times = np.sort(rng.uniform(0.0, end, len(TAKEOVER_TIMES)))
     steps = np.unique((times / period).round().astype(int))
     scenarios = []
-    for step in steps[(steps > 0) & (steps < len(episode.poses))].tolist():
+    for step in steps[(steps > 0) & (steps < len(episode.states))].tolist():
         if horizon - step * period < MIN_TIME_LEFT:
             break
-        rest = {"start": tuple(episode.poses[step].tolist()), "horizon": round(horizon - step * period, 9)}
+        x, y, heading, *motion = episode.states[step].tolist()
+        rest: dict[str, Any] = {"start": (x, y, heading), "horizon": round(horizon - step * period, 9)}
+        if motion:
+            rest["start_motion"] = tuple(motion)
         scenarios.append(episode.scenario.model_copy(update=rest))
     return scenarios
 
@@ -325,7 +329,7 @@ def _demonstrated(env: NavigateEnv, expert: ExpertPolicy, scenario: Scenario, le
         cost, costate = expert.labels()
         if not np.isfinite(cost[0]):  # the goal cannot be reached any more, so the action is not a label
             return None
-        rows.append((observation, action, -cost[0], costate[0], info["pose"], info["time"], action))
+        rows.append((observation, action, -cost[0], costate[0], state_of(info), info["time"], action))
         return action
 
     try:
@@ -349,10 +353,12 @@ def _demonstrated(env: NavigateEnv, expert: ExpertPolicy, scenario: Scenario, le
 
 
 def _check_environment(settings: EnvironmentSettings) -> None:
-    """Raise ValueError unless an episode can be continued from a pose and a time alone."""
+    """Raise ValueError unless an episode can be continued from a state and a time alone."""
     for name, feature in _UNSUPPORTED.items():
         if getattr(settings, name):
-            raise ValueError(f"venv: expected an environment without {feature}; the expert starts from poses alone")
+            raise ValueError(
+                f"venv: expected an environment without {feature}; the expert starts from states of the robot alone"
+            )
 
 
 def check_dagger(config: DAggerConfig) -> None:

@@ -13,7 +13,8 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.robots import RobotModel
+from leapnav.envs.scenarios.scenario import Cost, Scenario, check_robot
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.files import atomic_path
@@ -21,7 +22,7 @@ from leapnav.experts.data.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Dem
 
 FORMAT = 2  # version of the file format
 # Arguments of the environment that select the scenarios; the meaning of an observation does not depend on them.
-SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario")
+SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario", "robot")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +31,12 @@ class Dataset:
 
     Attributes:
         observations (N, d): float32.
-        actions (N, 2): the expert's actions, float32, in [-1, 1].
+        actions (N, m): the expert's actions, float32, in [-1, 1].
         returns (N,): expert's return from the sample to the end of the episode (-cost-to-go); NaN if unknown.
-        costates (N, 3): gradient of the cost-to-go with respect to x, y and heading; NaN if unknown.
-        states (N, 3): x, y (m), heading (rad).
+        costates (N, n): gradient of the cost-to-go with respect to the state; NaN if unknown.
+        states (N, n): x, y (m), heading (rad) and further states of the robot.
         times (N,): time since the start of the episode (s).
-        executed (N, 2): the actions that were executed, float32; NaN if unknown.
+        executed (N, m): the actions that were executed, float32; NaN if unknown.
         rewards (N,): the rewards of the executed actions; NaN if unknown.
         episodes (N,): int64, index of the sample's scenario in `scenarios`.
         scenarios: the scenarios of the episodes, as JSON.
@@ -62,7 +63,9 @@ class Dataset:
         count = len(self.observations)
         if count == 0:
             raise ValueError("dataset: expected at least one sample, got none")
-        for name, shape in _SHAPES.items():
+        n, m = self.settings.model.sizes()
+        for name, kind in _SHAPES.items():
+            shape = {"scalar": (), "state": (n,), "control": (m,)}[kind]
             found = getattr(self, name).shape
             if found != (count, *shape):
                 raise ValueError(f"dataset: {name}: expected the shape {(count, *shape)}, got {found}")
@@ -105,13 +108,28 @@ class Dataset:
 
     @property
     def limits(self) -> np.ndarray:
-        """Maximum speed (m/s) and turn rate (rad/s) of each sample's robot (N, 2), the controls of the action 1."""
-        return self._per_sample([[fields["robot"][name] for name in _LIMITS] for fields in self._scenario_fields])
+        """Limits (N, m) of the controls of each sample's robot, the controls of the action 1."""
+        return self._per_sample([robot.limits() for robot, _ in self._robots])
 
     @property
     def weights(self) -> np.ndarray:
-        """Cost weights of speed and turn rate of each sample's scenario (N, 2)."""
-        return self._per_sample([[fields["cost"][name] for name in _WEIGHTS] for fields in self._scenario_fields])
+        """Cost weights (N, m) of the controls of each sample's scenario."""
+        return self._per_sample([robot.control_weight(cost) for robot, cost in self._robots])
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """Parameters (N, k) of the dynamics of each sample's robot."""
+        return self._per_sample([robot.parameters(cost) for robot, cost in self._robots])
+
+    @property
+    def is_reversible(self) -> bool:
+        """Whether all robots have footprints that a rotation by 180 degrees does not change."""
+        return all(bool((robot.discs()[:, 0] == 0.0).all()) for robot, _ in self._robots)
+
+    @cached_property
+    def _robots(self) -> list[tuple[RobotModel, Cost]]:
+        """The robot and the cost of each of `scenarios`."""
+        return [(check_robot(fields["robot"]), Cost(**fields["cost"])) for fields in self._scenario_fields]
 
     @cached_property
     def course_texts(self) -> list[str]:
@@ -201,7 +219,8 @@ class Dataset:
         if not scenarios:
             raise ValueError("dataset: expected at least one episode, got none")
         arrays: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
-        return cls(**arrays, scenarios=tuple(scenarios))
+        robot = json.loads(scenarios[0])["robot"]["model"]
+        return cls(**arrays, scenarios=tuple(scenarios), settings=EnvironmentSettings(robot=robot))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the dataset to a file, atomically."""
@@ -235,17 +254,16 @@ class Dataset:
 
 
 _SHAPES = {
-    "actions": (2,),
-    "returns": (),
-    "costates": (3,),
-    "states": (3,),
-    "times": (),
-    "executed": (2,),
-    "rewards": (),
-    "episodes": (),
+    "actions": "control",
+    "returns": "scalar",
+    "costates": "state",
+    "states": "state",
+    "times": "scalar",
+    "executed": "control",
+    "rewards": "scalar",
+    "episodes": "scalar",
 }
 _COLUMNS = ("observations", *_SHAPES)
-_LIMITS, _WEIGHTS = ("max_speed", "max_turn_rate"), ("speed_weight", "turn_weight")
 _REQUIRED_INFOS = {"state", "costate", "cost_to_go", "executed_action"}
 
 

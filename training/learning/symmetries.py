@@ -1,14 +1,16 @@
 """Symmetries of the navigation task, as transformations of observations and actions.
 
-The robot is a disc, and the cost does not depend on the sign of the controls. Hence a mirrored optimum is optimal in
-the mirrored scenario. An optimum with all headings rotated by 180 degrees is optimal in the scenario with the start and
-goal headings rotated by 180 degrees: the robot follows the same path with the opposite driving mode.
+The cost does not depend on the sign of the controls. Hence a mirrored optimum is optimal in the mirrored scenario, if
+the robot's model has this symmetry (`RobotModel.mirror`). An optimum with all headings rotated by 180 degrees is
+optimal in the scenario with the start and goal headings rotated by 180 degrees, if the model has that symmetry
+(`RobotModel.reversal`): the robot follows the same path with the opposite driving mode.
 """
 
 from __future__ import annotations
 
 import torch as th
 
+from leapnav.envs.robots import RobotModel, Symmetry, Unicycle
 from leapnav.envs.simulation.observations import GOAL_ENTRIES
 
 # Signs of the first entries of the observation (see the docstring of the environment) under each symmetry.
@@ -16,44 +18,66 @@ _MIRROR_SIGNS = th.tensor([1.0, -1, 1, -1, 1, 1, -1, 1, -1])
 _TIME_REVERSE_SIGNS = th.tensor([-1.0, -1, 1, 1, 1, -1, -1, 1, 1])
 
 
-def mirror(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def mirror(
+    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle
+) -> tuple[th.Tensor, th.Tensor]:
     """Exchange left and right.
 
     Args:
         observations (B, d): observations with lidar ranges.
-        actions (B, 2): actions.
+        actions (B, m): actions.
+        model: the robot's model.
 
     Returns:
         The mirrored observations and actions.
 
+    Raises:
+        ValueError: the model has no mirror symmetry.
+
     """
-    ranges = observations[:, GOAL_ENTRIES:]
+    symmetry = _require(model, "mirror", model.mirror)
+    first = GOAL_ENTRIES + len(symmetry.motion)
+    ranges = observations[:, first:]
     ranges = th.cat([ranges[:, :1], ranges[:, 1:].flip(1)], dim=1)
-    return _transformed(observations, _MIRROR_SIGNS, ranges), actions * th.tensor([1.0, -1.0], device=actions.device)
+    return _transformed(observations, actions, _MIRROR_SIGNS, symmetry, ranges)
 
 
-def time_reverse(observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def time_reverse(
+    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle
+) -> tuple[th.Tensor, th.Tensor]:
     """Exchange forwards and backwards: rotate the robot and the goal heading by 180 degrees, and negate the speed.
 
     Args:
         observations (B, d): observations with an even number of lidar ranges.
-        actions (B, 2): actions.
+        actions (B, m): actions.
+        model: the robot's model.
 
     Returns:
         The transformed observations and actions.
 
     Raises:
-        ValueError: the number of lidar beams is odd.
+        ValueError: the number of lidar beams is odd, or the model has no such symmetry.
 
     """
-    ranges = observations[:, GOAL_ENTRIES:]
+    symmetry = _require(model, "reversal", model.reversal)
+    ranges = observations[:, GOAL_ENTRIES + len(symmetry.motion) :]
     if ranges.shape[1] % 2:
         raise ValueError(f"time reversal needs an even number of lidar beams, got {ranges.shape[1]}")
     ranges = ranges.roll(ranges.shape[1] // 2, dims=1)
-    signs = th.tensor([-1.0, 1.0], device=actions.device)
-    return _transformed(observations, _TIME_REVERSE_SIGNS, ranges), actions * signs
+    return _transformed(observations, actions, _TIME_REVERSE_SIGNS, symmetry, ranges)
 
 
-def _transformed(observations: th.Tensor, signs: th.Tensor, ranges: th.Tensor) -> th.Tensor:
-    """Return the observations with other signs of the first entries and other lidar ranges."""
-    return th.cat([observations[:, :GOAL_ENTRIES] * signs.to(ranges.device), ranges], dim=1)
+def _require(model: type[RobotModel], name: str, symmetry: Symmetry | None) -> Symmetry:
+    if symmetry is None:
+        raise ValueError(f"{name}: the robot {model.name()!r} does not have this symmetry")
+    return symmetry
+
+
+def _transformed(
+    observations: th.Tensor, actions: th.Tensor, signs: th.Tensor, symmetry: Symmetry, ranges: th.Tensor
+) -> tuple[th.Tensor, th.Tensor]:
+    """Return observations with other signs of the first entries and other lidar ranges, and transformed actions."""
+    device = observations.device
+    signs = th.cat([signs, th.tensor(symmetry.motion, dtype=signs.dtype)]).to(device)
+    matrix = th.tensor(symmetry.controls, dtype=actions.dtype, device=device)
+    return th.cat([observations[:, : len(signs)] * signs, ranges], dim=1), actions @ matrix.T

@@ -35,7 +35,7 @@ from leapnav.training.threads import limit_threads
 
 # Standard deviations (m, m, rad) of the random state offsets over which the slope of the cost-to-go is fitted: small
 # compared with the curvature radius of the cost-to-go, large compared with the discontinuities of the lidar ranges.
-STATE_OFFSET = np.array([0.02, 0.02, 0.02])
+STATE_OFFSET = 0.02
 # Slopes above this multiple of the median are left out, because the costate grows without bound towards the horizon.
 MAX_RELATIVE_SLOPE = 10.0
 ACTION_NOISE = 0.5  # standard deviation of the actions around the expert's at which a Q function is fitted
@@ -270,7 +270,7 @@ class _Slopes:
     ) -> None:
         chosen = np.sort(rng.permutation(len(dataset))[:count])
         subset = dataset[chosen]
-        step = rng.normal(size=(len(subset), 3)) * STATE_OFFSET
+        step = rng.normal(size=subset.states.shape) * STATE_OFFSET
         parsed = {episode: Scenario.from_json(dataset.scenarios[episode]) for episode in np.unique(subset.episodes)}
         scenarios = [parsed[episode] for episode in subset.episodes.tolist()]
         observer = Observer(dataset.settings)

@@ -49,8 +49,9 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     return actor(observations)
 
 
-def set_noise(policy: BasePolicy, std: th.Tensor) -> None:
-    """Set the standard deviation (m,) of a stochastic policy's actions, independent of the observation."""
+def set_noise(policy: BasePolicy, std: th.Tensor | float) -> None:
+    """Set the standard deviation, (m,) or a number, of a stochastic policy's actions for all observations."""
+    std = th.as_tensor(std)
     with th.no_grad():
         if isinstance(policy, ActorCriticPolicy):
             policy.log_std.copy_(std.log())

@@ -38,7 +38,7 @@ class RandomPolicy:
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return one random action for each observation."""
         count = np.asarray(observation).shape[:-1]
-        return self._rng.uniform(self._low, self._high, (*count, 2)).astype(np.float32), state
+        return self._rng.uniform(self._low, self._high, (*count, *self._low.shape)).astype(np.float32), state
 
 
 class GoToGoal:
@@ -60,6 +60,9 @@ class GoToGoal:
 
     def __init__(self, env: Any) -> None:
         self._envs = unwrap(env)
+        robot = self._envs[0].settings.robot
+        if robot != "unicycle":
+            raise ValueError(f"go-to-goal: expected the robot 'unicycle', whose controls it computes, got {robot!r}")
 
     def predict(
         self,

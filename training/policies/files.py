@@ -17,6 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
@@ -32,7 +33,7 @@ BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
 FORMAT, READ_FORMATS = 3, (2, 3)  # version of policy.json; in version 2 every network is that of `network`
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
-OBSERVED = (*SENSORS, "actuation", "dict_observation")
+OBSERVED = (*SENSORS, "robot", "actuation", "dict_observation")
 # Fields of policy.json with their types, besides `format` and `environment`.
 FIELDS = {"kind": str, "hidden": list, "critic": list, "actor_only": bool, "training": dict, "sha256": str}
 
@@ -181,7 +182,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
     try:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
         observation_space = spaces.Box(low, high, dtype=np.float32)
-        action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        action_space = spaces.Box(-1.0, 1.0, (_n_controls(description["environment"]),), np.float32)
         architecture = Architecture(
             **{field.name: description[field.name] for field in fields(Architecture) if field.name in description}
         )
@@ -220,9 +221,19 @@ def _load_model(path: Path, env: Any) -> BasePolicy:
     return load_zip(path, arguments)[0]
 
 
+def _n_controls(environment: Mapping[str, Any]) -> int:
+    """Return the number of controls of the robot in the description of an environment.
+
+    Raises:
+        ValueError: the robot's model is not registered.
+
+    """
+    return robot_class(environment.get("robot", "unicycle")).sizes()[1]
+
+
 def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
     """Check that an environment has the observations that the policy was trained with."""
-    trained = description["environment"]
+    trained = {"robot": "unicycle", **description["environment"]}  # earlier files do not contain the robot
     for inner in unwrap(env):
         settings = _as_dict(inner.settings)
         differing = [
@@ -237,7 +248,9 @@ def _check_environment(folder: Path, description: dict[str, Any], space: spaces.
 
 def shipped_policies() -> list[str]:
     """Return the names of the policies included in leapnav: families, and "all" for a policy for all families."""
-    return [name for name in (*FAMILIES, ALL) if (SHIPPED / name / "policy.json").is_file()]
+    names = [path.parent.name for path in SHIPPED.glob("*/policy.json")]
+    known = (*FAMILIES, ALL)
+    return sorted(names, key=lambda name: (name not in known, known.index(name) if name in known else 0, name))
 
 
 def policy_folder(folder: str | Path) -> Path:

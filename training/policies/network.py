@@ -26,12 +26,17 @@ class NavigationFeatures(BaseFeaturesExtractor):
     therefore contain logarithms, saturated values and exponentials in addition to the scaled values.
     """
 
-    POSE_FEATURES = 23  # features that do not depend on the number of beams
+    POSE_FEATURES = 23  # features of the goal part
+    MOTION_FEATURES = 2  # features of each entry of the motion part
     BEAM_FEATURES = 3  # features of each lidar beam
 
     def __init__(self, observation_space: spaces.Box) -> None:
-        beams = observation_space.shape[0] - GOAL_ENTRIES
-        super().__init__(observation_space, self.POSE_FEATURES + self.BEAM_FEATURES * beams)
+        # Ranges are not negative; the entries of the motion part, which is before them, can be.
+        motion = int((observation_space.low[GOAL_ENTRIES:] < 0.0).sum())
+        beams = observation_space.shape[0] - GOAL_ENTRIES - motion
+        features = self.POSE_FEATURES + self.MOTION_FEATURES * motion + self.BEAM_FEATURES * beams
+        super().__init__(observation_space, features)
+        self._first_beam = GOAL_ENTRIES + motion
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features (B, features_dim) of observations (B, d)."""
@@ -41,7 +46,7 @@ class NavigationFeatures(BaseFeaturesExtractor):
         error = th.atan2(observations[:, 3:4], observations[:, 2:3])
         bearing = th.atan2(goal[:, 1:2], goal[:, 0:1])
         needed_speeds, needed_turn_rate = observations[:, 5:8], observations[:, 8:9]  # to arrive on time
-        ranges = observations[:, GOAL_ENTRIES:]
+        motion, ranges = observations[:, GOAL_ENTRIES : self._first_beam], observations[:, self._first_beam :]
         return th.cat(
             [
                 goal / 5,
@@ -62,6 +67,8 @@ class NavigationFeatures(BaseFeaturesExtractor):
                 # change of heading.
                 th.cos(error - 2 * bearing),
                 th.sin(error - 2 * bearing),
+                (motion / 2).clamp(-3, 3),
+                th.tanh(motion / 0.3),
                 ranges / 5,
                 th.exp(-(ranges - ROBOT_RADIUS) / 0.3),
                 ROBOT_RADIUS / ranges.clamp(min=0.1),
@@ -128,5 +135,5 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
     if not (len(shape) == 1 and shape[0] > GOAL_ENTRIES):
         got = f"a Box of shape {shape}" if shape else type(observation_space).__name__
         raise ValueError(f"observation_space: expected that of {ENVIRONMENT} with a lidar, got {got}")
-    if not (isinstance(action_space, spaces.Box) and action_space.shape == (2,)):
+    if not (isinstance(action_space, spaces.Box) and len(action_space.shape) == 1):
         raise ValueError(f"action_space: expected that of {ENVIRONMENT}, got {action_space}")

@@ -23,6 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.robots.base import robot_class
 from leapnav.envs.simulation.observations import GOAL_ENTRIES
 from leapnav.training.policies.architecture import ACTIVATIONS, EXTRACTORS, Architecture, is_actor_weight, widths
 
@@ -83,7 +84,8 @@ def load_zip(
     if trust:
         policy = _algorithm(path, data).load(path, device="cpu").policy
     else:
-        policy = _architecture(path, data).make(space, spaces.Box(-1.0, 1.0, (2,), np.float32))
+        n_controls = robot_class(arguments.get("robot", "unicycle")).sizes()[1]
+        policy = _architecture(path, data).make(space, spaces.Box(-1.0, 1.0, (n_controls,), np.float32))
         _load_actor(path, policy, weights)
     policy.set_training_mode(False)
     return policy, arguments

@@ -21,7 +21,7 @@ from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv, select_robot
 
 ENVIRONMENT = "leapnav/Navigate-v0"
 # Names in the vector environment of attributes that differ between robots, and of those of a single robot.
-_PER_ROBOT = {"scenario": "scenarios", "time": "times", "pose": "poses"}
+_PER_ROBOT = {"scenario": "scenarios", "time": "times", "pose": "poses", "state": "states"}
 _SINGLE = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
 
 
@@ -100,7 +100,7 @@ class NavigateVecEnv(VecEnv):
             raise ValueError(f"venv: expected autoreset_mode='SameStep', got {venv.autoreset_mode.value!r}")
         self.venv = venv
         self._step_infos = step_infos or (venv.settings.goal_conditioned and venv.settings.reward == "cost")
-        self._actions = np.zeros((venv.num_envs, 2), np.float32)
+        self._actions = np.zeros((venv.num_envs, venv.settings.model.sizes()[1]), np.float32)
         self._returns = np.zeros(venv.num_envs)
         self._lengths = np.zeros(venv.num_envs, dtype=int)
         self._started = time.time()
@@ -121,7 +121,7 @@ class NavigateVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Store the actions (n_envs, 2) of the next step."""
+        """Store the actions (n_envs, m) of the next step."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:

@@ -166,7 +166,7 @@ def _demonstrations(run: Run, count: int, workers: int, progress: bool) -> Datas
     if not any(folder.glob("**/metadata.json")):
         # The scenarios depend on the seed of the run.
         seed = environment_seed(run.config.seed, DEMONSTRATION_STREAM)
-        rollout(run.config.family, count, folder, seed=seed, workers=workers, progress=progress)
+        rollout(run.config.family, count, folder, robot=run.config.robot, seed=seed, workers=workers, progress=progress)
     return Dataset.of(folder)
 
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import torch as th
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -168,7 +167,7 @@ def _train(
         callback.save_checkpoint()
     callback.bar.close()
     if isinstance(config, PPOConfig) and config.last_std > 0:
-        set_noise(model.policy, th.full((2,), config.last_std))
+        set_noise(model.policy, config.last_std)
     evaluations = run.evaluate(model.policy, model.num_timesteps, final=True)
     run.save_policy(model.policy)
     return evaluations
@@ -206,7 +205,7 @@ def _training_env(config: Config) -> VecEnv:
     venv: VecEnv = robots
     if config.jump_start > 0:
         families = FAMILIES if config.family == ALL else (config.family,)
-        banks = [ScenarioBank.shipped(family, "train") for family in families]
+        banks = [ScenarioBank.shipped(family, "train", config.robot) for family in families]
         venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
     if config.graded_miss:
         venv = GradedMiss(venv)
@@ -236,7 +235,7 @@ def _warm_start(
             progress=progress,
         )
     if isinstance(config, PPOConfig) and isinstance(model.policy, KLRegularizedPolicy):
-        set_noise(model.policy, th.full((2,), config.std))
+        set_noise(model.policy, config.std)
         model.policy.set_reference()
 
 
@@ -331,7 +330,7 @@ class _RunCallback(BaseCallback):
             policy.log_std.requires_grad_(completed >= config.critic_first and config.last_std == 0)
             if config.last_std > 0:
                 std = config.std + min(1.0, completed) * (config.last_std - config.std)
-                set_noise(policy, th.full((2,), std))
+                set_noise(policy, std)
         for wrapper in _stateful_wrappers(self._venv):
             if isinstance(wrapper, JumpStart):
                 wrapper.max_fraction = _linear_decay(config.jump_start, config.jump_start_until, completed)

@@ -123,7 +123,8 @@ class Run:
         count = None if final else self.config.evaluation_scenarios
         options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
         evaluations = [
-            evaluate(policy, ScenarioBank.shipped(family, "test"), count=count, **options) for family in self.families
+            evaluate(policy, ScenarioBank.shipped(family, "test", self.config.robot), count=count, **options)
+            for family in self.families
         ]
         line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
         for family, evaluation in zip(self.families, evaluations, strict=True):

@@ -18,8 +18,9 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
-from leapnav.envs.utils.validation import check_choice
+from leapnav.envs.utils.validation import check_choice, in_words
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.problem.problem import Trajectory
@@ -56,13 +57,14 @@ class FunctionPolicy:
     """A policy from a function of one observation, called for each robot.
 
     Args:
-        function: maps an observation (d,), or a dictionary, to an action (2,).
+        function: maps an observation (d,), or a dictionary, to an action (m,).
         observation_space: the space of one observation, to recognise batches.
+        n_actions: number m of controls.
 
     """
 
-    def __init__(self, function: Callable[[Any], Any], observation_space: gym.spaces.Space) -> None:
-        self._function, self._space = function, observation_space
+    def __init__(self, function: Callable[[Any], Any], observation_space: gym.spaces.Space, n_actions: int = 2) -> None:
+        self._function, self._space, self._n_actions = function, observation_space, n_actions
 
     def predict(
         self,
@@ -71,7 +73,7 @@ class FunctionPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return the actions (2,) or (N, 2) for an observation or a batch of them."""
+        """Return the actions (m,) or (N, m) for an observation or a batch of them."""
         if isinstance(observation, Mapping):
             assert isinstance(self._space, gym.spaces.Dict)
             name, values = next(iter(observation.items()))
@@ -84,8 +86,10 @@ class FunctionPolicy:
 
     def _action(self, observation: Any) -> np.ndarray:
         action = np.asarray(self._function(observation), dtype=np.float32)
-        if action.shape != (2,) or not np.isfinite(action).all():
-            raise ValueError(f"policy: expected two finite numbers from the function, got {action.tolist()}")
+        if action.shape != (self._n_actions,) or not np.isfinite(action).all():
+            raise ValueError(
+                f"policy: expected {in_words(self._n_actions)} finite numbers from the function, got {action.tolist()}"
+            )
         return action
 
 
@@ -99,12 +103,12 @@ class Episode:
         cost: cost J of the episode.
         episode_return: sum of the rewards.
         reference_cost: optimal cost J* of the scenario.
-        reached_reference: optimal cost J* for the pose that a successful episode has reached, see
+        reached_reference: optimal cost J* for the state that a successful episode has reached, see
             `find_reached_optimum`; NaN for other episodes, and if no certified extremal was found.
         clearance: minimum clearance of the episode (m).
         reference_clearance: minimum clearance of the optimum (m).
         reversing: whether the optimum contains backward driving.
-        states (K + 1, 3): the poses before and after each environment step.
+        states (K + 1, n): the states before and after each environment step.
 
     """
 
@@ -287,7 +291,7 @@ def _play_batch(
     venv = NavigateVectorEnv(count, bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
     policy = _policy_for(policy_or_factory, venv, venv.single_observation_space)
     observations, _ = venv.reset(seed=seed, options={"index": list(indices)})
-    poses, returns, clearances = [venv.poses], np.zeros(count), np.full(count, np.inf)
+    states, returns, clearances = [venv.states], np.zeros(count), np.full(count, np.inf)
     episodes: list[Episode | None] = [None] * count
     state, starts = None, np.ones(count, dtype=bool)
     while any(episode is None for episode in episodes):
@@ -297,13 +301,13 @@ def _play_batch(
         returns += np.where(playing, rewards, 0.0)
         # Robots whose episode has ended are already in the next one; their last step is in `final_info`.
         last = infos.get("final_info", infos)
-        poses.append(np.where(starts[:, None], last["pose"], infos["pose"]))
+        states.append(np.where(starts[:, None], _states(last), _states(infos)))
         clearances = np.minimum(clearances, np.where(starts, last["clearance"], infos["clearance"]))
         for i in np.flatnonzero(starts & playing).tolist():
             episodes[i] = _make_episode(
                 bank,
                 indices[i],
-                np.array([row[i] for row in poses]),
+                np.array([row[i] for row in states]),
                 success=bool(last["is_success"][i]),
                 collision=bool(last["collision"][i]),
                 cost=float(last["cost"][i]),
@@ -313,6 +317,11 @@ def _play_batch(
             on_episode()
     venv.close()
     return [episode for episode in episodes if episode is not None]
+
+
+def _states(infos: Mapping[str, Any]) -> np.ndarray:
+    """Return the states (N, n) of the robots from the infos of a step."""
+    return np.concatenate([infos["pose"], infos["motion"]], axis=1) if "motion" in infos else infos["pose"]
 
 
 def _make_episode(
@@ -329,16 +338,22 @@ def _make_episode(
         reference_cost=reference.cost,
         reached_reference=_optimal_cost_to(states[-1], scenario, reference, cost) if success else math.nan,
         reference_clearance=reference.certificate[3],
-        reversing=bool(reference.controls[:, 0].min() < -MIN_REVERSE_SPEED),
+        reversing=bool(_speeds(reference).min() < -MIN_REVERSE_SPEED),
         states=states,
         **outcome,
     )
 
 
-def _optimal_cost_to(pose: np.ndarray, scenario: Scenario, reference: Reference, cost: float) -> float:
+def _speeds(reference: Reference) -> np.ndarray:
+    """Return the speeds (N - 1,) along the heading (m/s) of an optimum, negative backwards."""
+    step, heading = np.diff(reference.states, axis=0), reference.states[:-1, 2]
+    return (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / np.diff(reference.times)
+
+
+def _optimal_cost_to(state: np.ndarray, scenario: Scenario, reference: Reference, cost: float) -> float:
     """Return J* for the pose that a successful episode has reached; NaN if no certified extremal is found."""
     guess = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
-    optimum = find_reached_optimum(scenario, pose, cost, guess)
+    optimum = find_reached_optimum(scenario, state, cost, guess)
     return optimum.cost if optimum.success else math.nan
 
 
@@ -379,7 +394,7 @@ def _policy_for(policy_or_factory: PolicyOrFactory, env: Any, observation_space:
     elif _is_factory(given):
         policy = given(env)
     else:
-        policy = FunctionPolicy(given, observation_space)
+        policy = FunctionPolicy(given, observation_space, unwrap(env)[0].settings.model.sizes()[1])
     if not hasattr(policy, "predict"):
         raise TypeError(f"policy: expected one with `predict`, got {type(policy).__name__}")
     expected = getattr(policy, "observation_space", None)
