@@ -8,6 +8,7 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
+sys.path.append(str(Path(__file__).parent.parent / "examples"))  # for the robot of `trailer_robot.py`
 
 # The default profile repeats the same examples; HYPOTHESIS_PROFILE=long generates many new ones.
 settings.register_profile("default", max_examples=40, deadline=None, derandomize=True)

@@ -14,6 +14,7 @@ MAX_FAULTS = 8  # faults in one message
 EXPECTED = {
     "greater_than": "expected a number > {gt:g}",
     "greater_than_equal": "expected a number >= {ge:g}",
+    "less_than": "expected a number < {lt:g}",
     "less_than_equal": "expected a number <= {le:g}",
     "finite_number": "expected a finite number",
     "float_type": "expected a number",
