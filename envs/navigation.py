@@ -219,6 +219,8 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         self._simulator = BatchSimulator(1, self.settings)
         self.observation_space = self._simulator.layout.space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._source.robot.sizes()[1],), np.float32)
+        self._action_shape = self._source.robot.sizes()[1:]
+        self._has_motion = bool(self._simulator.motion.shape[1])
         self._simulator.check(self._source.scenario, self.bank)
         self._choice: Scenario | int | None = None
         self._playing = np.zeros(1, dtype=bool)
@@ -273,7 +275,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         """
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
-        values = check_actions(action, self.settings.model.sizes()[1:])
+        values = check_actions(action, self._action_shape)
         self._simulator.step(values.reshape(1, -1), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)
@@ -391,7 +393,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         for name, column in columns.FLAGS.items():
             info[name] = row[column] != 0.0
         info["pose"], info["reward_parts"] = self.pose, parts
-        if self._simulator.motion.shape[1]:
+        if self._has_motion:
             info["motion"] = self._simulator.motion[0].copy()
         return info
 

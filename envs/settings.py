@@ -56,8 +56,10 @@ MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
     VERTICES,
     DRIVE,
     MOTION_TOLERANCE,
+    N_MOTION,
+    N_CONTROLS,
     PACKED,
-) = range(26)
+) = range(28)
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,8 @@ class EnvironmentSettings:
         values[OBSTACLES], values[VERTICES] = self.map_obstacles, self.map_vertices
         values[DRIVE] = self.model.drive
         values[MOTION_TOLERANCE] = self.motion_tolerance
+        n, m = self.model.sizes()
+        values[N_MOTION], values[N_CONTROLS] = n - 3, m
         return values
 
 

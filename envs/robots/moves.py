@@ -25,6 +25,7 @@ class Moves:
         targets: (HEADINGS, count, 3), int64: cells in x, cells in y, heading steps.
         points: (HEADINGS, count, P, 2), int64: offsets (half cells) of the points at which the speed of the metric is
             evaluated, from the start of the move to its end.
+        rotating: whether these are the moves of `rotating_moves`.
         weights: (HEADINGS, count, P), weights of these speeds: the length of the move, in the units of sqrt(cost * s),
             times the weights of Simpson's rule on each of its straight parts.
 
@@ -33,6 +34,7 @@ class Moves:
     targets: np.ndarray
     points: np.ndarray
     weights: np.ndarray
+    rotating: bool = False
 
     @property
     def border(self) -> int:
@@ -60,7 +62,7 @@ def rotating_moves(cell: float, speed_weight: float, turn_weight: float) -> Move
     """
     targets, points, squares, turns = _rotating_table()
     lengths = np.sqrt(speed_weight * squares * cell * cell + turn_weight * turns * turns)
-    return Moves(targets, points, (lengths / 6.0)[:, :, None] * SIMPSON)
+    return Moves(targets, points, (lengths / 6.0)[:, :, None] * SIMPSON, rotating=True)
 
 
 @cache
@@ -79,6 +81,10 @@ def _rotating_table() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     turns = np.array([[turn_angle(k, change) for change in targets[k, :, 2].tolist()] for k in range(HEADINGS)])
     points = np.stack([0 * targets[:, :, :2], targets[:, :, :2], 2 * targets[:, :, :2]], axis=2)
     return targets, points, targets[:, :, 0] ** 2 + targets[:, :, 1] ** 2, turns
+
+
+ROTATING_MOVES = _rotating_table()[0]
+ROTATING_MOVES.flags.writeable = False
 
 
 def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: float) -> Moves:

@@ -61,7 +61,7 @@ def footprint_clearance(x, y, heading, discs, field):
 
     Args:
         x, y, heading: pose (m, rad).
-        discs (D, 2): offsets along the robot's axis and radii (m).
+        discs (D, 2): offsets along the robot's axis and radii (m); a radius that is not positive is unused.
         field: packed obstacle field.
 
     """
@@ -71,6 +71,8 @@ def footprint_clearance(x, y, heading, discs, field):
     cos, sin = math.cos(heading), math.sin(heading)
     best, found = np.inf, -1
     for k in range(len(discs)):
+        if discs[k, 1] <= 0.0:  # unused
+            continue
         distance, nearest = obstacle_distance(x + discs[k, 0] * cos, y + discs[k, 0] * sin, field)
         if distance - discs[k, 1] < best:
             best, found = distance - discs[k, 1], nearest

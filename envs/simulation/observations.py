@@ -17,6 +17,7 @@ from leapnav.envs.settings import (
     GOAL_CONDITIONED,
     LIDAR_RANGE,
     MOTORS,
+    N_CONTROLS,
     OBSERVATION,
     OBSERVATIONS,
     OBSTACLES,
@@ -205,7 +206,7 @@ def observe_robots(robots, packed, packed_buffers, out):
     goal_conditioned, motors = settings[GOAL_CONDITIONED] != 0.0, settings[MOTORS] != 0.0
     has_lidar, has_map = settings[OBSERVATION] == LIDAR, settings[OBSERVATION] == MAP
     count = beams.shape[1]
-    sensing = 2 * sim.controls.shape[1]  # first column of the sensing noise, after that of the actuation
+    sensing = 2 * int(settings[N_CONTROLS])  # first column of the sensing noise, after that of the actuation
     for i in robots:
         x, y, heading = bodies[i, 0], bodies[i, 1], bodies[i, 2]
         cos, sin = math.cos(heading), math.sin(heading)
@@ -246,8 +247,8 @@ def observe_robots(robots, packed, packed_buffers, out):
             row[at + 1] = cos * state[i, VY] - sin * state[i, VX]
             row[at + 2] = state[i, SPIN]
             at += MOTION_ENTRIES
-        for k in range(sim.motion.shape[1]):
-            value = sim.motion[i, k]
+        for k in range(len(buffers.is_heading)):
+            value = sim.robots[i, k]
             if buffers.is_heading[k]:
                 value = (value - heading + math.pi) % (2 * math.pi) - math.pi
             row[at] = value

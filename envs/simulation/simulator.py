@@ -41,7 +41,6 @@ from leapnav.envs.utils.validation import in_words
 
 MAX_MOTOR_STEP = 0.01  # s, substep of a control period with motors
 MAX_CONTACT_STEP = 0.0025  # s, substep of a control period in contact
-UNUSED_DISC = (0.0, -math.inf)  # offset and radius (m)
 NOISE_ROWS = 32  # control periods whose noise is sampled together
 
 
@@ -69,10 +68,10 @@ class BatchSimulator:
         self.layout = ObservationLayout(settings)
         self.state = np.zeros((count, COLUMNS))
         n, m = settings.model.sizes()
-        self.motion, self._controls = np.zeros((count, n - 3)), np.zeros((count, m))
+        self._n_motion, self._n_controls = n - 3, m
+        self._robots = np.zeros((count, n - 3 + m + 2 + 2))
         self.tasks = np.zeros((count, LIMITS + 2 * m + 2 * (n - 3)))
-        self._discs = np.zeros((count, 1, 2))
-        self._metric = np.zeros((count, 2))
+        self._known_bank: tuple[ScenarioBank, np.ndarray] | None = None
         self._drive, self._drives_paths = settings.model.drive, settings.model.drive == GENERAL
         self._pointers: tuple[FunctionPointer, FunctionPointer] | None = None
         self.fields = np.zeros((count, 0))
@@ -97,20 +96,26 @@ class BatchSimulator:
         return self._free.rows[:, :3]
 
     @property
+    def motion(self) -> np.ndarray:  # noqa: D102 (documented as an attribute of the class)
+        return self._robots[:, : self._n_motion]
+
+    @property
+    def _first_disc(self) -> int:
+        """Column of the first disc in the array of the robots."""
+        return self._n_motion + self._n_controls + 2
+
+    @property
     def _arrays(self) -> tuple[np.ndarray, ...]:
         """The episodes as the record that the kernels take."""
         if self._record is None:
             self._record = tuple(
                 SimulationState(
                     bodies=self._free.rows,
-                    motion=self.motion,
-                    controls=self._controls,
+                    robots=self._robots,
                     state=self.state,
                     tasks=self.tasks,
-                    discs=self._discs,
                     fields=self.fields,
                     guides=self._guides,
-                    metric=self._metric,
                     noise=self._noise,
                     noise_rows=self._noise_rows,
                     settings=self._packed,
@@ -142,10 +147,8 @@ class BatchSimulator:
         for field in fields:
             self._check_fits(field)
         tasks = [self._get_task(choice, bank) for choice in choices]
-        footprints = [
-            choice.discs if isinstance(choice, Scenario) else _bank_discs(_require(bank)) for choice in choices
-        ]
-        self._make_room(max(map(len, tasks)), max(map(len, footprints)))
+        footprints = [choice.discs if isinstance(choice, Scenario) else self._bank_discs(bank) for choice in choices]
+        self._make_room(max(map(len, tasks)), max(map(_required_discs, footprints)))
         longest = max(map(len, fields))
         if longest > self.fields.shape[1]:
             # Rows at multiples of a large power of two would map to the same cache sets, so a row has an odd number of
@@ -156,17 +159,18 @@ class BatchSimulator:
         for i, field in zip(indices.tolist(), fields, strict=True):
             self.fields[i, : len(field)] = field
             self._lengths[i] = len(field)
-        m = self._controls.shape[1]
+        m, first = self._n_controls, self._first_disc
         for i, choice, task, discs in zip(indices.tolist(), choices, tasks, footprints, strict=True):
             self.tasks[i, : len(task)] = task
-            self._discs[i] = UNUSED_DISC
-            self._discs[i, : len(discs)] = discs
-            if self._drive == ARCS:
-                self._metric[i] = task[LIMITS + m : LIMITS + 2 * m]
-            elif self.settings.reward == "shaped":
-                scenario = get_scenario(choice, bank)
-                self._metric[i] = scenario.robot.metric(scenario.cost)
+            row = self._robots[i]
+            row[first:] = 0.0
+            row[first : first + discs.size] = discs.ravel()
             if self.settings.reward == "shaped":
+                if self._drive == ARCS:
+                    row[first - 2 : first] = task[LIMITS + m : LIMITS + 2 * m]
+                else:
+                    scenario = get_scenario(choice, bank)
+                    row[first - 2 : first] = scenario.robot.metric(scenario.cost)
                 self._guides[i] = self._guide(choice, bank, self.tasks[i])
             self._contacts.pop(i, None)
         stepping.start_episodes(indices, self._arrays)
@@ -182,6 +186,8 @@ class BatchSimulator:
             ValueError: the scenario has another robot than the environment.
 
         """
+        if not isinstance(choice, Scenario) and self._known_bank is not None and bank is self._known_bank[0]:
+            return self._known_bank[0].tasks[choice]
         robot = choice.robot if isinstance(choice, Scenario) else _require(bank).robot
         if robot.model != self.settings.robot:
             name = f"scenario {choice.name!r}" if isinstance(choice, Scenario) else f"bank {_require(bank).path.name}"
@@ -196,9 +202,9 @@ class BatchSimulator:
         if n_columns > self.tasks.shape[1]:
             self.tasks = np.pad(self.tasks, ((0, 0), (0, n_columns - self.tasks.shape[1])))
             self._record = None
-        if n_discs > self._discs.shape[1]:
-            more = np.full((len(self._discs), n_discs - self._discs.shape[1], 2), UNUSED_DISC)
-            self._discs, self._record = np.concatenate([self._discs, more], axis=1), None
+        missing = self._first_disc + 2 * n_discs - self._robots.shape[1]
+        if missing > 0:
+            self._robots, self._record = np.pad(self._robots, ((0, 0), (0, missing))), None
             self._drives_paths = True
 
     def check(self, choice: Scenario | int | None, bank: ScenarioBank | None) -> None:
@@ -270,7 +276,7 @@ class BatchSimulator:
         if self._motors:
             bodies, substeps = self._free.rows, self._substeps
             for substep in range(substeps):
-                stepping.drive_motors(bodies, state, self._metric, self.fields, self._packed, substep, substeps)
+                stepping.drive_motors(bodies, state, self.tasks, self.fields, self._packed, substep, substeps)
                 self._free.advance()
             stepping.read_velocities(bodies, state, substeps)
         else:
@@ -301,7 +307,8 @@ class BatchSimulator:
         """Simulate the rest of a period after a contact."""
         row, body = self.state[i], self._free.rows[i]
         duration = float(row[REMAINING])
-        field, discs = self.field(i), self._discs[i][self._discs[i, :, 1] > 0.0]
+        field, discs = self.field(i), self._robots[i, self._first_disc :].reshape(-1, 2)
+        discs = discs[discs[:, 1] > 0.0]
         motor = self.settings.motor
         if i not in self._contacts:
             self._contacts[i] = ContactWorld(field, discs, motor.mass, motor.moment, motor.friction)
@@ -319,11 +326,11 @@ class BatchSimulator:
             for name, value in zip(model.velocity_states, (ahead, velocity[2]), strict=True):
                 self.motion[i, model.state_names.index(name) - 3] = value
         if self._drive == ARCS:
-            row[EFFORT] += stepping.effort(self._metric, i, speeds, turn_rates)
+            row[EFFORT] += stepping.effort(self.tasks, i, speeds, turn_rates)
         else:
             # The controls are held, and further states change by them also in contact; the state cost is that at both
             # ends of the period.
-            row[EFFORT] += stepping.control_effort(self.tasks, self._controls, i) * duration
+            row[EFFORT] += stepping.control_effort(self.tasks, self._controls(i), i) * duration
             if model.state_cost is not None:
                 parameters = self._parameters(i)
                 ends = [np.concatenate([body[:3], values]) for values in (motion, self.motion[i])]
@@ -332,10 +339,22 @@ class BatchSimulator:
         row[POSE_CLEARANCE] = footprint_clearance(body[0], body[1], body[2], discs, field)[0]
         row[CLEARANCE] = min(row[CLEARANCE], lowest)
 
+    def _controls(self, i: int) -> np.ndarray:
+        """Return the controls (m,) of a robot in its period."""
+        if self._drive == ARCS:
+            return np.array([self.state[i, SPEED], self.state[i, TURN_RATE]])
+        return self._robots[i, self._n_motion : self._n_motion + self._n_controls].copy()
+
+    def _bank_discs(self, bank: ScenarioBank | None) -> np.ndarray:
+        """Return the footprint of the robot of a bank."""
+        if self._known_bank is None or self._known_bank[0] is not bank:
+            known = _require(bank)
+            self._known_bank = known, known[0].discs
+        return self._known_bank[1]
+
     def _parameters(self, i: int) -> np.ndarray:
         """Return the parameters of a robot's model."""
-        n, m = self.settings.model.sizes()
-        return self.tasks[i, LIMITS + 2 * m + 2 * (n - 3) :]
+        return self.tasks[i, LIMITS + 2 * self._n_controls + 2 * self._n_motion :]
 
     def _command(self, i: int, step: float) -> Callable[[float, float, float, float], tuple[float, float, float]]:
         """Return the function from the velocity of a robot in contact to that of its next step without contact."""
@@ -348,7 +367,7 @@ class BatchSimulator:
                 return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
 
             return track
-        controls, parameters, new = self._controls[i], self._parameters(i), np.zeros(3 + self.motion.shape[1])
+        controls, parameters, new = self._controls(i), self._parameters(i), np.zeros(3 + self._n_motion)
 
         def follow(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
             q = np.array([0.0, 0.0, heading, *self.motion[i]])
@@ -385,8 +404,9 @@ class BatchSimulator:
         return {**self.__dict__, "_contacts": {}, "_record": None, "_pointers": None}
 
 
-def _bank_discs(bank: ScenarioBank) -> np.ndarray:
-    return bank[0].discs
+def _required_discs(discs: np.ndarray) -> int:
+    """Return the number of discs in the array of footprints; one is for discs around the robot's position only."""
+    return 1 if len(discs) == 1 and discs[0, 0] == 0.0 else max(len(discs), 2)
 
 
 def _require(bank: ScenarioBank | None) -> ScenarioBank:

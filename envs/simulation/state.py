@@ -52,15 +52,14 @@ class SimulationState(NamedTuple):
 
     Attributes:
         bodies (count, 6 or 9): see `FreeBodies`.
-        motion (count, n - 3): further states of the robots, see `RobotModel`.
-        controls (count, m): controls of the period, with actuation noise.
+        robots (count, n - 3 + m + 2 + 2 D): further states of the robot; controls of the period, with actuation noise;
+            weights of squared speed and turn rate in the potential; footprint of at most D discs, each with its offset
+            along the heading and its radius (m), which is not positive if the disc is unused.
         state (count, COLUMNS): see the constants of this module.
         tasks (count, K): see `leapnav.envs.scenarios.scenario`.
-        discs (count, D, 2): footprints, offset along the heading and radius (m); unused discs have the radius -inf.
         fields (count, L): packed obstacle fields; the end of a row is unused.
         guides (count, N_GUIDE_POINTS, 3): points (m) of the reference path, and the path length (m) from
             each to the goal.
-        metric (count, 2): weights of squared speed and turn rate of the potential.
         noise (count, rows, columns): standard normal numbers.
         noise_rows (count,): the row of `noise` that each robot uses.
         settings (PACKED,): see `leapnav.envs.settings`.
@@ -68,14 +67,11 @@ class SimulationState(NamedTuple):
     """
 
     bodies: np.ndarray
-    motion: np.ndarray
-    controls: np.ndarray
+    robots: np.ndarray
     state: np.ndarray
     tasks: np.ndarray
-    discs: np.ndarray
     fields: np.ndarray
     guides: np.ndarray
-    metric: np.ndarray
     noise: np.ndarray
     noise_rows: np.ndarray
     settings: np.ndarray
@@ -84,14 +80,11 @@ class SimulationState(NamedTuple):
 SIMULATION_STATE = record_type(
     SimulationState,
     bodies=MATRIX,
-    motion=MATRIX,
-    controls=MATRIX,
+    robots=MATRIX,
     state=MATRIX,
     tasks=MATRIX,
-    discs=CUBE,
     fields=MATRIX,
     guides=CUBE,
-    metric=MATRIX,
     noise=CUBE,
     noise_rows=INTEGERS,
     settings=VECTOR,

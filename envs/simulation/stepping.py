@@ -27,6 +27,8 @@ from leapnav.envs.settings import (
     MISS_PENALTY,
     MOMENT,
     MOTION_TOLERANCE,
+    N_CONTROLS,
+    N_MOTION,
     PERIOD,
     POSITION_TOLERANCE,
     RESPONSE,
@@ -73,25 +75,18 @@ GRAVITY = 9.81  # m/s^2
 
 
 @kernel(float64(MATRIX, int64, float64, float64))
-def effort(weights, i, speed_squared, turn_rate_squared):
-    """Return the running cost of the motion of robot i, a unicycle, without the proximity cost.
-
-    Args:
-        weights (count, 2): weights of the squared speed and turn rate.
-        i: index of the robot.
-        speed_squared, turn_rate_squared: (m/s)^2 and (rad/s)^2.
-
-    """
-    return 0.5 * (weights[i, 0] * speed_squared + weights[i, 1] * turn_rate_squared)
+def effort(tasks, i, speed_squared, turn_rate_squared):
+    """Return the running cost of the motion of robot i, a unicycle, without the proximity cost."""
+    return 0.5 * (tasks[i, LIMITS + 2] * speed_squared + tasks[i, LIMITS + 3] * turn_rate_squared)
 
 
-@kernel(float64(MATRIX, MATRIX, int64))
+@kernel(float64(MATRIX, VECTOR, int64))
 def control_effort(tasks, controls, i):
-    """Return the running cost of the controls of robot i."""
-    m = controls.shape[1]
+    """Return the running cost of the controls (m,) of robot i."""
+    m = len(controls)
     total = 0.0
     for j in range(m):
-        total += tasks[i, LIMITS + m + j] * controls[i, j] ** 2
+        total += tasks[i, LIMITS + m + j] * controls[j] ** 2
     return 0.5 * total
 
 
@@ -110,7 +105,9 @@ def potential(i, sim):
     heading = tasks[i, GOAL + 2]
     turn = 0.0 if math.isnan(heading) else (heading - bodies[i, 2] + math.pi) % (2 * math.pi) - math.pi
     time = max(tasks[i, HORIZON] - sim.state[i, TIME], sim.settings[PERIOD])
-    estimate = effort(sim.metric, i, length * length, turn * turn) / time
+    weights = int(sim.settings[N_MOTION] + sim.settings[N_CONTROLS])
+    square = sim.robots[i, weights] * (length * length) + sim.robots[i, weights + 1] * (turn * turn)
+    estimate = 0.5 * square / time
     return -min(estimate, sim.settings[MISS_PENALTY])
 
 
@@ -119,18 +116,19 @@ def start_episodes(robots, packed):
     """Place robots, given by index, at the start of their tasks."""
     sim = SimulationState(*packed)
     bodies, state, tasks, settings = sim.bodies, sim.state, sim.tasks, sim.settings
-    further = LIMITS + 2 * sim.controls.shape[1]
+    n_motion, n_controls = int(settings[N_MOTION]), int(settings[N_CONTROLS])
+    further, first_disc = LIMITS + 2 * n_controls, n_motion + n_controls + 2
     for i in robots:
         for column in range(bodies.shape[1]):
             bodies[i, column] = tasks[i, START + column] if column < 3 else 0.0
-        for k in range(sim.motion.shape[1]):
-            sim.motion[i, k] = tasks[i, further + k]
+        for k in range(n_motion):
+            sim.robots[i, k] = tasks[i, further + k]
         for column in range(state.shape[1]):
             state[i, column] = 0.0
         # A remainder of less than 1e-6 periods is a rounding error of the horizon, not another period.
         state[i, LAST_STEP] = max(1.0, math.ceil(tasks[i, HORIZON] / settings[PERIOD] - 1e-6))
         state[i, POSE_CLEARANCE] = footprint_clearance(
-            bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.discs[i], sim.fields[i]
+            bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.robots[i, first_disc:].reshape((-1, 2)), sim.fields[i]
         )[0]
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
         if settings[SHAPED] != 0.0:
@@ -148,8 +146,8 @@ def command(actions, active, packed):
 
     """
     sim = SimulationState(*packed)
-    state, tasks, settings, controls = sim.state, sim.tasks, sim.settings, sim.controls
-    m, drive = controls.shape[1], int(settings[DRIVE])
+    state, tasks, settings, robots = sim.state, sim.tasks, sim.settings, sim.robots
+    first, m, drive = int(settings[N_MOTION]), int(settings[N_CONTROLS]), settings[DRIVE]
     for i in range(len(state)):
         for j in range(m):
             if active[i] and not math.isfinite(actions[i, j]):
@@ -163,33 +161,37 @@ def command(actions, active, packed):
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
         if not active[i]:
             continue
-        for j in range(m):
-            controls[i, j] = min(max(actions[i, j], -1.0), 1.0) * tasks[i, LIMITS + j]
+        state[i, DURATION] = max(min(settings[PERIOD], tasks[i, HORIZON] - state[i, TIME]), 0.0)
+        if drive == ARCS:
+            speed = min(max(actions[i, 0], -1.0), 1.0) * tasks[i, LIMITS]
+            turn_rate = min(max(actions[i, 1], -1.0), 1.0) * tasks[i, LIMITS + 1]
             if disturbed:
-                controls[i, j] *= 1.0 + settings[ACTUATION_NOISE] * sim.noise[i, sim.noise_rows[i], j]
-        if disturbed and drive == ARCS:
-            noise, row = sim.noise, sim.noise_rows[i]
-            half = settings[TRACK] / 2
-            speed, turn_rate = controls[i, 0], controls[i, 1]
-            right = (speed + half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 2]), 1.0))
-            left = (speed - half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 3]), 1.0))
-            controls[i, 0], controls[i, 1] = (right + left) / 2, (right - left) / (2 * half)
-        elif disturbed:
-            for j in range(m):
-                controls[i, j] *= 1.0 - min(settings[SLIP] * abs(sim.noise[i, sim.noise_rows[i], m + j]), 1.0)
+                noise, row = sim.noise, sim.noise_rows[i]
+                speed *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, 0]
+                turn_rate *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, 1]
+                half = settings[TRACK] / 2
+                right = (speed + half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 2]), 1.0))
+                left = (speed - half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 3]), 1.0))
+                speed, turn_rate = (right + left) / 2, (right - left) / (2 * half)
+            state[i, SPEED], state[i, TURN_RATE] = speed, turn_rate
+            continue
+        for j in range(m):
+            value = min(max(actions[i, j], -1.0), 1.0) * tasks[i, LIMITS + j]
+            if disturbed:
+                noise, row = sim.noise, sim.noise_rows[i]
+                value *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, j]
+                value *= 1.0 - min(settings[SLIP] * abs(noise[i, row, m + j]), 1.0)
+            robots[i, first + j] = value
         if drive == WHEELS:
             track = tasks[i, LIMITS + 2 * m]
-            state[i, SPEED] = 0.5 * (controls[i, 0] + controls[i, 1])
-            state[i, TURN_RATE] = (controls[i, 1] - controls[i, 0]) / track
-        elif drive == ARCS:
-            state[i, SPEED], state[i, TURN_RATE] = controls[i, 0], controls[i, 1]
-        state[i, DURATION] = max(min(settings[PERIOD], tasks[i, HORIZON] - state[i, TIME]), 0.0)
+            state[i, SPEED] = 0.5 * (robots[i, 0] + robots[i, 1])
+            state[i, TURN_RATE] = (robots[i, 1] - robots[i, 0]) / track
     return -1
 
 
 @kernel(boolean(CONSTANT_MATRIX))
 def is_one_disc(discs):
-    """Return whether a footprint is one disc around the robot's position."""
+    """Return whether a footprint is one disc around the robot's position, as all are in an array of one disc each."""
     return discs[0, 0] == 0.0 and (len(discs) == 1 or discs[1, 1] <= 0.0)
 
 
@@ -202,18 +204,21 @@ def drive_paths(packed, motion):
     """
     sim = SimulationState(*packed)
     bodies, state, settings = sim.bodies, sim.state, sim.settings
-    general, m, n = settings[DRIVE] == GENERAL, sim.controls.shape[1], 3 + sim.motion.shape[1]
+    general, m, n = settings[DRIVE] == GENERAL, int(settings[N_CONTROLS]), 3 + int(settings[N_MOTION])
     first = LIMITS + 2 * m + 2 * (n - 3)
     q, new, work = np.empty(n), np.empty(n), np.empty(n)
     for i in range(len(state)):
         if general:
             bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        discs, field, duration = sim.discs[i], sim.fields[i], state[i, DURATION]
+        robot, field, duration = sim.robots[i], sim.fields[i], state[i, DURATION]
+        discs = robot[n - 1 + m :].reshape((-1, 2))
         if duration == 0.0 or (not general and is_one_disc(discs)):
             continue
-        parameters, u = sim.tasks[i, first:], sim.controls[i]
+        parameters, u = sim.tasks[i, first:], robot[n - 3 : n - 3 + m]
+        if settings[DRIVE] == ARCS:
+            u[0], u[1] = state[i, SPEED], state[i, TURN_RATE]
         for k in range(n):
-            q[k] = bodies[i, k] if k < 3 else sim.motion[i, k - 3]
+            q[k] = bodies[i, k] if k < 3 else robot[k - 3]
         lowest, fraction, after = follow_path(motion, q, u, duration, parameters, discs, field, new)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
         if fraction < 1.0:
@@ -223,12 +228,12 @@ def drive_paths(packed, motion):
         driven = duration * fraction
         if driven > 0.0:
             proximity, state_cost = path_costs(motion, q, u, driven, parameters, discs, field, work)
-            state[i, EFFORT] += (control_effort(sim.tasks, sim.controls, i) + state_cost) * driven
+            state[i, EFFORT] += (control_effort(sim.tasks, u, i) + state_cost) * driven
             state[i, PROXIMITY] += proximity * driven
         for k in range(3):
             bodies[i, 3 + k] = new[k] - bodies[i, k]
         for k in range(n - 3):
-            sim.motion[i, k] = new[3 + k]
+            robot[k] = new[3 + k]
 
 
 @kernel(int64(MATRIX, FLAGS, PACKED_STATE))
@@ -245,13 +250,13 @@ def drive_arcs(actions, active, packed):
     """
     sim = SimulationState(*packed)
     bodies, state = sim.bodies, sim.state
-    wheels = sim.settings[DRIVE] == WHEELS
+    wheels, all_discs = sim.settings[DRIVE] == WHEELS, sim.robots.shape[1] == 6
     invalid = command(actions, active, packed)
     if invalid >= 0:
         return invalid
     for i in range(len(state)):
         bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        if state[i, DURATION] == 0.0 or not is_one_disc(sim.discs[i]):
+        if state[i, DURATION] == 0.0 or not (all_discs or is_one_disc(sim.robots[i, 4:].reshape((-1, 2)))):
             continue
         x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.fields[i]
         distance, turn = state[i, SPEED] * state[i, DURATION], state[i, TURN_RATE] * state[i, DURATION]
@@ -265,9 +270,9 @@ def drive_arcs(actions, active, packed):
             turn *= fraction
         driven = state[i, DURATION] * fraction
         if wheels:
-            state[i, EFFORT] += control_effort(sim.tasks, sim.controls, i) * driven
+            state[i, EFFORT] += control_effort(sim.tasks, sim.robots[i, :2], i) * driven
         else:
-            state[i, EFFORT] += effort(sim.metric, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
+            state[i, EFFORT] += effort(sim.tasks, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
         if driven > 0.0:
             state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, field) * driven
         chord, middle = distance * sinc(turn / 2), heading + turn / 2
@@ -307,7 +312,7 @@ def read_velocities(bodies, state, substeps):
 
 
 @kernel(NOTHING(MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, int64, int64))
-def drive_motors(bodies, state, metric, fields, settings, substep, substeps):
+def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
     """Set velocity and force of each body for one substep, up to the first contact, and add the running cost.
 
     The velocities after the previous substep are read first.
@@ -326,7 +331,7 @@ def drive_motors(bodies, state, metric, fields, settings, substep, substeps):
         lowest, fraction, after = follow_arc(x, y, course, distance, 0.0, state[i, POSE_CLEARANCE], field)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = min(state[i, CLEARANCE], lowest), after
         speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
-        state[i, EFFORT] += effort(metric, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
+        state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
         state[i, PROXIMITY] += arc_proximity(x, y, course, distance * fraction, 0.0, field) * step * fraction
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * fraction, dy * fraction, turn * fraction
         if fraction < 1.0:
@@ -346,10 +351,11 @@ def at_goal(i, sim):
     dx, dy = bodies[i, 0] - tasks[i, GOAL], bodies[i, 1] - tasks[i, GOAL + 1]
     if math.hypot(dx, dy) > settings[POSITION_TOLERANCE]:
         return False
-    further = LIMITS + 2 * sim.controls.shape[1] + sim.motion.shape[1]
-    for k in range(sim.motion.shape[1]):
+    n_motion = int(settings[N_MOTION])
+    further = LIMITS + 2 * int(settings[N_CONTROLS]) + n_motion
+    for k in range(n_motion):
         goal = tasks[i, further + k]
-        if not math.isnan(goal) and abs(sim.motion[i, k] - goal) > settings[MOTION_TOLERANCE]:
+        if not math.isnan(goal) and abs(sim.robots[i, k] - goal) > settings[MOTION_TOLERANCE]:
             return False
     heading = tasks[i, GOAL + 2]
     if math.isnan(heading):

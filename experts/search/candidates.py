@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.robots.moves import HEADINGS
+from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import (
     Limits,
@@ -186,7 +187,7 @@ class CandidateSearch:
         lattice = self.lattice
         speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
         plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
-        return Metric(speed, plane, lattice.cell, lattice.weights[0], moves.targets, moves.points, moves.weights)
+        return Metric(speed, plane, lattice.cell, *lattice.weights, moves.targets, moves.points, moves.weights)
 
     def _grow(self) -> None:
         """Compute the trees from the start and from the goal, and the nodes at which they meet, in order of cost."""
@@ -195,8 +196,9 @@ class CandidateSearch:
         ends = self.lattice.nodes_around(*scenario.goal, metric.plane)
         bound = _plane_costs(metric, seeds)
         limits = Limits(self._reach, self.slack, math.inf)
-        cost_behind, behind, limit = tree(metric, ends, seeds, bound, False, limits)
-        cost_ahead, ahead, _ = tree(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
+        grow = tree if self.lattice.moves.rotating and len(metric.speed) == 1 else general_tree
+        cost_behind, behind, limit = grow(metric, ends, seeds, bound, False, limits)
+        cost_ahead, ahead, _ = grow(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
         self._meetings = meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit)
 

@@ -16,7 +16,7 @@ from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CUBE, FLAGS, INDICES, INTEGERS, LINKS, MATRIX, NOTHING, VECTOR, tuple_of
-from leapnav.envs.robots.moves import DIRECTIONS, HEADINGS
+from leapnav.envs.robots.moves import ANGLES, DIRECTIONS, HEADINGS, ROTATING_MOVES
 
 # Number of buckets of the circular bucket queue, and number of buckets that cover the cost of the shortest path.
 BUCKETS, BUCKETS_PER_COST = 4096, 2000
@@ -24,7 +24,7 @@ MAX_BUCKET_INDEX = 1e15  # before the conversion to an integer: costs deep in an
 
 
 @kernel(int64(INDICES, LINKS, int64))
-def _dequeue(bucket, links, node):
+def dequeue(bucket, links, node):
     """Remove a node from its bucket; return 1, or 0 if it is in none."""
     index = links[node, 2]
     if index < 0:
@@ -41,12 +41,12 @@ def _dequeue(bucket, links, node):
 
 
 @kernel(int64(INDICES, LINKS, int64, int64))
-def _enqueue(bucket, links, node, index):
+def enqueue(bucket, links, node, index):
     """Move a node into a bucket; return the number of nodes by which the queue grew, 0 or 1.
 
     The rows of `links` (nodes, 3) are the previous and the next node in the bucket's list, and the bucket; -1 for none.
     """
-    grown = 1 - _dequeue(bucket, links, node)
+    grown = 1 - dequeue(bucket, links, node)
     head = bucket[index]
     links[node, 0], links[node, 1], links[node, 2] = -1, head, index
     if head >= 0:
@@ -64,6 +64,7 @@ class Metric(NamedTuple):
         plane: its minimum over the layers.
         cell: side of a cell (m).
         speed_weight: weight of squared distances.
+        turn_weight: weight of squared changes of the heading.
         targets, points, weights: the robot's moves, see `leapnav.envs.robots.moves.Moves`.
 
     """
@@ -72,6 +73,7 @@ class Metric(NamedTuple):
     plane: np.ndarray
     cell: float
     speed_weight: float
+    turn_weight: float
     targets: np.ndarray
     points: np.ndarray
     weights: np.ndarray
@@ -111,6 +113,7 @@ METRIC = record_type(
     plane=MATRIX,
     cell=float64,
     speed_weight=float64,
+    turn_weight=float64,
     targets=int64[:, :, ::1],
     points=int64[:, :, :, ::1],
     weights=CUBE,
@@ -146,13 +149,13 @@ def plane_costs(metric, seeds):
         node = seeds.nodes[k]
         if seeds.costs[k] < cost[node]:
             cost[node] = seeds.costs[k]
-            waiting += _enqueue(bucket, links, node, int(min(seeds.costs[k] / width, BUCKETS - 1.0)))
+            waiting += enqueue(bucket, links, node, int(min(seeds.costs[k] / width, BUCKETS - 1.0)))
     while waiting > 0:
         node = bucket[current % BUCKETS]
         if node < 0:
             current += 1
             continue
-        waiting -= _dequeue(bucket, links, node)
+        waiting -= dequeue(bucket, links, node)
         here = 2 * (node // lines) * stride + 2 * (node % lines)
         for k in range(HEADINGS):
             following = node + ahead[k]
@@ -161,7 +164,7 @@ def plane_costs(metric, seeds):
             if total < cost[following]:
                 cost[following] = total
                 index = min(max(int(min(total / width, MAX_BUCKET_INDEX)), current), current + BUCKETS - 1)
-                waiting += _enqueue(bucket, links, following, index % BUCKETS)
+                waiting += enqueue(bucket, links, following, index % BUCKETS)
     return cost
 
 
@@ -169,37 +172,38 @@ def plane_costs(metric, seeds):
 def tree(metric, seeds, ends, rest, exact, limits):
     """Compute the tree of shortest paths from the seeds by A* search with the lower bounds `rest`.
 
+    For robots that rotate in place, with one layer of speeds; see `leapnav.experts.search.general_paths` for others.
+
     `rest` is a lower bound of the remaining cost to the ends, per cell, or per node if `exact`. Nodes are omitted if
     the paths through them cost more than the limit. Once the cost of the best end is known, the limit is `reach`
     times that cost plus `slack`.
 
     Returns the cost of each node, its predecessor (-1 for none), and the limit.
     """
-    speed, targets = metric.speed, metric.targets
+    speed, cell, speed_weight, turn_weight = metric.plane, metric.cell, metric.speed_weight, metric.turn_weight
     reach, slack, limit = limits.reach, limits.slack, limits.limit
-    lines, stride = (speed.shape[2] + 1) // 2, speed.shape[2]
+    lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
     flat = speed.ravel()
-    size = (speed.shape[1] + 1) // 2 * lines * HEADINGS
-    layer = 0 if len(speed) == 1 else speed.shape[1] * stride
+    size = (speed.shape[0] + 1) // 2 * lines * HEADINGS
     cost = np.full(size, np.inf)
     parent = np.full(size, -1, dtype=np.int32)
     arrival = np.full(size, np.inf)
     for k in range(len(ends.nodes)):
         arrival[ends.nodes[k]] = min(arrival[ends.nodes[k]], ends.costs[k])
-    count, n_points = targets.shape[1], metric.points.shape[2]
+    count = ROTATING_MOVES.shape[1]
     ahead, cells = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count), np.int64)
-    offsets, length = np.empty((HEADINGS, count, n_points), np.int64), np.empty((HEADINGS, count))
-    is_straight = n_points == 3  # one application of Simpson's rule, with fewer multiplications
+    middle, length = np.empty((HEADINGS, count), np.int64), np.empty((HEADINGS, count))
     for k in range(HEADINGS):
         for move in range(count):
-            dx, dy, change = targets[k, move]
+            dx, dy, change = ROTATING_MOVES[k, move]
             other = (k + change) % HEADINGS
+            turn = abs(ANGLES[other] - ANGLES[k])
+            turn = min(turn, 2.0 * math.pi - turn)
             cells[k, move] = dx * lines + dy
             ahead[k, move] = (dx * lines + dy) * HEADINGS + other - k
-            length[k, move] = metric.weights[k, move, 0]
-            for i in range(n_points):
-                a, b = metric.points[k, move, i]
-                offsets[k, move, i] = layer * (k if 2 * i <= n_points else other) + a * stride + b
+            middle[k, move] = dx * stride + dy
+            square = speed_weight * (dx * dx + dy * dy) * cell * cell + turn_weight * turn * turn
+            length[k, move] = math.sqrt(square) / 6.0
     first = np.inf
     for k in range(len(seeds.nodes)):
         node = seeds.nodes[k]
@@ -217,14 +221,14 @@ def tree(metric, seeds, ends, rest, exact, limits):
         # `rest` is infinite for a seed without a path to the ends, and so is the limit while it is unknown.
         if seeds.costs[k] < cost[node] and bound <= limit and bound < np.inf:
             cost[node] = seeds.costs[k]
-            waiting += _enqueue(bucket, links, node, int(min((bound - first) / width, BUCKETS - 1.0)))
+            waiting += enqueue(bucket, links, node, int(min((bound - first) / width, BUCKETS - 1.0)))
     best = np.inf
     while waiting > 0:
         node = bucket[current % BUCKETS]
         if node < 0:
             current += 1
             continue
-        waiting -= _dequeue(bucket, links, node)
+        waiting -= dequeue(bucket, links, node)
         key = cost[node]
         k = node % HEADINGS
         position = node // HEADINGS
@@ -236,13 +240,8 @@ def tree(metric, seeds, ends, rest, exact, limits):
         here = 2 * (position // lines) * stride + 2 * (position % lines)
         for move in range(count):
             following = node + ahead[k, move]
-            at = offsets[k, move]
-            if is_straight:
-                total = key + length[k, move] * (flat[here + at[0]] + 4.0 * flat[here + at[1]] + flat[here + at[2]])
-            else:
-                total = key
-                for i in range(n_points):
-                    total += metric.weights[k, move, i] * flat[here + at[i]]
+            between = middle[k, move]
+            total = key + length[k, move] * (flat[here] + 4.0 * flat[here + between] + flat[here + 2 * between])
             if total < cost[following]:
                 bound = total + (rest[following] if exact else rest[position + cells[k, move]])
                 if bound <= limit and bound < np.inf:
@@ -253,7 +252,7 @@ def tree(metric, seeds, ends, rest, exact, limits):
                     index = min(
                         max(int(min((bound - first) / width, MAX_BUCKET_INDEX)), current), current + BUCKETS - 1
                     )
-                    waiting += _enqueue(bucket, links, following, index % BUCKETS)
+                    waiting += enqueue(bucket, links, following, index % BUCKETS)
     return cost, parent, limit
 
 
