@@ -78,7 +78,9 @@ def _attributes_section(found: griffe.Class) -> str:
 
 def _rewrite(found: griffe.Object) -> None:
     if found.docstring is not None:
-        if isinstance(found, griffe.Class) and any(str(base) == "_Frozen" for base in found.bases):
+        if isinstance(found, griffe.Class) and any(
+            str(base) in ("Frozen", "RobotModel", "Unicycle") for base in found.bases
+        ):
             # A pydantic model has no `__init__`; its arguments are its attributes.
             found.docstring.value = found.docstring.value.replace("Args:", "Attributes:", 1)
         found.docstring.value = _STAR.sub(lambda star: star[1] or r"\*", rewritten(found.docstring.value))

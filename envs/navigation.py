@@ -26,7 +26,7 @@ NOISE_STREAM = 1  # of the environment's seed; the stream of the scenarios is th
 
 
 class NavigateEnv(gym.Env[Any, np.ndarray]):
-    r"""A two-wheeled robot drives to a goal pose among obstacles, in a fixed time and at minimum cost.
+    r"""A wheeled robot drives to a goal pose among obstacles, in a fixed time and at minimum cost.
 
     ## Description
     The robot has a fixed time, the horizon, to reach the goal pose without a collision. The reward is minus the running
@@ -34,14 +34,19 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     optimal policy is therefore `-J*`, up to terms of second order in the control period, where `J*` is the minimum cost
     of the scenario. `leapnav.experts.find_optimum` computes the best known value of `J*`, and scenario banks store it.
 
+    The argument `robot` selects the model of the robot: `"unicycle"`, `"differential_drive"`, `"car"`,
+    `"dynamic_unicycle"` or one's own, see `leapnav.envs.RobotModel`. The tables of this page describe the unicycle; for
+    other robots the action and the part `motion` of the observation differ.
+
     The motion is simulated with pymunk. With `actuation="velocity"` and without contact, the robot follows the exact
-    circular arc of each action.
+    path of each action, for the unicycle a circular arc.
 
     `gym.make_vec("leapnav/Navigate-v0", num_envs=1024)` simulates many robots in one process, see `NavigateVectorEnv`.
     `leapnav/NavigateGoal-v0` is the same task for goal-conditioned learners, see `NavigateGoalEnv`.
 
     ## Action space
-    `Box(-1, 1, (2,), float32)`. The action is held for one control period. Values outside the bounds are clipped.
+    `Box(-1, 1, (m,), float32)` for a robot with m controls: each control divided by its limit. The action is held for
+    one control period. Values outside the bounds are clipped. For the unicycle:
 
     | Index | Action | Unit | -1 | +1 |
     |---|---|---|---|---|
@@ -64,6 +69,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | | 5, 6 | goal position divided by the time left: ahead, to the left | m/s | -20 to 20 |
     | | 7 | distance to the goal divided by the time left | m/s | 0 to 20 |
     | | 8 | angle to the goal heading divided by the time left; 0 if the goal heading is free | rad/s | -20 to 20 |
+    | `motion` (robots with further states) | k | further state k of the robot's model, such as speed and turn rate; a heading relative to that of the robot | | -20 to 20 |
     | `motion` (`"motor"` only) | 0, 1 | velocity in the robot's frame: ahead, to the left | m/s | -20 to 20 |
     | | 2 | turn rate | rad/s | -20 to 20 |
     | `lidar` (`"lidar"` only) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
@@ -83,7 +89,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
 
     | Part | Value | When |
     |---|---|---|
-    | `effort` | minus the integral of 1/2 (speed_weight v^2 + turn_weight omega^2) over the step | always |
+    | `effort` | minus the integral of the running cost without the proximity cost over the step, for the unicycle 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
     | `proximity` | minus the integral of the proximity cost Phi over the step | always |
     | `collision` | `-collision_penalty` | at the first collision of the episode |
     | `miss` | `-miss_penalty` | if the episode ends without reaching the goal, at the horizon or by a collision |
@@ -110,7 +116,8 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     The episode is `terminated` at the horizon, which is part of the task (the time left is observed), or at a
     collision. It is never `truncated`. With `terminate_on_collision=False`, the robot continues in contact with the
     obstacle, as simulated by pymunk, until the horizon. The episode is a success if, at the horizon, the robot is
-    within `position_tolerance` and `heading_tolerance` of the goal and has not collided.
+    within `position_tolerance` and `heading_tolerance` of the goal and has not collided. Further states of the robot
+    with a goal, such as the speed of the dynamic unicycle, must be within `motion_tolerance` of it.
 
     ## Info
     | Key | Content |
@@ -121,6 +128,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `is_success` | whether the episode is a success |
     | `time` | time since the start of the episode (s) |
     | `pose` | x, y (m), heading (rad, unwrapped) |
+    | `motion` | further states of the robot, if its model has any |
     | `reward_parts` | see Rewards |
     | `scenario` | after a reset: the `Scenario` |
     | `index`, `reference_cost` | after a reset, with a bank: index of the scenario, and cost of its optimum |
@@ -132,6 +140,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `scenario` | None | the scenario of all episodes |
     | `split` | `"train"` | the family's included bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
+    | `robot` | None | name of the robot's model, a dict of its fields with `model`, or a `RobotModel`; None for that of the scenario or the bank, otherwise the unicycle. Without an included bank for the robot, scenarios are fresh |
     | `observation` | `"lidar"` | `"lidar"`, `"state"` or `"map"` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |
     | `actuation` | `"velocity"` | `"velocity"` or `"motor"` |
@@ -141,6 +150,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `control_period` | 0.05 | duration of an action (s); the last period of an episode ends at the horizon |
     | `position_tolerance` | 0.1 | tolerance of success (m) |
     | `heading_tolerance` | 0.1 | tolerance of success (rad) |
+    | `motion_tolerance` | 0.1 | tolerance of success of further states (in their units) |
     | `collision_penalty`, `miss_penalty` | 50 | should exceed the cost of the optimum, or else not moving is optimal; 50 is sufficient for the families |
     | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
     | `terminate_on_collision` | True | whether a collision ends the episode |

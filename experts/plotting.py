@@ -49,7 +49,7 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
             axes.add_patch(Polygon(np.array(obstacle.polygon.vertices), facecolor=OBSTACLE, edgecolor=EDGE))
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
     for pose, color in ((scenario.start, START), (scenario.goal, GOAL)):
-        draw_robot(axes, pose, scenario.robot.radius, color)
+        draw_robot(axes, pose, scenario.discs, color)
     margin = 0.02 * (x_max - x_min)
     axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - margin, y_max + margin), aspect="equal")
     axes.set_xticks([])
@@ -58,13 +58,16 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
         spine.set_visible(False)
 
 
-def draw_robot(axes: Axes, pose: Any, radius: float, color: str, **style: Any) -> None:
-    """Draw the outline of a robot, and a line from its centre along its heading unless that is None."""
-    x, y, heading = pose
-    axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=color, **{"linewidth": 1.4, **style}))
+def draw_robot(axes: Axes, pose: Any, discs: np.ndarray, color: str, **style: Any) -> None:
+    """Draw the discs (D, 2) of a robot, and a line along its heading unless that is None."""
+    x, y, heading = pose[:3]
+    cos, sin = (1.0, 0.0) if heading is None else (np.cos(heading), np.sin(heading))
+    for offset, radius in discs:
+        centre = x + offset * cos, y + offset * sin
+        axes.add_patch(Circle(centre, radius, fill=False, edgecolor=color, **{"linewidth": 1.4, **style}))
     if heading is not None:
-        tip = x + 1.6 * radius * np.cos(heading), y + 1.6 * radius * np.sin(heading)
-        axes.plot([x, tip[0]], [y, tip[1]], color=color, **{"linewidth": 1.8, **style})
+        reach = max(offset + 1.6 * radius for offset, radius in discs)
+        axes.plot([x, x + reach * cos], [y, y + reach * sin], color=color, **{"linewidth": 1.8, **style})
 
 
 def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLike[str]) -> None:
@@ -217,7 +220,7 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
     if scenario is not None:
         draw_scenario(axes, scenario)
         for pose in poses[1:-1]:
-            draw_robot(axes, pose, scenario.robot.radius, OPTIMUM, alpha=0.3, zorder=3)
+            draw_robot(axes, pose, scenario.discs, OPTIMUM, alpha=0.3, zorder=3)
         return
     low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
     center, reach = (low + high) / 2, 0.6 * float((high - low).max()) or 1.0

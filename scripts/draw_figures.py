@@ -8,13 +8,23 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from leapnav.envs import FAMILIES, NavigateEnv, ScenarioBank, sample_scenario
+from leapnav.envs import (
+    FAMILIES,
+    Car,
+    DifferentialDrive,
+    DynamicUnicycle,
+    NavigateEnv,
+    ScenarioBank,
+    Unicycle,
+    sample_scenario,
+)
 from leapnav.envs.utils.colors import OPTIMUM
 from leapnav.experts import ExpertPolicy, find_optimum, plot_extremal, solve
-from leapnav.experts.plotting import draw_scenario
+from leapnav.experts.plotting import draw_robot, draw_scenario
 from leapnav.training import evaluate, load_policy, plot_episodes, policy_environment
 
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
+ROBOT_SCENARIOS = (("clutter", 11), ("rooms", 12), ("open", 4))  # families and seeds
 FAMILY_ROWS, FAMILY_INDICES = 3, (0, 1, 2)
 # Family, index in the test bank, and number of steps of the expert, of the three frames.
 FRAMES = (("clutter", 7, 124), ("polygons", 0, 110), ("slalom", 0, 364))
@@ -31,6 +41,21 @@ def draw_families() -> None:
             draw_scenario(axes[row, column], bank[index])
             axes[row, column].plot(*bank.states(index)[:, :2].T, color=OPTIMUM, linewidth=1.5)
     figure.savefig(IMAGES / "families.png", dpi=100)
+
+
+def draw_robots() -> None:
+    """Draw three scenarios with the optima of each robot."""
+    for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle):
+        figure = Figure(figsize=(9.6, 3.3), layout="constrained")
+        for axes, (family, seed) in zip(figure.subplots(1, 3), ROBOT_SCENARIOS, strict=True):
+            scenario = sample_scenario(family, seed, model())
+            optimum = find_optimum(scenario)
+            draw_scenario(axes, scenario)
+            for pose in optimum.evaluate(np.linspace(0.0, scenario.horizon, 12))[0][1:-1]:
+                draw_robot(axes, pose, scenario.discs, OPTIMUM, alpha=0.3)
+            axes.plot(*optimum.states[:, :2].T, color=OPTIMUM, linewidth=1.5)
+            axes.set_title(f"{family}, J = {optimum.cost:.2f}")
+        figure.savefig(IMAGES / f"robot_{model.name()}.png", dpi=100)
 
 
 def draw_frames() -> None:
@@ -53,6 +78,7 @@ def draw_frames() -> None:
 def main() -> None:
     """Write all figures."""
     draw_families()
+    draw_robots()
     draw_frames()
     scenario = sample_scenario("clutter", 910065)
     plot_extremal(find_optimum(scenario), IMAGES / "solution.png", scenario)

@@ -29,8 +29,7 @@ from leapnav.envs.scenarios.scenario import Cost
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts import ExpertPolicy, OptimalControlProblem, find_optimum
 from leapnav.experts.acting.policy import plan_actions
-from leapnav.experts.problem.switching import switching_functions
-from leapnav.experts.problem.system import system_of
+from leapnav.experts.problem.system import switching_functions, system_of
 
 ROBOTS = {model.name(): model for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer)}
 BOX = [{"offset": offset, "radius": 0.16} for offset in (-0.2, 0.0, 0.2)]

@@ -202,10 +202,6 @@ class RobotModel(Frozen):
         """
         return None
 
-    def outline(self) -> np.ndarray | None:
-        """Return the outline as a polygon (K, 2) in the robot's frame (m), or None for that of the footprint."""
-        return None
-
     @classmethod
     def sizes(cls) -> tuple[int, int]:
         """Return the numbers of states and of controls."""

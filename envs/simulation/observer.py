@@ -30,7 +30,7 @@ class Observer:
 
         Args:
             scenarios: N scenarios.
-            states (N, 3): x, y (m) and heading (rad).
+            states (N, n): x, y (m), heading (rad) and further states of the robot.
             times (N,): times since the start of the episode (s).
 
         """
@@ -41,7 +41,8 @@ class Observer:
             part = slice(first, min(first + BATCH, count))
             robots = np.arange(part.stop - first)
             simulator.reset(robots, scenarios[part])
-            simulator.poses[robots] = states[part]
+            simulator.poses[robots] = states[part, :3]
+            simulator.motion[robots] = states[part, 3:]
             simulator.state[robots, TIME] = times[part]
             simulator.observe(rows, robots)
             observations[part] = rows[robots]

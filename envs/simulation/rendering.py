@@ -117,13 +117,17 @@ def draw_scene(scene: Scene) -> np.ndarray:
 
     if scene.optimum is not None:
         _draw_path(canvas, OPTIMUM, [to_pixels(x, y) for x, y in scene.optimum[:, :2].tolist()], 2 * line)
-    radius = scenario.robot.radius
+    discs = scenario.discs.tolist()
+    radius = min(disc_radius for _, disc_radius in discs)
     goal = scenario.goal
-    pygame.draw.circle(canvas, GOAL, to_pixels(goal[0], goal[1]), radius * scale, 2 * line)
+    cos, sin = math.cos(goal[2] or 0.0), math.sin(goal[2] or 0.0)
+    for offset, disc_radius in discs:
+        centre = to_pixels(goal[0] + offset * cos, goal[1] + offset * sin)
+        pygame.draw.circle(canvas, GOAL, centre, disc_radius * scale, 2 * line)
     if goal[2] is not None:
         _draw_arrow(canvas, GOAL, to_pixels, (goal[0], goal[1], goal[2]), radius, 2 * line)
     _draw_path(canvas, POLICY, [to_pixels(x, y) for x, y, _ in scene.trail], 2 * line)
-    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.pose, radius, scale)
+    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.pose, discs, scale)
     small = pygame.transform.smoothscale(canvas, (width // SUPERSAMPLING, height // SUPERSAMPLING))
     whole = pygame.Surface((small.get_width(), small.get_height() + STATUS_HEIGHT))
     whole.fill(WHITE)
@@ -172,16 +176,18 @@ def _draw_robot(
     color: str,
     to_pixels: ToPixels,
     pose: tuple[float, float, float],
-    radius: float,
+    discs: Sequence[Sequence[float]],
     scale: float,
 ) -> None:
     x, y, heading = pose
     cos, sin = math.cos(heading), math.sin(heading)
+    radius = min(disc_radius for _, disc_radius in discs)
 
     def outline(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         return [to_pixels(x + radius * (a * cos - b * sin), y + radius * (a * sin + b * cos)) for a, b in corners]
 
-    pygame.draw.circle(canvas, color, to_pixels(x, y), radius * scale)
+    for offset, disc_radius in discs:
+        pygame.draw.circle(canvas, color, to_pixels(x + offset * cos, y + offset * sin), disc_radius * scale)
     for side in (-0.75, 0.75):  # wheels
         wheel = [(a, side + b) for a, b in ((-0.4, -0.12), (0.4, -0.12), (0.4, 0.12), (-0.4, 0.12))]
         pygame.draw.polygon(canvas, WHEEL, outline(wheel))

@@ -28,7 +28,7 @@ from leapnav.envs.utils.validation import (
     check_positive,
 )
 from leapnav.experts.data.demonstrations import Demonstration
-from leapnav.experts.problem.switching import switching_functions
+from leapnav.experts.problem.system import switching_functions
 from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.symmetries import mirror, time_reverse
