@@ -198,6 +198,28 @@ def test_robot_and_cost_are_edited_and_an_invalid_number_is_reported(page):
     assert page.evaluate("play.scenario") == scenario.to_dict() and page.inner_text("#status") == "Certified optimum"
 
 
+@pytest.mark.parametrize("model", ["car", "dynamic_unicycle", "differential_drive"])
+def test_another_robot_is_chosen(page, model):
+    load(page, SCENARIO.to_dict())
+    page.click("text=Robot and cost")
+    page.select_option("#model", model)
+    rest(page)
+    scenario = Scenario.from_dict(page.evaluate("play.scenario"))
+    assert scenario.robot.model == model
+    assert page.inner_text("#cost") == f"{find_optimum(scenario).cost:.6f}"
+    assert page.is_disabled("#drive")
+    assert page.is_disabled("#turn-weight") == ("turn_weight" not in scenario.robot.cost_fields)
+    field = {"car": "wheelbase", "dynamic_unicycle": "max_acceleration", "differential_drive": "track"}[model]
+    page.fill(f"#{field.replace('_', '-')}", "0.8")
+    page.keyboard.press("Enter")
+    rest(page)
+    changed = Scenario.from_dict(page.evaluate("play.scenario"))
+    assert getattr(changed.robot, field) == 0.8
+    page.select_option("#model", "unicycle")
+    rest(page)
+    assert Scenario.from_dict(page.evaluate("play.scenario")) == SCENARIO
+
+
 def test_a_link_contains_the_scenario(page):
     scenario = fields(name="ein Weg, 42 °", goal=[6.5, 3, 0.25])
     load(page, scenario)

@@ -10,6 +10,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
 from leapnav.envs.utils.validation import is_finite_number
+from leapnav.experts.data.demonstrations import state_of
 from leapnav.experts.optimum import find_reached_optimum
 
 MAX_DRIVE_HORIZON = 300.0  # s
@@ -118,26 +119,26 @@ def _describe(
         "collision": bool(info["collision"]),
         "stopped": not done,
         "cost": float(info["cost"]),
-        "regret": regret(scenario, info["pose"], float(info["cost"])) if success else None,
+        "regret": regret(scenario, state_of(info), float(info["cost"])) if success else None,
     }
 
 
-def regret(scenario: Scenario, pose: Sequence[float] | np.ndarray, cost: float) -> float | None:
-    """Return (J - J*)/J* of a successful episode, with the optimum J* for the pose that it reached.
+def regret(scenario: Scenario, state: Sequence[float] | np.ndarray, cost: float) -> float | None:
+    """Return (J - J*)/J* of a successful episode, with the optimum J* for the state that it reached.
 
     Args:
         scenario: the scenario of the episode.
-        pose: the last pose: x, y (m), heading (rad).
+        state: the last state: x, y (m), heading (rad), further states of the robot.
         cost: J of the episode.
 
     Returns:
         The regret. It is negative if the search did not find an optimum as good as the episode. None if no optimum for
-        the pose is certified.
+        the state is certified.
 
     """
     try:
-        optimum = find_reached_optimum(scenario, pose, cost)
-    except ScenarioError:  # the pose is in contact with an obstacle, up to rounding
+        optimum = find_reached_optimum(scenario, state, cost)
+    except ScenarioError:  # the state is in contact with an obstacle, up to rounding
         return None
     return (cost - optimum.cost) / optimum.cost if optimum.success and optimum.cost > 0 else None
 

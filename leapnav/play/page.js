@@ -2,7 +2,7 @@
 
 // The panels of the page and their controls.
 
-const SETTINGS = document.querySelectorAll("[data-group]"); // number inputs of robot and cost
+const settings = () => document.querySelectorAll("[data-group]"); // number inputs of robot and cost
 
 // ---- Display
 
@@ -84,21 +84,51 @@ function alternativeRow(row, i, path) {
 function showSettings() {
   if (!play.scenario) return;
   if (document.activeElement !== byId("horizon")) byId("horizon").value = play.scenario.horizon;
-  for (const input of SETTINGS) {
-    const value = (play.scenario[input.dataset.group] || {})[input.dataset.field];
+  showRobotFields();
+  const { weights } = robotOf(play.scenario);
+  for (const input of settings()) {
+    const { group, field } = input.dataset, value = (play.scenario[group] || {})[field];
     if (document.activeElement !== input) input.value = value === undefined ? "" : value;
+    if (field === "speed_weight" || field === "turn_weight") input.disabled = !weights.includes(field);
   }
+  byId("drive").disabled = modelOf(play.scenario) !== "unicycle";
+}
+
+const modelOf = (scenario) => (scenario.robot || {}).model || "unicycle";
+
+let shownModel = null; // the model whose numbers have inputs
+
+function showRobotFields() {
+  const model = modelOf(play.scenario);
+  byId("model").value = model;
+  if (model === shownModel) return;
+  shownModel = model;
+  const numbers = Object.keys(robotOf(play.scenario).fields).filter((field) => field !== "model");
+  byId("robot-fields").replaceChildren(...numbers.flatMap((field) => {
+    const label = document.createElement("label"), input = document.createElement("input");
+    input.id = label.htmlFor = field.replaceAll("_", "-");
+    label.textContent = `${field[0].toUpperCase()}${field.slice(1).replaceAll("_", " ")}`;
+    Object.assign(input, { type: "number", min: 0, step: 0.05 });
+    Object.assign(input.dataset, { group: "robot", field });
+    return [label, input];
+  }));
 }
 
 // ---- Controls
 
-for (const input of SETTINGS) {
-  input.addEventListener("change", () => {
-    if (!canEdit()) return;
-    const { group, field } = input.dataset;
-    edit({ [group]: { ...play.scenario[group], [field]: Number(input.value) } });
-  });
-}
+document.addEventListener("change", ({ target: input }) => {
+  const { group, field } = input.dataset;
+  if (group && canEdit()) edit({ [group]: { ...play.scenario[group], [field]: Number(input.value) } });
+});
+
+// Another model starts with its defaults and the present radius; weights that it does not use get their default.
+byId("model").addEventListener("change", () => {
+  if (!canEdit()) return;
+  const { fields, weights } = play.robots[byId("model").value], { start_motion, goal_motion, ...scenario } = play.scenario;
+  const cost = Object.entries(scenario.cost || {}).filter(([name]) => name.startsWith("proximity") || weights.includes(name));
+  const radius = scenario.robot && scenario.robot.radius;
+  replaceScenario({ ...scenario, robot: { ...fields, ...(radius ? { radius } : {}) }, cost: Object.fromEntries(cost) });
+});
 
 byId("horizon").addEventListener("change", () => {
   if (canEdit()) edit({ horizon: Number(byId("horizon").value) });
@@ -177,6 +207,8 @@ observer.observe(byId("plots"));
   try {
     const initial = await request("/initial");
     play.colors = initial.colors;
+    play.robots = initial.robots;
+    for (const model of Object.keys(initial.robots)) byId("model").add(new Option(model.replaceAll("_", " "), model));
     document.documentElement.style.setProperty("--failure", initial.colors.failure);
     for (const policy of initial.policies) byId("policy").add(new Option(policy, policy));
     if (await openLink()) return;

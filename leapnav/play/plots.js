@@ -140,13 +140,12 @@ function drawPlots(width, height) {
   context.fillText(shownPathName(), boxes[0].left, headingHeight - 2 * unit);
   const marks = play.time === null ? [] : [[play.time, play.colors.optimum]];
   const at = (box, title, lines, options) => drawPlot(box, title, lines, path.times, { marks, ...options });
-  at(boxes[0], "Controls", [
-    ["v (m/s)", column(path.controls, 0), curves[0]], ["ω (rad/s)", column(path.controls, 1), curves[1]],
-  ], { minRange: 0.1 });
-  at(boxes[1], "Costates", [
-    ["λx (1/m)", column(path.costates, 0), curves[0]], ["λy (1/m)", column(path.costates, 1), curves[1]],
-    ["λθ (1/rad)", column(path.costates, 2), curves[2]],
-  ], { minRange: 0.1 });
+  const { controls, states } = robotOf(play.scenario), isUnicycle = modelOf(play.scenario) === "unicycle";
+  const controlNames = isUnicycle ? ["v (m/s)", "ω (rad/s)"] : controls;
+  const costateNames = states.map((name, i) => ["λx (1/m)", "λy (1/m)", "λθ (1/rad)"][i] || `λ ${name.split(" (")[0]}`);
+  const lines = (names, rows) => names.map((name, i) => [name, column(rows, i), curves[i]]);
+  at(boxes[0], "Controls", lines(controlNames, path.controls), { minRange: 0.1 });
+  at(boxes[1], "Costates", lines(costateNames, path.costates), { minRange: 0.1 });
   at(boxes[2], "Hamiltonian", [["H (1/s)", path.hamiltonian, curves[5]]], { minRange: 1e-3 });
   at(boxes[3], "Clearance (m)", [["", path.clearances, curves[5]]], { minRange: 0.1, includesZero: true });
   drawAbscissa(boxes, "0", `${play.scenario.horizon} s`, "time", height);

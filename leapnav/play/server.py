@@ -16,6 +16,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.scenario import Scenario, check_headings
 from leapnav.envs.utils import colors
 from leapnav.experts.acting.policy import NoOptimumError
@@ -62,6 +63,24 @@ Endpoint = Callable[[Request], Awaitable[Response]]
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
 
 
+def robots() -> dict[str, dict[str, Any]]:
+    """Return, for each robot model, a robot with the defaults, its labels, and the weights of the cost that it uses."""
+    described = {}
+    for name, model in MODELS.items():
+        fields = model().model_dump(mode="json", exclude_none=True)
+        names = (*model.state_names, *model.control_names)
+        units = (*model.state_units, *model.control_units)
+        labels = [f"{label.replace('_', ' ')} ({unit})" for label, unit in zip(names, units, strict=True)]
+        n = len(model.state_names)
+        described[name] = {
+            "fields": fields,
+            "states": labels[:n],
+            "controls": labels[n:],
+            "weights": list(model.cost_fields),
+        }
+    return described
+
+
 def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") -> Starlette:
     """Return the web application.
 
@@ -74,7 +93,9 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
     """
 
     async def initial(request: Request) -> Response:
-        return JSONResponse({"scenario": scenario.to_dict(), "policies": solver.policies, "colors": COLORS})
+        return JSONResponse(
+            {"scenario": scenario.to_dict(), "policies": solver.policies, "colors": COLORS, "robots": robots()}
+        )
 
     async def bank(request: Request) -> Response:
         index = request.query_params.get("index", "0")

@@ -14,7 +14,7 @@ import numpy as np
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import check_family
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.utils.validation import check_choice, check_integer
 from leapnav.experts.optimum import Optimum, as_optimum, find_optimum, shortest_horizon
 from leapnav.experts.problem.extremal import Extremal, Status
@@ -168,10 +168,15 @@ def _path(scenario: Scenario, optimum: Optimum, points: int = OPTIMUM_POINTS) ->
         "controls": _rows(controls),
         "costates": _rows(costates),
         "hamiltonian": np.interp(times, optimum.times, optimum.hamiltonian).tolist(),
-        "clearances": np.round(clearances(optimum.interpolate(times)[:, :2], scenario.field), 6).tolist(),
+        "clearances": np.round(_clearances(scenario, optimum.interpolate(times)), 6).tolist(),
         "residual": None if certificate is None else max(certificate.residual, certificate.defect),
         "conjugate_point": None if certificate is None else certificate.conjugate_point,
     }
+
+
+def _clearances(scenario: Scenario, values: np.ndarray) -> np.ndarray:
+    """Return the clearance (m) of the robot at states and costates (N, 2n)."""
+    return footprint_clearances(values, scenario.discs, scenario.field)
 
 
 def _summary(optimum: Optimum, points: int) -> dict[str, Any]:

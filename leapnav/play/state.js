@@ -27,6 +27,7 @@ const play = (window.play = {
   error: null,
   notice: null, // a line that is shown until the next change
   colors: null, // by name, from the server
+  robots: {}, // by model, from the server: defaults, names of states and controls, weights of the cost
   lesson: null, // the open lesson, see lessons.js
   driving: null, // the person's episode in progress, see driving.js
   undo: [], // earlier scenarios
@@ -35,6 +36,8 @@ const play = (window.play = {
 });
 let drag = null, following = false, searching = false, changed = false, searchTimer = null, revision = 0;
 let moveTime = null; // time (ms) of the first pointer move that is in no request yet
+
+const robotOf = (scenario) => play.robots[(scenario.robot || {}).model || "unicycle"];
 
 // ---- Requests
 
@@ -175,9 +178,13 @@ let lastGroup = null;
 
 // Changes fields of the scenario. Successive changes with the same group, such as those of a drag, are undone together.
 function edit(fields, group = null) {
+  replaceScenario({ ...play.scenario, ...fields }, group);
+}
+
+function replaceScenario(scenario, group = null) {
   if (group === null || group !== lastGroup) remember();
   lastGroup = group;
-  play.scenario = { ...play.scenario, ...fields };
+  play.scenario = scenario;
   scenarioChanged();
 }
 
