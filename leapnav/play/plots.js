@@ -142,7 +142,8 @@ function drawPlots(width, height) {
   const at = (box, title, lines, options) => drawPlot(box, title, lines, path.times, { marks, ...options });
   const { controls, states } = robotOf(play.scenario), isUnicycle = modelOf(play.scenario) === "unicycle";
   const controlNames = isUnicycle ? ["v (m/s)", "ω (rad/s)"] : controls;
-  const costateNames = states.map((name, i) => ["λx (1/m)", "λy (1/m)", "λθ (1/rad)"][i] || `λ ${name.split(" (")[0]}`);
+  const poseNames = isUnicycle ? ["λx (1/m)", "λy (1/m)", "λθ (1/rad)"] : ["λx", "λy", "λθ"]; // little room for more
+  const costateNames = states.map((name, i) => poseNames[i] || `λ ${name.split(" (")[0]}`);
   const lines = (names, rows) => names.map((name, i) => [name, column(rows, i), curves[i]]);
   at(boxes[0], "Controls", lines(controlNames, path.controls), { minRange: 0.1 });
   at(boxes[1], "Costates", lines(costateNames, path.costates), { minRange: 0.1 });
