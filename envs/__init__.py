@@ -7,11 +7,13 @@ from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
 from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Scenario, ScenarioError
 from leapnav.envs.settings import Disturbance, Motor
+from leapnav.envs.shapes import Capsule, Shape
 from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 
 __all__ = [
     "FAMILIES",
     "BankError",
+    "Capsule",
     "Car",
     "Circle",
     "Cost",
@@ -31,6 +33,7 @@ __all__ = [
     "Scenario",
     "ScenarioBank",
     "ScenarioError",
+    "Shape",
     "Unicycle",
     "sample_scenario",
 ]

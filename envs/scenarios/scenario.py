@@ -12,19 +12,29 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
-from pydantic_core import ErrorDetails
+from pydantic import (
+    BaseModel,
+    SerializationInfo,
+    SerializeAsAny,
+    ValidationError,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails
 
 from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
+from leapnav.envs.shapes import Circle, Polygon, Shape
+from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Point, Positive
+from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Positive
 from leapnav.envs.utils.validation import check_positive, suggestion
 
 # Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
@@ -61,53 +71,65 @@ class Cost(Frozen):
     proximity_scale: Positive = 0.1
 
 
-class Circle(Frozen):
-    """A disc obstacle: center (x, y) and radius (m)."""
-
-    center: Point
-    radius: Positive
-
-
-class Polygon(Frozen):
-    """A convex polygon obstacle: at least three vertices (x, y) (m), in either orientation."""
-
-    vertices: tuple[Point, ...]
-
-    @field_validator("vertices")
-    @classmethod
-    def _check_convex(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
-        if len(vertices) < 3:
-            raise ValueError(f"a polygon needs at least 3 vertices, this one has {len(vertices)}")
-        points = np.asarray(vertices)
-        edges = np.roll(points, -1, axis=0) - points
-        following = np.roll(edges, -1, axis=0)
-        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-        angles = np.arctan2(turns, np.sum(edges * following, axis=1))
-        # The boundary of a convex polygon turns in one direction only, by 2 pi in total (that of a star by more).
-        same_direction = bool(np.all(turns > 0) or np.all(turns < 0))
-        if not same_direction or not math.isclose(abs(float(angles.sum())), 2 * math.pi, rel_tol=1e-6):
-            raise ValueError("the polygon is not strictly convex; write a non-convex obstacle as several convex ones")
-        return vertices
-
-
 class Obstacle(Frozen):
-    """An obstacle: exactly one of a circle or a polygon, `{"circle": {...}}` or `{"polygon": {...}}` in the file."""
+    """An obstacle: exactly one shape, given by its kind: `Obstacle(circle=Circle(...))`, `{"circle": {...}}` in the file.
 
-    circle: Circle | None = None
-    polygon: Polygon | None = None
+    The kinds are the registered shapes, see `leapnav.envs.shapes.Shape`.
 
-    @model_validator(mode="after")
-    def _check_one_shape(self) -> Self:
-        if (self.circle is None) == (self.polygon is None):
-            raise ValueError("an obstacle is exactly one of 'circle' or 'polygon'")
-        return self
+    Attributes:
+        shape: the shape.
+
+    """
+
+    shape: Shape
+
+    if TYPE_CHECKING:
+
+        def __init__(self, **shape: Shape | None) -> None: ...
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_shape(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping):
+            return fields
+        given = {kind: shape for kind, shape in fields.items() if shape is not None}
+        faults: list[InitErrorDetails] = [
+            {"type": "extra_forbidden", "loc": (kind,), "input": value}
+            for kind, value in given.items()
+            if kind not in KINDS
+        ]
+        if not faults and len(given) != 1:
+            kinds = [repr(kind) for kind in KINDS]
+            raise ValueError(f"an obstacle is exactly one of {', '.join(kinds[:-1])} or {kinds[-1]}")
+        if not faults:
+            ((kind, value),) = given.items()
+            try:
+                return {"shape": KINDS[kind].model_validate(value)}
+            except ValidationError as error:
+                faults = [_inside(kind, details) for details in error.errors(include_url=False)]
+        raise ValidationError.from_exception_data(cls.__name__, faults)
+
+    @model_serializer
+    def _serialize(self, info: SerializationInfo) -> dict[str, Any]:
+        return {self.shape.kind: self.shape.model_dump(mode=info.mode, exclude_none=info.exclude_none)}
 
     @property
-    def shape(self) -> Circle | Polygon:
-        """The circle or the polygon."""
-        shape = self.circle or self.polygon
-        assert shape is not None  # validated
-        return shape
+    def circle(self) -> Circle | None:
+        """The circle, or None if the shape is another one."""
+        return self.shape if isinstance(self.shape, Circle) else None
+
+    @property
+    def polygon(self) -> Polygon | None:
+        """The polygon, or None if the shape is another one."""
+        return self.shape if isinstance(self.shape, Polygon) else None
+
+
+def _inside(kind: str, details: ErrorDetails) -> InitErrorDetails:
+    """Return a fault of a shape as one of its obstacle."""
+    fault: InitErrorDetails = {"type": details["type"], "loc": (kind, *details["loc"]), "input": details["input"]}
+    if "ctx" in details:
+        fault["ctx"] = details["ctx"]
+    return fault
 
 
 class Scenario(Frozen):
@@ -120,7 +142,7 @@ class Scenario(Frozen):
         start: pose (x, y, heading) at time 0.
         goal: pose (x, y, heading) at the horizon; a heading of None is free.
         horizon: duration of the task (s).
-        obstacles: circles and convex polygons.
+        obstacles: the obstacles, which may overlap; each has one shape, see `Obstacle`.
         cost: weights of the running cost.
         start_motion: further states of the robot at time 0, such as speed and turn rate; None for zeros.
         goal_motion: further states at the horizon, each a number or None if it is free; None for those of the model.
@@ -496,12 +518,12 @@ def _known_fields(location: Sequence[Any], robot: type[BaseModel]) -> tuple[str,
         "robot": robot,
         "footprint": Disc,
         "cost": Cost,
-        "circle": Circle,
-        "polygon": Polygon,
+        **KINDS,
     }
     names = [key for key in location if isinstance(key, str)]
-    model = parts.get(names[-1], Obstacle) if names else Scenario
-    return tuple(model.model_fields)
+    if names and names[-1] not in parts:
+        return tuple(KINDS)
+    return tuple((parts[names[-1]] if names else Scenario).model_fields)
 
 
 __getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})
