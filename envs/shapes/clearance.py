@@ -36,8 +36,9 @@ def obstacle_distance(x, y, field):
             distance = math.sqrt(dx * dx + dy * dy) - rim
             if distance < best:
                 best, nearest = distance, int(field[indices + i])
-    at, others = first_polygon(field)
-    if others > 0:
+    others = 0
+    if field[RECORDS] > 0.0 and field[at] < 0.0:
+        at, others = first_polygon(field)
         best, found = nearest_record(x, y, field, others, best)
         if found >= 0:
             nearest = int(field[indices + circles + found])

@@ -20,8 +20,8 @@ The entries of the array are, by index:
 A cell lists the obstacles that contribute to the proximity cost somewhere in it, so that the work at a point does not
 depend on the number of distant obstacles. n and p are multiples of LANES; the remaining entries are obstacles without
 any contribution. Polygons with fewer than m edges are padded with edges without any contribution. With at most
-MAX_OBSTACLES_WITHOUT_GRID circles and polygons there is no grid: columns and lines are 0. Other shapes are not in the
-grid: a comparison with the circle of their proximity cost skips them.
+MAX_OBSTACLES_WITHOUT_GRID circles and polygons there is no grid, and columns and lines are 0, or a grid of one cell if
+there are other shapes. These are not in the grid: a comparison with the circle of their proximity cost skips them.
 """
 
 from __future__ import annotations
@@ -48,7 +48,11 @@ MAX_GRID_CELLS = 16  # per axis
 LANES = 8  # doubles in a vector register of 512 bits
 FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
 OUTLINE_MARGIN = 1.02  # factor of the circle through the outline, between whose points a shape may be larger
-N_DIRECTIONS, REACH_STEP, REACH_MARGIN = 64, 1.2, 1.1  # for the circle of the proximity cost; both factors of its radius
+N_DIRECTIONS, REACH_STEP, REACH_MARGIN = (
+    64,
+    1.2,
+    1.1,
+)  # for the circle of the proximity cost; both factors of its radius
 
 
 class FieldParts(NamedTuple):
@@ -145,7 +149,8 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
     if (
         len(a.circles) != len(b.circles)
         or [len(polygon) for polygon in a.polygons] != [len(polygon) for polygon in b.polygons]
-        or [(len(r), r[KIND], r[N_VERTICES]) for r in a.records] != [(len(r), r[KIND], r[N_VERTICES]) for r in b.records]
+        or [(len(r), r[KIND], r[N_VERTICES]) for r in a.records]
+        != [(len(r), r[KIND], r[N_VERTICES]) for r in b.records]
     ):
         raise ValueError("obstacles: two fields can be blended only if they contain the same kinds of obstacles")
     header = ((1.0 - fraction) * first[:GRID] + fraction * second[:GRID]).tolist()
@@ -224,8 +229,9 @@ def obstacle_centres(packed: np.ndarray) -> np.ndarray:
 
 def _pack_grid(packed: np.ndarray) -> np.ndarray:
     """Return the grid of a field. Obstacles contribute up to CUTOFF proximity scales from the robot's rim."""
-    circles, _, polygons = unpack_field(packed)
-    if len(circles) + len(polygons) <= MAX_OBSTACLES_WITHOUT_GRID:
+    circles, records, polygons = unpack_field(packed)
+    are_few = len(circles) + len(polygons) <= MAX_OBSTACLES_WITHOUT_GRID
+    if are_few and not records:
         return np.zeros(5)
     reach = packed[2] + CUTOFF * packed[1]
     # Obstacles may extend beyond the arena. A point outside the grid uses the nearest cell, which lists all obstacles
@@ -234,7 +240,7 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
     corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
     corners += [polygon[:, 3:] for polygon in polygons]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-    size = float(np.max(high - low)) / MAX_GRID_CELLS
+    size = float(np.max(high - low)) / (1 if are_few else MAX_GRID_CELLS)
     shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
     nearest = np.clip(circles[:, :2], first[:, None], first[:, None] + size)

@@ -17,7 +17,7 @@ from leapnav.envs.shapes.field import CIRCLES, CUTOFF, GRID, RECORDS, SHAPES
 from leapnav.envs.shapes.half_plane import wall_distance
 from leapnav.envs.shapes.polygon import half_plane_distance, polygon_derivatives, polygon_term
 from leapnav.envs.shapes.proximity_grid import grid_proximity
-from leapnav.envs.shapes.records import first_polygon, records_proximity, records_values
+from leapnav.envs.shapes.records import first_polygon, records_proximity
 
 VALUE_CUTOFF = 25.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 
@@ -49,13 +49,8 @@ def disc_proximity(x, y, radius, field):
             else:
                 gy -= slope
                 hyy += sign * slope * steepness
-    polygons, others = first_polygon(field)
-    if others > 0:
-        found = records_proximity(x, y, radius, field, others)
-        value, gx, gy = value + found[0], gx + found[1], gy + found[2]
-        hxx, hxy, hyy = hxx + found[3], hxy + found[4], hyy + found[5]
-    if field[int(field[GRID]) + 3] > 0.0:
-        found = grid_proximity(x, y, radius, field)
+    if field[int(field[GRID]) + 3] > 0.0:  # so that the loops below need not distinguish other shapes
+        found = _many_proximity(x, y, radius, field)
         gx, gy = gx + found[1], gy + found[2]
         return value + found[0], gx, gy, hxx + found[3], hxy + found[4], hyy + found[5]
     at = SHAPES
@@ -73,8 +68,7 @@ def disc_proximity(x, y, radius, field):
             hxx += bxx
             hxy += bxy
             hyy += byy
-    at = polygons
-    for _ in range(int(field[RECORDS]) - others):
+    for _ in range(int(field[RECORDS])):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges
@@ -112,6 +106,18 @@ def disc_proximity(x, y, radius, field):
     return value, gx, gy, hxx, hxy, hyy
 
 
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
+def _many_proximity(x, y, radius, field):
+    """Proximity cost of the obstacles of a field with a grid, without the walls, see `disc_proximity`."""
+    found = grid_proximity(x, y, radius, field)
+    others = first_polygon(field)[1]
+    if others == 0:
+        return found
+    more = records_proximity(x, y, radius, field, others)
+    value, gx, gy = found[0] + more[0], found[1] + more[1], found[2] + more[2]
+    return value, gx, gy, found[3] + more[3], found[4] + more[4], found[5] + more[5]
+
+
 @kernel(float64(float64, float64, float64, CONSTANT))
 def proximity_value(x, y, radius, field):
     """Proximity cost of a disc, without derivatives, to 1e-11 of the weight for each obstacle."""
@@ -145,11 +151,7 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
             first += math.exp((rim - softened_distance(xa - x, ya - y)) * steepness)
             second += math.exp((rim - softened_distance(xb - x, yb - y)) * steepness)
             third += math.exp((rim - softened_distance(xc - x, yc - y)) * steepness)
-    at, others = first_polygon(field)
-    if others > 0:
-        found = records_values((xa, xb, xc), (ya, yb, yc), radius, apart, field, others)
-        first, second, third = first + found[0], second + found[1], third + found[2]
-    for _ in range(int(field[RECORDS]) - others):
+    for _ in range(int(field[RECORDS])):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges

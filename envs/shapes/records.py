@@ -27,7 +27,6 @@ from leapnav.envs.shapes.field import (
     VERTICES,
 )
 
-THREE = tuple_of(*[float64] * 3)
 HIT = 1e-11  # m, distance at which a ray has arrived
 NEAR = 1e-3  # m, distance below which the slope of the distance along a ray is used
 MAX_RAY_STEPS = 200
@@ -97,25 +96,6 @@ def records_proximity(x, y, radius, field, count):
             hyy += slope * (d_y * d_y * steepness - d_yy)
         at += 2 + int(field[at + LENGTH])
     return value, gx, gy, hxx, hxy, hyy
-
-
-@kernel(tuple_of(*[float64] * 3)(THREE, THREE, float64, float64, CONSTANT, int64))
-def records_values(x, y, radius, apart, field, count):
-    """Proximity cost of these obstacles per unit of weight at three points, the second at most `apart` (m) from others.
-
-    See `leapnav.envs.shapes.proximity.proximity_values`.
-    """
-    steepness = 1.0 / field[1]
-    first = second = third = 0.0
-    at = SHAPES + 3 * int(field[CIRCLES])
-    for _ in range(count):
-        dx, dy = x[1] - field[at + CENTRE], y[1] - field[at + CENTRE + 1]
-        if dx * dx + dy * dy < (field[at + REACH] + apart) ** 2:
-            first += math.exp((radius - record_smooth_distance(x[0], y[0], field, at)[0]) * steepness)
-            second += math.exp((radius - record_smooth_distance(x[1], y[1], field, at)[0]) * steepness)
-            third += math.exp((radius - record_smooth_distance(x[2], y[2], field, at)[0]) * steepness)
-        at += 2 + int(field[at + LENGTH])
-    return first, second, third
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, float64, float64, float64, CONSTANT, int64))

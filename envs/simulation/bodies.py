@@ -190,9 +190,7 @@ class ContactWorld:
         return sum(proximity_value(x + a * cos, y + a * sin, r, self._field) for a, r in self._discs.tolist())
 
 
-def _rounded_polygon(
-    body: pymunk.Body, vertices: np.ndarray, radius: float, centre: np.ndarray
-) -> list[pymunk.Shape]:
+def _rounded_polygon(body: pymunk.Body, vertices: np.ndarray, radius: float, centre: np.ndarray) -> list[pymunk.Shape]:
     """Return the shapes of a polygon rounded by a radius (m); a polygon that is not convex is divided into triangles.
 
     The triangles from the centre to the sides cover a polygon that is star-shaped about it.
@@ -208,7 +206,9 @@ def _rounded_polygon(
     if np.all(turns >= 0) or np.all(turns <= 0):
         return [pymunk.Poly(body, points, radius=radius)]
     middle = centre.tolist()
-    return [pymunk.Poly(body, [middle, a, b], radius=radius) for a, b in zip(points, points[1:] + points[:1], strict=True)]
+    return [
+        pymunk.Poly(body, [middle, a, b], radius=radius) for a, b in zip(points, points[1:] + points[:1], strict=True)
+    ]
 
 
 def _pose(body: pymunk.Body) -> tuple[float, float, float]:

@@ -58,7 +58,7 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
             half = math.sqrt(square if square > 0.0 else 0.0)
             hit = along - half if square > 0.0 and along + half > 0.0 else reach
             nearest[k] = hit if hit < nearest[k] else nearest[k]
-    others = first_polygon(field)[1]
+    others = first_polygon(field)[1] if field[RECORDS] > 0.0 and field[at] < 0.0 else 0
     for _ in range(others):
         trace_rays(x, y, dxs, dys, nearest, reach, field, at)
         at += 2 + int(field[at + LENGTH])
