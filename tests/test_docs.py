@@ -48,6 +48,7 @@ PRINTED = {
     r"\['speed / max_speed', 'turn_rate / max_turn_rate'\]\nTrue\n",
     "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
     "guides/obstacles.md": rf"True {NUMBER}\n8 4 True\nrooms-3\n",
+    "guides/own_shape.md": r"True 3\.02\n",
     "guides/robots.md": r"1\.7322 \[ 4\. +1\. +-?0\. +-0\.2402\] \[-0\.7902 -0\.2627 +0\.0862 +-?0\. *\]\n",
 }
 

@@ -36,7 +36,7 @@ ROOT = Path(__file__).parent
 
 
 @kernel(DISTANCE_SIGNATURE)
-def superellipse_distance(x, y, values):
+def lame_curve_distance(x, y, values):
     """The distance to a convex shape is the largest one to its tangents: a search over their angles."""
     x, y, a, b = abs(x - values[0]), abs(y - values[1]), values[2], values[3]
     best, angle, width = -np.inf, math.pi / 4, math.pi / 4
@@ -53,7 +53,7 @@ def superellipse_distance(x, y, values):
 
 
 @kernel(SMOOTH_DISTANCE_SIGNATURE)
-def superellipse_smooth_distance(x, y, scale, values):
+def lame_curve_smooth_distance(x, y, scale, values):
     """Gauge function (u^4 + v^4)^(1/4) - 1, times the smaller half-axis."""
     a, b = values[2], values[3]
     u, v, m = (x - values[0]) / a, (y - values[1]) / b, min(a, b)
@@ -63,13 +63,12 @@ def superellipse_smooth_distance(x, y, scale, values):
     return m * (g - 1), m * gu / a, m * gv / b, m * guu / a**2, m * guv / (a * b), m * gvv / b**2
 
 
-@register
-class Superellipse(Shape):
-    """((x - x_0) / a)^4 + ((y - y_0) / b)^4 = 1."""
+class LameCurve(Shape):
+    """A superellipse, ((x - x_0) / a)^4 + ((y - y_0) / b)^4 = 1."""
 
-    kind: ClassVar = "superellipse"
-    distance: ClassVar = superellipse_distance
-    smooth_distance: ClassVar = superellipse_smooth_distance
+    kind: ClassVar = "lame_curve"
+    distance: ClassVar = lame_curve_distance
+    smooth_distance: ClassVar = lame_curve_smooth_distance
 
     center: Point
     half_axes: tuple[Positive, Positive]
@@ -87,8 +86,15 @@ SHAPES = [
     Circle(center=(4.0, 3.0), radius=0.7),
     Polygon(vertices=((3.2, 2.4), (4.9, 2.7), (4.6, 3.6), (3.5, 3.5))),
     Capsule(start=(3.4, 2.5), end=(4.6, 3.4), radius=0.3),
-    Superellipse(center=(4.0, 3.0), half_axes=(0.9, 0.6)),
+    LameCurve(center=(4.0, 3.0), half_axes=(0.9, 0.6)),
 ]
+
+
+@pytest.fixture(autouse=True)
+def _lame_curve():
+    register(LameCurve)  # until the end of each test, see conftest.py
+
+
 each_shape = pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
 ROBOT = 0.25
 
@@ -149,7 +155,7 @@ def test_the_cost_and_its_derivatives_are_the_sum_over_the_obstacles(shape):
         term = cost.proximity_weight * math.exp(-(d - ROBOT) / sigma)
         slopes = [-term * dx / sigma, -term * dy / sigma]
         bends = [term * (a * b / sigma - c) / sigma for a, b, c in ((dx, dx, dxx), (dx, dy, dxy), (dy, dy, dyy))]
-        expected = np.array(proximity(x, y, alone.field)) + [term, *slopes, *bends]
+        expected = np.array(proximity(x, y, alone.field)) + np.array([term, *slopes, *bends])
         assert proximity(x, y, both.field) == pytest.approx(expected, rel=1e-9, abs=1e-9)
         value = proximity_values(x - 0.05, y, x, y, x, y + 0.05, ROBOT, both.field)
         assert proximity_value(x, y, ROBOT, both.field) == pytest.approx(value[1], rel=1e-9, abs=1e-9)
@@ -212,7 +218,7 @@ def drive(scenario, **settings):
     env.reset(seed=0)
     lowest = math.inf
     while True:
-        _, _, terminated, truncated, info = env.step(np.array([1.0, 0.0]))
+        _, _, terminated, truncated, _ = env.step(np.array([1.0, 0.0]))
         lowest = min(lowest, clearance(*env.unwrapped.pose[:2], scenario.field)[0])
         if terminated or truncated:
             return lowest, terminated, env.unwrapped.pose
@@ -349,7 +355,7 @@ def test_a_shape_is_checked_when_it_is_registered():
         register(type("Nameless", (Shape,), {"__annotations__": {}}))
     with pytest.raises(TypeError, match="distance: expected a kernel of DISTANCE_SIGNATURE for 'plain'"):
         register(type("Plain", (Shape,), {"kind": "plain", "__annotations__": {"kind": ClassVar}}))
-    assert set(KINDS) == {"circle", "polygon", "capsule", "superellipse"}
+    assert set(KINDS) == {"circle", "polygon", "capsule", "lame_curve"}
     assert kind_number("capsule") == 3063  # stored in banks
 
 
@@ -362,8 +368,8 @@ def test_unknown_shapes_are_refused():
         Scenario.from_dict(fields)
     field = scenario_of(SHAPES[3]).field.copy()
     check_field(field)
-    field[field == -kind_number("superellipse")] = -kind_number("unknown")
-    with pytest.raises(ValueError, match="not registered in this process.*Import the file"):
+    field[field == -kind_number("lame_curve")] = -kind_number("unknown")
+    with pytest.raises(ValueError, match=r"not registered in this process.*Import the file"):
         check_field(field)
     assert math.isnan(proximity(4.0, 3.0, field)[0])  # not a wrong value
 
@@ -384,7 +390,7 @@ print(*map(repr, found), sum(record_distance.stats.cache_hits.values()), sep="\\
 def test_cached_kernels_call_the_shape_in_another_process(shape, tmp_path):
     field = scenario_of(shape).field
     np.save(tmp_path / "field.npy", field)
-    imports = "" if shape.kind == "capsule" else "import test_shapes"
+    imports = "" if shape.kind == "capsule" else "import test_shapes; test_shapes.register(test_shapes.LameCurve)"
     code = PROCESS.format(imports=imports)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     expected = proximity(4.1, 3.9, field)  # compiles what is missing
@@ -417,7 +423,8 @@ class Disc(Circle):
     distance: ClassVar = distance
 
 obstacle = Obstacle(disc=Disc(center=(4.0, 3.0), radius=0.5))
-scenario = Scenario(arena=(0.0, 0.0, 8.0, 6.0), start=(1.0, 3.0, 0.0), goal=(7.0, 3.0, 0.0), horizon=8.0, obstacles=(obstacle,))
+scenario = Scenario(arena=(0.0, 0.0, 8.0, 6.0), start=(1.0, 3.0, 0.0), goal=(7.0, 3.0, 0.0), horizon=8.0,
+                    obstacles=(obstacle,))
 print(clearance(4.0, 4.0, scenario.field)[0], sum(distance.stats.cache_hits.values()))
 """
 

@@ -3,9 +3,10 @@
 A kernel has the kernels that it calls compiled into it, but Numba's cache compares the source of the kernel's own file
 only ("Caching Limitations" in https://numba.readthedocs.io/en/stable/developer/caching.html). The machine code of a
 module's kernels is therefore kept in a directory that is named after the source of the module and of every module of
-leapnav that it imports, directly or not. Kernels may also be declared outside of leapnav. For such a module, the modules
-beside it and below its directory are followed, too. Kernels without a source file, such as those of an interactive
-session, are compiled but not cached.
+leapnav that it imports, directly or not.
+
+Kernels may also be declared outside of leapnav. For such a module, imports of modules beside it and below its directory
+are followed, too. Kernels without a source file, such as those of an interactive session, are compiled but not cached.
 """
 
 from __future__ import annotations

@@ -12,29 +12,22 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    SerializationInfo,
-    SerializeAsAny,
-    ValidationError,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
-from pydantic_core import ErrorDetails, InitErrorDetails
+from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
 
 from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
-from leapnav.envs.shapes import Circle, Polygon, Shape
+from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Positive
+from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Positive, as_tuples
 from leapnav.envs.utils.validation import check_positive, suggestion
 
 # Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
@@ -69,67 +62,6 @@ class Cost(Frozen):
     turn_weight: Positive = 0.5
     proximity_weight: NotNegative = 1.0
     proximity_scale: Positive = 0.1
-
-
-class Obstacle(Frozen):
-    """An obstacle: exactly one shape, given by its kind: `Obstacle(circle=Circle(...))`, `{"circle": {...}}` in the file.
-
-    The kinds are the registered shapes, see `leapnav.envs.shapes.Shape`.
-
-    Attributes:
-        shape: the shape.
-
-    """
-
-    shape: Shape
-
-    if TYPE_CHECKING:
-
-        def __init__(self, **shape: Shape | None) -> None: ...
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read_shape(cls, fields: Any) -> Any:
-        if not isinstance(fields, Mapping):
-            return fields
-        given = {kind: shape for kind, shape in fields.items() if shape is not None}
-        faults: list[InitErrorDetails] = [
-            {"type": "extra_forbidden", "loc": (kind,), "input": value}
-            for kind, value in given.items()
-            if kind not in KINDS
-        ]
-        if not faults and len(given) != 1:
-            kinds = [repr(kind) for kind in KINDS]
-            raise ValueError(f"an obstacle is exactly one of {', '.join(kinds[:-1])} or {kinds[-1]}")
-        if not faults:
-            ((kind, value),) = given.items()
-            try:
-                return {"shape": KINDS[kind].model_validate(value)}
-            except ValidationError as error:
-                faults = [_inside(kind, details) for details in error.errors(include_url=False)]
-        raise ValidationError.from_exception_data(cls.__name__, faults)
-
-    @model_serializer
-    def _serialize(self, info: SerializationInfo) -> dict[str, Any]:
-        return {self.shape.kind: self.shape.model_dump(mode=info.mode, exclude_none=info.exclude_none)}
-
-    @property
-    def circle(self) -> Circle | None:
-        """The circle, or None if the shape is another one."""
-        return self.shape if isinstance(self.shape, Circle) else None
-
-    @property
-    def polygon(self) -> Polygon | None:
-        """The polygon, or None if the shape is another one."""
-        return self.shape if isinstance(self.shape, Polygon) else None
-
-
-def _inside(kind: str, details: ErrorDetails) -> InitErrorDetails:
-    """Return a fault of a shape as one of its obstacle."""
-    fault: InitErrorDetails = {"type": details["type"], "loc": (kind, *details["loc"]), "input": details["input"]}
-    if "ctx" in details:
-        fault["ctx"] = details["ctx"]
-    return fault
 
 
 class Scenario(Frozen):
@@ -298,7 +230,7 @@ class Scenario(Frozen):
         if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
             raise ScenarioError(f"a scenario is a JSON object, got {_shorten(fields)}")
         try:
-            return cls(**_tuples(fields))
+            return cls(**as_tuples(fields))
         except RecursionError:
             raise ScenarioError(f"Scenario {_shorten(fields.get('name'))}: the fields are nested too deeply") from None
 
@@ -430,7 +362,7 @@ def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
     except ValueError as error:
         return Unicycle(), [f"robot.model: {error}"]
     try:
-        return model(**_tuples(dict(fields))), []
+        return model(**as_tuples(dict(fields))), []
     except ValidationError as error:
         return Unicycle(), [_fault(details, model) for details in error.errors(include_url=False)]
 
@@ -441,15 +373,6 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         repeated = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
         raise ScenarioError(f"scenario: {repeated}: the key appears more than once")
     return fields
-
-
-def _tuples(value: Any) -> Any:
-    """Return a value with lists replaced by tuples, as strict validation of immutable fields requires."""
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return tuple(_tuples(item) for item in value)
-    return value
 
 
 def _read(path: Path) -> str:
@@ -514,16 +437,10 @@ def _fault(details: ErrorDetails, robot: type[BaseModel] | None = None) -> str:
 
 def _known_fields(location: Sequence[Any], robot: type[BaseModel]) -> tuple[str, ...]:
     """Return the fields of the part of a scenario at a location."""
-    parts: dict[Any, type[BaseModel]] = {
-        "robot": robot,
-        "footprint": Disc,
-        "cost": Cost,
-        **KINDS,
-    }
+    parts: dict[Any, type[BaseModel]] = {"robot": robot, "footprint": Disc, "cost": Cost, **KINDS}
     names = [key for key in location if isinstance(key, str)]
-    if names and names[-1] not in parts:
-        return tuple(KINDS)
-    return tuple((parts[names[-1]] if names else Scenario).model_fields)
+    model = parts.get(names[-1]) if names else Scenario
+    return tuple(KINDS) if model is None else tuple(model.model_fields)
 
 
 __getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})

@@ -1,4 +1,4 @@
-"""Obstacle shapes, one file each, see `leapnav.envs.shapes.base`, and the packed obstacle field of a scenario (kernels)."""
+"""Obstacle shapes, one file each, see `leapnav.envs.shapes.base`, and the packed field of a scenario (kernels)."""
 
 from leapnav.envs.shapes.base import Shape, register
 from leapnav.envs.shapes.capsule import Capsule

@@ -100,7 +100,9 @@ def pack_field(
         else:
             parts.records.append(_pack_record(shape, header))
             indices[1].append(float(index))
-    return _assemble(header, parts._replace(circles=np.reshape(circles, (-1, 3))), sum(indices, []))
+    return _assemble(
+        header, parts._replace(circles=np.reshape(circles, (-1, 3))), [*indices[0], *indices[1], *indices[2]]
+    )
 
 
 def _pack_record(shape: Shape, header: Sequence[float]) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Convex polygons.
 
-The loops over the polygons of a packed field are written out where speed matters; these use the kernels of the distances,
-and of the value and the derivatives of a proximity term. In a packed field the rows of a polygon with m edges begin at `rows`: m times (n_x, n_y, c, x, y), see
-`leapnav.envs.shapes.field`.
+The loops over the polygons of a packed field are written out where speed matters. They use the kernels of the
+distances, and of the value and the derivatives of a proximity term. In a packed field the rows of a polygon with m
+edges begin at `rows`: m times (n_x, n_y, c, x, y), see `leapnav.envs.shapes.field`.
 """
 
 from __future__ import annotations

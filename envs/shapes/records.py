@@ -120,7 +120,7 @@ def _advance_ray(t, x, y, dx, dy, field, at):
 
 @kernel(NOTHING(float64, float64, VECTOR, VECTOR, VECTOR, float64, CONSTANT, int64))
 def trace_rays(x, y, dxs, dys, nearest, reach, field, at):
-    """Shorten rays from (x, y) in the directions (dxs, dys) with lengths `nearest` (m) to the boundary of an obstacle."""
+    """Shorten rays from (x, y) in the directions (dxs, dys), of lengths `nearest` (m), to the rim of an obstacle."""
     cx, cy, rim = field[at + CENTRE] - x, field[at + CENTRE + 1] - y, field[at + RIM]
     if cx * cx + cy * cy >= (rim + reach) ** 2:
         return

@@ -109,8 +109,8 @@ def max_vertices(field):
 def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
     """Describe the walls and the nearest obstacles in the robot's frame, in order of distance.
 
-    An obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the radius 0. Its row contains 1, the
-    radius and the vertices, which are repeated to fill the row. Rows without an obstacle are zeros.
+    An obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the radius 0. Its row
+    contains 1, the radius and the vertices, which are repeated to fill the row. Rows without an obstacle are zeros.
 
     Args:
         x, y: position of the robot (m).
