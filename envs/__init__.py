@@ -6,13 +6,16 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
-from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Scenario, ScenarioError
+from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.scenarios.scenario import Cost, Scenario, ScenarioError
 from leapnav.envs.settings import Disturbance, Motor
+from leapnav.envs.shapes import Capsule, Circle, Polygon, Shape
 from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 
 __all__ = [
     "FAMILIES",
     "BankError",
+    "Capsule",
     "Car",
     "Circle",
     "Cost",
@@ -32,6 +35,7 @@ __all__ = [
     "Scenario",
     "ScenarioBank",
     "ScenarioError",
+    "Shape",
     "Unicycle",
     "sample_scenario",
 ]

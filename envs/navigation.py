@@ -77,7 +77,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | | 4, 5 | cosine and sine of the heading | 1 | -1 to 1 |
     | `obstacles` (`"map"` only) | per obstacle: 0 | 1; in a row without an obstacle, all entries are 0 | 1 | 0 to 1 |
     | | 1 | radius of a disc, 0 for a polygon | m | 0 to 1000 |
-    | | 2 ... | vertices in the robot's frame: ahead, to the left; for a disc, its centre; repeated to fill the row | m | -1000 to 1000 |
+    | | 2 ... | vertices in the robot's frame: ahead, to the left; for a disc, its centre; for a capsule, its ends; repeated to fill the row | m | -1000 to 1000 |
 
     `observation="lidar"` contains `lidar_beams` ranges. `"map"` contains the `map_obstacles` nearest obstacles, in
     order of distance, with `map_vertices` vertices each. `"state"` contains neither; it suits scenarios without
@@ -155,7 +155,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
     | `terminate_on_collision` | True | whether a collision ends the episode |
     | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and maximum range (m) |
-    | `map_obstacles`, `map_vertices` | 8, 8 | number of obstacles in the map, and of vertices of each; a polygon with more vertices is an error |
+    | `map_obstacles`, `map_vertices` | 8, 8 | number of obstacles in the map, and of vertices of each; an obstacle with more vertices is an error |
     | `render_mode` | None | `"rgb_array"` or `"human"` |
 
     ## Errors

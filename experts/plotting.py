@@ -45,8 +45,8 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
     for obstacle in scenario.obstacles:
         if obstacle.circle is not None:
             axes.add_patch(Circle(obstacle.circle.center, obstacle.circle.radius, facecolor=OBSTACLE, edgecolor=EDGE))
-        elif obstacle.polygon is not None:
-            axes.add_patch(Polygon(np.array(obstacle.polygon.vertices), facecolor=OBSTACLE, edgecolor=EDGE))
+        else:
+            axes.add_patch(Polygon(obstacle.shape.outline(), facecolor=OBSTACLE, edgecolor=EDGE))
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
     for pose, color in ((scenario.start, START), (scenario.goal, GOAL)):
         draw_robot(axes, pose, scenario.discs, color)

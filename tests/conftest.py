@@ -7,6 +7,8 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from leapnav.envs.shapes.base import KINDS
+
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
 sys.path.append(str(Path(__file__).parent.parent / "examples"))  # for the robot of `trailer_robot.py`
 
@@ -74,3 +76,12 @@ def clone(dataset, tmp_path_factory):
 @pytest.fixture
 def env():
     return gym.make("leapnav/Navigate-v0", family="open")
+
+
+@pytest.fixture(autouse=True)
+def _registered_shapes():
+    """Forget the obstacle shapes that a test registers."""
+    before = dict(KINDS)
+    yield
+    KINDS.clear()
+    KINDS.update(before)

@@ -58,6 +58,14 @@ def test_the_optimum_and_its_alternatives_are_those_of_find_optimum(ask):
     assert min(found["path"]["clearances"]) == pytest.approx(optimum.certificate.clearance, abs=1e-2)
 
 
+def test_the_outline_of_a_shape_that_the_page_does_not_know_is_sent(ask):
+    capsule = {"start": [1, 1], "end": [2, 1], "radius": 0.5}
+    status, found = ask("/outline", {"obstacle": {"capsule": capsule}})
+    assert status == 200
+    assert np.array(found["outline"]).max(axis=0) == pytest.approx([2.5, 1.5], abs=1e-2)
+    assert ask("/outline", {"obstacle": {"moon": {}}})[0] == 400
+
+
 def test_alternatives_have_their_controls_and_costates(ask):
     scenario = Scenario.from_dict(fields(obstacles=[{"circle": {"center": [4, 2.6], "radius": 0.5}}]))
     _, found = ask("/search", {"scenario": scenario.to_dict()})

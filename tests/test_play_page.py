@@ -81,6 +81,17 @@ def test_sweeps_policy_and_keys(page):
     rest(page)
     assert page.evaluate("play.scenario.obstacles.length") == count
     until(page, "play.episode !== null")  # the policy drives in the new scenario
+    page.click("#add-capsule")
+    page.focus("#view")
+    for key in ("e", "+", "ArrowUp"):
+        page.keyboard.press(key)
+    rest(page)
+    capsule = page.evaluate("play.scenario.obstacles.at(-1).capsule")
+    assert capsule["radius"] == pytest.approx(0.22)
+    assert capsule["end"][1] < capsule["start"][1]  # rotated clockwise
+    assert "capsule" in page.inner_text("#selection")
+    page.keyboard.press("Delete")
+    rest(page)
 
 
 def test_a_pose_in_an_obstacle_is_refused_and_nothing_is_lost(page):

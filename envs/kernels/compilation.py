@@ -64,7 +64,8 @@ def missing(kernels: Iterable[Kernel]) -> list[Kernel]:
 
     for one in kernels:
         visit(one)
-    return [one for one in ordered if not one.is_cached(cache_directory(one.py_func.__module__))]
+    directories = {one: cache_directory(one.py_func.__module__) for one in ordered}
+    return [one for one, directory in directories.items() if directory is None or not one.is_cached(directory)]
 
 
 def _compile(kernels: list[Kernel], jobs: int, advise: bool) -> None:

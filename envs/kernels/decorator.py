@@ -4,6 +4,9 @@ A kernel has the kernels that it calls compiled into it, but Numba's cache compa
 only ("Caching Limitations" in https://numba.readthedocs.io/en/stable/developer/caching.html). The machine code of a
 module's kernels is therefore kept in a directory that is named after the source of the module and of every module of
 leapnav that it imports, directly or not.
+
+Kernels may also be declared outside of leapnav. For such a module, imports of modules beside it and below its directory
+are followed, too. Kernels without a source file, such as those of an interactive session, are compiled but not cached.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -77,15 +81,17 @@ def record_type(record: type[NamedTuple], **fields: types.Type) -> types.NamedTu
 
 
 @contextmanager
-def _compilation(compiled: Kernel) -> Iterator[tuple[Path, int | None]]:
+def _compilation(compiled: Kernel) -> Iterator[tuple[Path | None, int | None]]:
     """Yield cache directory and optimisation level (NUMBA_OPT takes precedence), and report the progress."""
     directory = cache_directory(compiled.py_func.__module__)
-    with progress.compiling(compiled, is_cached=compiled.is_cached(directory)):
+    with progress.compiling(compiled, is_cached=directory is not None and compiled.is_cached(directory)):
         yield directory, None if "NUMBA_OPT" in os.environ else OPTIMISATION_LEVEL
 
 
-def cache_directory(module: str) -> Path:
-    """The directory that keeps the machine code of a module's kernels."""
+def cache_directory(module: str) -> Path | None:
+    """The directory that keeps the machine code of a module's kernels; None for a module without a source file."""
+    if _file(module) is None:
+        return None
     return kernel_cache() / f"{module.removeprefix(f'{PACKAGE}.')}-{source_stamp(module)[:12]}"
 
 
@@ -120,7 +126,7 @@ def _temporary_directory() -> Path:
 
 @cache
 def source_stamp(module: str) -> str:
-    """A hash of the source of a module and of all modules of leapnav that it imports, directly or not."""
+    """A hash of the source of a module and of all modules that it imports, see `_imports`, directly or not."""
     stamp = hashlib.sha256()
     for name in sorted(_imported({module}, module) - WITHOUT_EFFECT):
         stamp.update(_source(name))
@@ -128,7 +134,7 @@ def source_stamp(module: str) -> str:
 
 
 def _imported(found: set[str], module: str) -> set[str]:
-    """Adds to `found` the modules of leapnav that a module imports, directly or not."""
+    """Adds to `found` the modules that a module imports, see `_imports`, directly or not."""
     for name in _imports(module):
         if name not in found:
             found.add(name)
@@ -138,10 +144,10 @@ def _imported(found: set[str], module: str) -> set[str]:
 
 @cache
 def _imports(module: str) -> frozenset[str]:
-    """The modules of leapnav that a module imports at its top level, in whatever form."""
-    spec = find_spec(module)
-    assert spec is not None
-    package = module if spec.submodule_search_locations is not None else module.rpartition(".")[0]
+    """The modules that a module imports at its top level, in whatever form: those of leapnav, and those beside it."""
+    file = _file(module)
+    assert file is not None
+    package = module if file.stem == "__init__" else module.rpartition(".")[0]
     candidates: set[str] = set()
     for node in ast.parse(_source(module)).body:
         if isinstance(node, ast.Import):
@@ -150,19 +156,37 @@ def _imports(module: str) -> frozenset[str]:
             name = resolve_name("." * node.level + (node.module or ""), package)
             candidates.add(name)
             candidates.update(f"{name}.{alias.name}" for alias in node.names)
-    return frozenset(name for name in candidates if name.startswith(f"{PACKAGE}.") and _has_source(name))
+    return frozenset(name for name in candidates if _is_followed(name, module))
 
 
-def _has_source(module: str) -> bool:
-    try:
-        spec = find_spec(module)
-    except ModuleNotFoundError:  # a name in a module, not a module in a package
+def _is_followed(name: str, module: str) -> bool:
+    """Whether an import of a module may change the machine code: a module of leapnav, or one beside the module."""
+    top = name.partition(".")[0]
+    if top == PACKAGE:
+        return name != PACKAGE and _file(name) is not None
+    if module.partition(".")[0] == PACKAGE or top in sys.stdlib_module_names:
         return False
-    return spec is not None and spec.origin is not None
+    beside, file = _file(top), _file(module)
+    if beside is None or file is None or "site-packages" in beside.parts:
+        return False
+    return beside.is_relative_to(file.parents[module.count(".")]) and _file(name) is not None
+
+
+@cache
+def _file(module: str) -> Path | None:
+    """The source file of a module, or None."""
+    loaded = sys.modules.get(module)
+    try:
+        # A script is not found by its name, `__main__`.
+        spec = find_spec(module) if getattr(loaded, "__spec__", None) is not None or loaded is None else None
+    except (ModuleNotFoundError, ValueError):  # a name in a module, not a module in a package
+        return None
+    origin = spec.origin if spec is not None else getattr(loaded, "__file__", None)
+    return Path(origin) if origin is not None and origin.endswith(".py") and Path(origin).exists() else None
 
 
 @cache
 def _source(module: str) -> bytes:
-    spec = find_spec(module)
-    assert spec is not None and spec.origin is not None
-    return Path(spec.origin).read_bytes()
+    file = _file(module)
+    assert file is not None
+    return file.read_bytes()

@@ -42,6 +42,7 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.field import check_field
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 FORMAT, VERSION = "leapnav-bank", 4
@@ -298,10 +299,13 @@ class ScenarioBank(Sequence[Scenario]):
 
         Raises:
             IndexError: the index is out of range.
+            ValueError: a shape of an obstacle is not registered in this process.
 
         """
         start, end = self._span("field_ends", self._check_index(index))
-        return self._array("fields")[start:end]
+        field = self._array("fields")[start:end]
+        check_field(field)
+        return field
 
     def states(self, index: int) -> np.ndarray:
         """Return the states (N, n_q) of the optimum of a scenario, see `Reference`.

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
-from leapnav.envs.scenarios.scenario import Circle, Cost, Obstacle, Polygon, Scenario, check_robot
+from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.scenarios.scenario import Cost, Scenario, check_robot
+from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.clearance import clearances, footprint_clearances
 from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.validation import suggestion

@@ -22,9 +22,12 @@ from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.faults import fault, one_line, shorten
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
+from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.shapes import Circle, Polygon
+from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Point, Positive
+from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Positive, as_tuples
 from leapnav.envs.utils.validation import check_positive, suggestion
 
 # Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
@@ -46,55 +49,6 @@ class Cost(Frozen):
     proximity_scale: Positive = 0.1
 
 
-class Circle(Frozen):
-    """A disc obstacle: center (x, y) and radius (m)."""
-
-    center: Point
-    radius: Positive
-
-
-class Polygon(Frozen):
-    """A convex polygon obstacle: at least three vertices (x, y) (m), in either orientation."""
-
-    vertices: tuple[Point, ...]
-
-    @field_validator("vertices")
-    @classmethod
-    def _check_convex(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
-        if len(vertices) < 3:
-            raise ValueError(f"a polygon needs at least 3 vertices, this one has {len(vertices)}")
-        points = np.asarray(vertices)
-        edges = np.roll(points, -1, axis=0) - points
-        following = np.roll(edges, -1, axis=0)
-        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-        angles = np.arctan2(turns, np.sum(edges * following, axis=1))
-        # The boundary of a convex polygon turns in one direction only, by 2 pi in total (that of a star by more).
-        same_direction = bool(np.all(turns > 0) or np.all(turns < 0))
-        if not same_direction or not math.isclose(abs(float(angles.sum())), 2 * math.pi, rel_tol=1e-6):
-            raise ValueError("the polygon is not strictly convex; write a non-convex obstacle as several convex ones")
-        return vertices
-
-
-class Obstacle(Frozen):
-    """An obstacle: exactly one of a circle or a polygon, `{"circle": {...}}` or `{"polygon": {...}}` in the file."""
-
-    circle: Circle | None = None
-    polygon: Polygon | None = None
-
-    @model_validator(mode="after")
-    def _check_one_shape(self) -> Self:
-        if (self.circle is None) == (self.polygon is None):
-            raise ValueError("an obstacle is exactly one of 'circle' or 'polygon'")
-        return self
-
-    @property
-    def shape(self) -> Circle | Polygon:
-        """The circle or the polygon."""
-        shape = self.circle or self.polygon
-        assert shape is not None  # validated
-        return shape
-
-
 class Scenario(Frozen):
     """A navigation task. Immutable; scenarios with equal fields are equal.
 
@@ -105,7 +59,7 @@ class Scenario(Frozen):
         start: pose (x, y, heading) at time 0.
         goal: pose (x, y, heading) at the horizon; a heading of None is free.
         horizon: duration of the task (s).
-        obstacles: circles and convex polygons.
+        obstacles: the obstacles, which may overlap; each has one shape, see `Obstacle`.
         cost: weights of the running cost.
         start_motion: further states of the robot at time 0, such as speed and turn rate; None for zeros.
         goal_motion: further states at the horizon, each a number or None if it is free; None for those of the model.
@@ -261,7 +215,7 @@ class Scenario(Frozen):
         if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
             raise ScenarioError(f"a scenario is a JSON object, got {shorten(fields)}")
         try:
-            return cls(**_tuples(fields))
+            return cls(**as_tuples(fields))
         except RecursionError:
             raise ScenarioError(f"Scenario {shorten(fields.get('name'))}: the fields are nested too deeply") from None
 
@@ -393,7 +347,7 @@ def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
     except ValueError as error:
         return Unicycle(), [f"robot.model: {error}"]
     try:
-        return model(**_tuples(dict(fields))), []
+        return model(**as_tuples(dict(fields))), []
     except ValidationError as error:
         return Unicycle(), [
             fault(details, partial(_known_fields, robot=model), ("robot",))
@@ -407,15 +361,6 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         repeated = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
         raise ScenarioError(f"scenario: {repeated}: the key appears more than once")
     return fields
-
-
-def _tuples(value: Any) -> Any:
-    """Return a value with lists replaced by tuples, as strict validation of immutable fields requires."""
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return tuple(_tuples(item) for item in value)
-    return value
 
 
 def _read(path: Path) -> str:
@@ -447,16 +392,10 @@ def check_headings(scenario: Scenario) -> None:
 
 def _known_fields(location: Sequence[Any], robot: type[RobotModel] = Unicycle) -> tuple[str, ...]:
     """Return the fields of the part of a scenario at a location."""
-    parts: dict[Any, type[BaseModel]] = {
-        "robot": robot,
-        "footprint": Disc,
-        "cost": Cost,
-        "circle": Circle,
-        "polygon": Polygon,
-    }
+    parts: dict[Any, type[BaseModel]] = {"robot": robot, "footprint": Disc, "cost": Cost, **KINDS}
     names = [key for key in location if isinstance(key, str)]
-    model = parts.get(names[-1], Obstacle) if names else Scenario
-    return tuple(model.model_fields)
+    model = parts.get(names[-1]) if names else Scenario
+    return tuple(KINDS) if model is None else tuple(model.model_fields)
 
 
 __getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})

@@ -1,1 +1,8 @@
-"""Obstacle shapes and the obstacle field of a scenario: packing, clearance, and the proximity cost (kernels)."""
+"""Obstacle shapes, one file each, see `leapnav.envs.shapes.base`, and the packed field of a scenario (kernels)."""
+
+from leapnav.envs.shapes.base import Shape, register
+from leapnav.envs.shapes.capsule import Capsule
+from leapnav.envs.shapes.circle import Circle
+from leapnav.envs.shapes.polygon import Polygon
+
+__all__ = ["Capsule", "Circle", "Polygon", "Shape", "register"]

@@ -9,8 +9,10 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.field import ARENA, CIRCLES, GRID, POLYGONS, SHAPES
+from leapnav.envs.shapes.field import CIRCLES, GRID, RECORDS, SHAPES
+from leapnav.envs.shapes.half_plane import wall_distance
 from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
+from leapnav.envs.shapes.records import first_polygon, nearest_record
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
@@ -19,13 +21,13 @@ def obstacle_distance(x, y, field):
 
     Negative inside. The wall has the index after the last obstacle.
     """
-    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
-    indices = int(field[GRID]) - circles - polygons
+    circles, records = int(field[CIRCLES]), int(field[RECORDS])
+    indices = int(field[GRID]) - circles - records
     best = min(
-        min(x - field[ARENA], field[ARENA + 2] - x),
-        min(y - field[ARENA + 1], field[ARENA + 3] - y),
+        min(wall_distance(x, y, field, 0), wall_distance(x, y, field, 2)),
+        min(wall_distance(x, y, field, 1), wall_distance(x, y, field, 3)),
     )
-    nearest = circles + polygons
+    nearest = circles + records
     at = SHAPES
     for i in range(circles):
         dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2]
@@ -34,7 +36,13 @@ def obstacle_distance(x, y, field):
             distance = math.sqrt(dx * dx + dy * dy) - rim
             if distance < best:
                 best, nearest = distance, int(field[indices + i])
-    for i in range(polygons):
+    others = 0
+    if field[RECORDS] > 0.0 and field[at] < 0.0:
+        at, others = first_polygon(field)
+        best, found = nearest_record(x, y, field, others, best)
+        if found >= 0:
+            nearest = int(field[indices + circles + found])
+    for i in range(others, records):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges

@@ -3,11 +3,15 @@
 The entries of the array are, by index:
 
     [0] proximity weight k   [1] proximity scale sigma   [2] largest radius of a disc of the robot's footprint
-    [3] circles   [4] polygons
+    [3] circles   [4] records after the circles
     [5:9] arena (x_min, y_min, x_max, y_max)   [9] index at which the grid begins
     then per circle:   x, y, r
+    then per obstacle of another shape: minus the number of its kind, length of the rest, centre x, y, radius of a
+                       circle around the centre that contains it, radius of a circle beyond which its proximity cost is
+                       negligible, radius and number v of vertices of its rounded polygon, v vertices x, y, then the
+                       numbers of its kernels
     then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
-    then the obstacles' indices in the scenario, since circles are packed before polygons
+    then the obstacles' indices in the scenario, since they are packed in this order
     then the grid:     x, y, cell size, columns, lines, then the offset of each cell in the grid, then the
                        cells: number of circles n, of polygons p, maximum number of edges m; then x, y, r of the n
                        circles, column by column, and (n_x, n_y, c) of the p polygons for each of the m edges, also
@@ -16,27 +20,58 @@ The entries of the array are, by index:
 A cell lists the obstacles that contribute to the proximity cost somewhere in it, so that the work at a point does not
 depend on the number of distant obstacles. n and p are multiples of LANES; the remaining entries are obstacles without
 any contribution. Polygons with fewer than m edges are padded with edges without any contribution. With at most
-MAX_OBSTACLES_WITHOUT_GRID obstacles there is no grid: columns and lines are 0.
+MAX_OBSTACLES_WITHOUT_GRID circles and polygons there is no grid, and columns and lines are 0, or a grid of one cell if
+there are other shapes. These are not in the grid: a comparison with the circle of their proximity cost skips them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from numba import float64
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CONSTANT
+from leapnav.envs.shapes.base import Shape, call_smooth_distance, compile_shape, kind_number, shape_class
+from leapnav.envs.shapes.polygon import edge_rows
 
 # Terms of obstacles farther away than 30 sigma are skipped: they are below 1e-13 k, 1/10 of the integrator's tolerance.
 CUTOFF = 30.0
-CIRCLES, POLYGONS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # indices into the packed field
+CIRCLES, RECORDS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # indices into the packed field
+# Indices into the record of a shape other than circle and polygon.
+KIND, LENGTH, CENTRE, RIM, REACH, ROUNDING, N_VERTICES, VERTICES = 0, 1, 2, 4, 5, 6, 7, 8
 MAX_OBSTACLES_WITHOUT_GRID = 16  # fewer obstacles are evaluated faster one by one
 MAX_GRID_CELLS = 16  # per axis
 LANES = 8  # doubles in a vector register of 512 bits
 FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
+OUTLINE_MARGIN = 1.02  # factor of the circle through the outline, between whose points a shape may be larger
+N_DIRECTIONS, REACH_STEP, REACH_MARGIN = (
+    64,
+    1.2,
+    1.1,
+)  # for the circle of the proximity cost; both factors of its radius
+
+
+class FieldParts(NamedTuple):
+    """The obstacles of a packed field.
+
+    Attributes:
+        circles (count, 3): x, y and radius (m).
+        records: the record of each obstacle of another shape.
+        polygons: the rows (m, 5) of each polygon.
+
+    """
+
+    circles: np.ndarray
+    records: list[np.ndarray]
+    polygons: list[np.ndarray]
 
 
 def pack_field(
-    shapes: Sequence[Any],
+    shapes: Sequence[Shape],
     arena: tuple[float, float, float, float],
     radius: float,
     weight: float,
@@ -45,25 +80,60 @@ def pack_field(
     """Pack obstacles, walls and proximity cost into the flat array that the kernels read.
 
     Args:
-        shapes: obstacles with `center` and `radius`, or with `vertices`.
+        shapes: the obstacles.
         arena: (x_min, y_min, x_max, y_max) (m).
         radius: largest radius of a disc of the robot's footprint (m).
         weight, scale: proximity weight and proximity scale (m).
 
     """
-    circles: list[float] = []
-    polygons: list[float] = []
-    circle_indices: list[int] = []
-    polygon_indices: list[int] = []
+    header = [weight, scale, radius, 0.0, 0.0, *arena]
+    parts = FieldParts(np.empty((0, 3)), [], [])
+    circles: list[tuple[float, ...]] = []
+    indices: tuple[list[float], list[float], list[float]] = [], [], []
     for index, shape in enumerate(shapes):
-        if hasattr(shape, "radius"):
-            circles += [*shape.center, shape.radius]
-            circle_indices.append(index)
+        if shape.kind == "circle":
+            circles.append(shape.values())
+            indices[0].append(float(index))
+        elif shape.kind == "polygon":
+            parts.polygons.append(np.reshape(shape.values(), (-1, 5)))
+            indices[2].append(float(index))
         else:
-            polygons += _pack_polygon(np.asarray(shape.vertices, dtype=float))
-            polygon_indices.append(index)
-    header = [weight, scale, radius, float(len(circle_indices)), float(len(polygon_indices)), *arena]
-    return _assemble(header, circles, polygons, [float(i) for i in circle_indices + polygon_indices])
+            parts.records.append(_pack_record(shape, header))
+            indices[1].append(float(index))
+    return _assemble(
+        header, parts._replace(circles=np.reshape(circles, (-1, 3))), [*indices[0], *indices[1], *indices[2]]
+    )
+
+
+def _pack_record(shape: Shape, header: Sequence[float]) -> np.ndarray:
+    """Return the record of a shape other than circle and polygon."""
+    compile_shape(type(shape))
+    vertices, rounding = shape.rounded_polygon()
+    centre = np.array(shape.centre())
+    rim = OUTLINE_MARGIN * float(np.hypot(*(vertices - centre).T).max()) + rounding
+    number = float(kind_number(shape.kind))
+    rest = [*centre.tolist(), rim, 0.0, rounding, float(len(vertices)), *np.ravel(vertices).tolist(), *shape.values()]
+    record = np.array([-number, len(rest), *rest])
+    if not np.isfinite(record).all():
+        raise ValueError(f"{shape.kind}: values() and rounded_polygon(): expected finite numbers, got {rest}")
+    record[REACH] = _proximity_reach(record, header[2] + CUTOFF * header[1], header[1])
+    return record
+
+
+@kernel(float64(CONSTANT, float64, float64))
+def _proximity_reach(record, distance, scale):
+    """Radius (m) of a circle around the centre of a record outside of which its smooth distance exceeds `distance`."""
+    values = record[VERTICES + 2 * int(record[N_VERTICES]) :]
+    reach = record[RIM] + distance
+    k = 0
+    while k < N_DIRECTIONS and reach < FAR_AWAY:
+        angle = 2 * math.pi * k / N_DIRECTIONS
+        x, y = record[CENTRE] + reach * math.cos(angle), record[CENTRE + 1] + reach * math.sin(angle)
+        k += 1
+        if not call_smooth_distance(2 * int(-record[KIND]) + 1, x, y, scale, values)[0] >= distance:
+            reach *= REACH_STEP
+            k = 0
+    return REACH_MARGIN * reach
 
 
 def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.ndarray:
@@ -77,45 +147,81 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
         ValueError: the fields do not contain the same kinds of obstacles.
 
     """
-    parts = [unpack_field(first), unpack_field(second)]
-    (circles, polygons), (other_circles, other_polygons) = parts
-    if len(circles) != len(other_circles) or [len(p) for p in polygons] != [len(p) for p in other_polygons]:
+    a, b = unpack_field(first), unpack_field(second)
+    if (
+        len(a.circles) != len(b.circles)
+        or [len(polygon) for polygon in a.polygons] != [len(polygon) for polygon in b.polygons]
+        or [(len(r), r[KIND], r[N_VERTICES]) for r in a.records]
+        != [(len(r), r[KIND], r[N_VERTICES]) for r in b.records]
+    ):
         raise ValueError("obstacles: two fields can be blended only if they contain the same kinds of obstacles")
-    header = (1.0 - fraction) * first[:GRID] + fraction * second[:GRID]
-    blended = [float(x) for x in ((1.0 - fraction) * circles + fraction * other_circles).ravel()]
-    rows: list[float] = []
-    for polygon, other in zip(polygons, other_polygons, strict=True):
-        rows += _pack_polygon((1.0 - fraction) * polygon[:, 3:] + fraction * other[:, 3:])
-    count = len(circles) + len(polygons)
-    indices = first[int(first[GRID]) - count : int(first[GRID])].tolist()
-    return _assemble(header.tolist(), blended, rows, indices)
+    header = ((1.0 - fraction) * first[:GRID] + fraction * second[:GRID]).tolist()
+    blended = FieldParts((1.0 - fraction) * a.circles + fraction * b.circles, [], [])
+    for record, other in zip(a.records, b.records, strict=True):
+        between = (1.0 - fraction) * record + fraction * other
+        between[KIND] = record[KIND]
+        between[REACH] = _proximity_reach(between, header[2] + CUTOFF * header[1], header[1])
+        blended.records.append(between)
+    for polygon, other in zip(a.polygons, b.polygons, strict=True):
+        blended.polygons.append(edge_rows((1.0 - fraction) * polygon[:, 3:] + fraction * other[:, 3:]))
+    return _assemble(header, blended, first[int(first[GRID]) - _count(a) : int(first[GRID])].tolist())
 
 
-def _assemble(header: list[float], circles: list[float], polygons: list[float], indices: list[float]) -> np.ndarray:
-    """Return the packed field with its grid, whose index is not in `header`."""
-    grid_index = SHAPES + len(circles) + len(polygons) + len(indices)
-    packed = np.array([*header, grid_index, *circles, *polygons, *indices], dtype=np.float64)
+def _count(parts: FieldParts) -> int:
+    return sum(map(len, parts))
+
+
+def _assemble(header: Sequence[float], parts: FieldParts, indices: Sequence[float]) -> np.ndarray:
+    """Return the packed field with its grid; its counts and the index of the grid are not in `header`."""
+    polygons = [value for rows in parts.polygons for value in (float(len(rows)), *rows.ravel().tolist())]
+    obstacles = [*parts.circles.ravel().tolist(), *(x for record in parts.records for x in record.tolist()), *polygons]
+    counts = float(len(parts.circles)), float(len(parts.records) + len(parts.polygons))
+    grid_index = float(SHAPES + len(obstacles) + len(indices))
+    packed = np.array([*header[:CIRCLES], *counts, *header[ARENA:], grid_index, *obstacles, *indices], dtype=np.float64)
     field = np.concatenate([packed, _pack_grid(packed)])
     field.flags.writeable = False
     return field
 
 
-def unpack_field(packed: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the circles (count, 3) and the rows (m, 5) of each polygon."""
+def unpack_field(packed: np.ndarray) -> FieldParts:
+    """Return the obstacles of a packed field."""
     at = SHAPES + 3 * int(packed[CIRCLES])
-    circles = packed[SHAPES:at].reshape(-1, 3)
-    polygons = []
-    for _ in range(int(packed[POLYGONS])):
-        edges = int(packed[at])
-        polygons.append(packed[at + 1 : at + 1 + 5 * edges].reshape(edges, 5))
-        at += 1 + 5 * edges
-    return circles, polygons
+    parts = FieldParts(packed[SHAPES:at].reshape(-1, 3), [], [])
+    for _ in range(int(packed[RECORDS])):
+        if packed[at] < 0:
+            parts.records.append(packed[at : at + 2 + int(packed[at + LENGTH])])
+            at += len(parts.records[-1])
+        else:
+            edges = int(packed[at])
+            parts.polygons.append(packed[at + 1 : at + 1 + 5 * edges].reshape(edges, 5))
+            at += 1 + 5 * edges
+    return parts
+
+
+def record_outline(record: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the vertices (v, 2) and the radius (m) of the rounded polygon of a record, see `Shape`."""
+    end = VERTICES + 2 * int(record[N_VERTICES])
+    return record[VERTICES:end].reshape(-1, 2), float(record[ROUNDING])
+
+
+def check_field(packed: np.ndarray) -> None:
+    """Check that the shapes of a stored field are known in this process.
+
+    Raises:
+        ValueError: a shape is not.
+
+    """
+    at = SHAPES + 3 * int(packed[CIRCLES])
+    if packed[RECORDS] > 0 and packed[at] < 0:
+        for record in unpack_field(packed).records:
+            compile_shape(shape_class(-int(record[KIND])))
 
 
 def obstacle_centres(packed: np.ndarray) -> np.ndarray:
     """Return the centres (n, 2) of the obstacles in the scenario's order; for a polygon, the mean of its vertices."""
-    circles, polygons = unpack_field(packed)
-    centres = [*circles[:, :2], *(polygon[:, 3:].mean(axis=0) for polygon in polygons)]
+    circles, records, polygons = unpack_field(packed)
+    centres = [*circles[:, :2], *(record[CENTRE : CENTRE + 2] for record in records)]
+    centres += [polygon[:, 3:].mean(axis=0) for polygon in polygons]
     indices = packed[int(packed[GRID]) - len(centres) : int(packed[GRID])].astype(int)
     ordered = np.empty((len(centres), 2))
     for index, centre in zip(indices, centres, strict=True):
@@ -125,8 +231,9 @@ def obstacle_centres(packed: np.ndarray) -> np.ndarray:
 
 def _pack_grid(packed: np.ndarray) -> np.ndarray:
     """Return the grid of a field. Obstacles contribute up to CUTOFF proximity scales from the robot's rim."""
-    circles, polygons = unpack_field(packed)
-    if len(circles) + len(polygons) <= MAX_OBSTACLES_WITHOUT_GRID:
+    circles, records, polygons = unpack_field(packed)
+    are_few = len(circles) + len(polygons) <= MAX_OBSTACLES_WITHOUT_GRID
+    if are_few and not records:
         return np.zeros(5)
     reach = packed[2] + CUTOFF * packed[1]
     # Obstacles may extend beyond the arena. A point outside the grid uses the nearest cell, which lists all obstacles
@@ -135,7 +242,7 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
     corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
     corners += [polygon[:, 3:] for polygon in polygons]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-    size = float(np.max(high - low)) / MAX_GRID_CELLS
+    size = float(np.max(high - low)) / (1 if are_few else MAX_GRID_CELLS)
     shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
     nearest = np.clip(circles[:, :2], first[:, None], first[:, None] + size)
@@ -166,13 +273,3 @@ def _pack_cell(circles: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray:
         rows[: len(polygon), :, k] = polygon[:, :3]
         rows[len(polygon) :, 2, k] = FAR_AWAY  # padding edges: the robot is this deep inside the half-plane
     return np.concatenate([[n, p, m], columns.ravel(), rows.ravel()])
-
-
-def _pack_polygon(vertices: np.ndarray) -> list[float]:
-    edges = np.roll(vertices, -1, axis=0) - vertices
-    area = float(np.sum(vertices[:, 0] * np.roll(vertices[:, 1], -1) - vertices[:, 1] * np.roll(vertices[:, 0], -1)))
-    if area < 0:  # reverse to counter-clockwise, so that (dy, -dx) points outwards
-        return _pack_polygon(vertices[::-1])
-    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
-    offsets = np.sum(normals * vertices, axis=1)
-    return [float(len(vertices)), *np.column_stack([normals, offsets, vertices]).ravel().tolist()]

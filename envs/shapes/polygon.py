@@ -1,18 +1,23 @@
-"""Convex polygons (kernels): distances, and the value and the derivatives of a proximity term.
+"""Convex polygons.
 
-In a packed field the rows of a polygon with m edges begin at `rows`: m times (n_x, n_y, c, x, y), see
-`leapnav.envs.shapes.field`.
+The loops over the polygons of a packed field are written out where speed matters. They use the kernels of the
+distances, and of the value and the derivatives of a proximity term. In a packed field the rows of a polygon with m
+edges begin at `rows`: m times (n_x, n_y, c, x, y), see `leapnav.envs.shapes.field`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numba import float64, int64
+from pydantic import field_validator
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
+from leapnav.envs.shapes.base import DISTANCE_SIGNATURE, SMOOTH_DISTANCE_SIGNATURE, Shape, register
+from leapnav.envs.utils.records import Point
 
 
 @kernel(float64(float64, float64, CONSTANT, int64, int64))
@@ -69,3 +74,79 @@ def polygon_derivatives(mx, my, sxx, sxy, syy, term, steepness):
     slope = term * steepness
     bend = slope * steepness
     return slope * mx, slope * my, bend * (2 * mx * mx - sxx), bend * (2 * mx * my - sxy), bend * (2 * my * my - syy)
+
+
+@kernel(DISTANCE_SIGNATURE)
+def distance(x, y, values):
+    """Distance (m), negative inside; `values` are the rows of the edges."""
+    return polygon_distance(x, y, values, 0, len(values) // 5)
+
+
+@kernel(SMOOTH_DISTANCE_SIGNATURE)
+def smooth_distance(x, y, scale, values):
+    """Smooth maximum of the distances (m) to the half-planes of the edges, with derivatives."""
+    largest = half_plane_distance(x, y, values, 0, len(values) // 5)
+    total = mx = my = sxx = sxy = syy = 0.0
+    for row in range(0, len(values), 5):
+        nx, ny = values[row], values[row + 1]
+        weight = math.exp((nx * x + ny * y - values[row + 2] - largest) / scale)
+        total += weight
+        mx += weight * nx
+        my += weight * ny
+        sxx += weight * nx * nx
+        sxy += weight * nx * ny
+        syy += weight * ny * ny
+    mx, my = mx / total, my / total
+    hxx, hxy, hyy = sxx / total - mx * mx, sxy / total - mx * my, syy / total - my * my
+    return largest + scale * math.log(total), mx, my, hxx / scale, hxy / scale, hyy / scale
+
+
+@register
+class Polygon(Shape):
+    """A convex polygon obstacle: at least three vertices (x, y) (m), in either orientation."""
+
+    kind: ClassVar = "polygon"
+    distance: ClassVar = distance
+    smooth_distance: ClassVar = smooth_distance
+
+    vertices: tuple[Point, ...]
+
+    @field_validator("vertices")
+    @classmethod
+    def _check_convex(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
+        if len(vertices) < 3:
+            raise ValueError(f"a polygon needs at least 3 vertices, this one has {len(vertices)}")
+        points = np.asarray(vertices)
+        edges = np.roll(points, -1, axis=0) - points
+        following = np.roll(edges, -1, axis=0)
+        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+        angles = np.arctan2(turns, np.sum(edges * following, axis=1))
+        # The boundary of a convex polygon turns in one direction only, by 2 pi in total (that of a star by more).
+        same_direction = bool(np.all(turns > 0) or np.all(turns < 0))
+        if not same_direction or not math.isclose(abs(float(angles.sum())), 2 * math.pi, rel_tol=1e-6):
+            raise ValueError("the polygon is not strictly convex; write a non-convex obstacle as several convex ones")
+        return vertices
+
+    def values(self) -> tuple[float, ...]:
+        """Return the rows (n_x, n_y, c, x, y) of the edges."""
+        return tuple(edge_rows(self.outline()).ravel().tolist())
+
+    def outline(self) -> np.ndarray:
+        """Return the vertices (m, 2)."""
+        return np.asarray(self.vertices, dtype=float)
+
+    def centre(self) -> tuple[float, float]:
+        """Return the mean of the vertices."""
+        x, y = self.outline().mean(axis=0).tolist()
+        return x, y
+
+
+def edge_rows(vertices: np.ndarray) -> np.ndarray:
+    """Return the rows (m, 5) of the edges of a polygon: outward normal, offset and first vertex."""
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    area = float(np.sum(vertices[:, 0] * np.roll(vertices[:, 1], -1) - vertices[:, 1] * np.roll(vertices[:, 0], -1)))
+    if area < 0:  # reverse to counter-clockwise, so that (dy, -dx) points outwards
+        return edge_rows(vertices[::-1])
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
+    offsets = np.sum(normals * vertices, axis=1)
+    return np.column_stack([normals, offsets, vertices])

@@ -1,6 +1,6 @@
 """The smooth proximity cost Phi of a packed obstacle field (kernels), with gradient and Hessian or without.
 
-Phi sums a term for each wall, circle and polygon: the proximity weight times exp(-distance / proximity scale), where
+Phi sums a term for each wall and obstacle: the proximity weight times exp(-distance / proximity scale), where
 the distance is that from the robot's outline.
 """
 
@@ -12,10 +12,12 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
-from leapnav.envs.shapes.circle import SOFTENING, circle_derivatives, smooth_distance
-from leapnav.envs.shapes.field import ARENA, CIRCLES, CUTOFF, GRID, POLYGONS, SHAPES
+from leapnav.envs.shapes.circle import SOFTENING, circle_derivatives, softened_distance
+from leapnav.envs.shapes.field import CIRCLES, CUTOFF, GRID, RECORDS, SHAPES
+from leapnav.envs.shapes.half_plane import wall_distance
 from leapnav.envs.shapes.polygon import half_plane_distance, polygon_derivatives, polygon_term
 from leapnav.envs.shapes.proximity_grid import grid_proximity
+from leapnav.envs.shapes.records import first_polygon, records_proximity
 
 VALUE_CUTOFF = 25.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 
@@ -36,7 +38,7 @@ def disc_proximity(x, y, radius, field):
     for side in range(4):  # walls: one half-plane each, the inside positive
         along_x = side % 2 == 0
         sign = 1.0 if side < 2 else -1.0
-        distance = sign * ((x if along_x else y) - field[ARENA + side]) - radius
+        distance = wall_distance(x, y, field, side) - radius
         if distance < reach:
             term = k * math.exp(-distance * steepness)
             slope = sign * term * steepness
@@ -47,8 +49,8 @@ def disc_proximity(x, y, radius, field):
             else:
                 gy -= slope
                 hyy += sign * slope * steepness
-    if field[int(field[GRID]) + 3] > 0.0:
-        found = grid_proximity(x, y, radius, field)
+    if field[int(field[GRID]) + 3] > 0.0:  # so that the loops below need not distinguish other shapes
+        found = _many_proximity(x, y, radius, field)
         gx, gy = gx + found[1], gy + found[2]
         return value + found[0], gx, gy, hxx + found[3], hxy + found[4], hyy + found[5]
     at = SHAPES
@@ -57,7 +59,7 @@ def disc_proximity(x, y, radius, field):
         rim = field[at + 2] + radius
         at += 3
         if dx * dx + dy * dy + SOFTENING < (rim + reach) ** 2:
-            smooth = smooth_distance(dx, dy)
+            smooth = softened_distance(dx, dy)
             term = k * math.exp((rim - smooth) * steepness)
             value += term
             ax, ay, bxx, bxy, byy = circle_derivatives(dx, dy, smooth, term, steepness)
@@ -66,7 +68,7 @@ def disc_proximity(x, y, radius, field):
             hxx += bxx
             hxy += bxy
             hyy += byy
-    for _ in range(int(field[POLYGONS])):
+    for _ in range(int(field[RECORDS])):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges
@@ -104,6 +106,18 @@ def disc_proximity(x, y, radius, field):
     return value, gx, gy, hxx, hxy, hyy
 
 
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
+def _many_proximity(x, y, radius, field):
+    """Proximity cost of the obstacles of a field with a grid, without the walls, see `disc_proximity`."""
+    found = grid_proximity(x, y, radius, field)
+    others = first_polygon(field)[1]
+    if others == 0:
+        return found
+    more = records_proximity(x, y, radius, field, others)
+    value, gx, gy = found[0] + more[0], found[1] + more[1], found[2] + more[2]
+    return value, gx, gy, found[3] + more[3], found[4] + more[4], found[5] + more[5]
+
+
 @kernel(float64(float64, float64, float64, CONSTANT))
 def proximity_value(x, y, radius, field):
     """Proximity cost of a disc, without derivatives, to 1e-11 of the weight for each obstacle."""
@@ -124,22 +138,20 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
     reach = VALUE_CUTOFF * field[1] + apart
     first = second = third = 0.0
     for side in range(4):
-        sign = 1.0 if side < 2 else -1.0
-        wall = field[ARENA + side]
-        a, b, c = (xa, xb, xc) if side % 2 == 0 else (ya, yb, yc)
-        if sign * (b - wall) - radius < reach:
-            first += math.exp((radius - sign * (a - wall)) * steepness)
-            second += math.exp((radius - sign * (b - wall)) * steepness)
-            third += math.exp((radius - sign * (c - wall)) * steepness)
+        between = wall_distance(xb, yb, field, side)
+        if between - radius < reach:
+            first += math.exp((radius - wall_distance(xa, ya, field, side)) * steepness)
+            second += math.exp((radius - between) * steepness)
+            third += math.exp((radius - wall_distance(xc, yc, field, side)) * steepness)
     at = SHAPES
     for _ in range(int(field[CIRCLES])):
         x, y, rim = field[at], field[at + 1], field[at + 2] + radius
         at += 3
         if (xb - x) ** 2 + (yb - y) ** 2 + SOFTENING < (rim + reach) ** 2:
-            first += math.exp((rim - smooth_distance(xa - x, ya - y)) * steepness)
-            second += math.exp((rim - smooth_distance(xb - x, yb - y)) * steepness)
-            third += math.exp((rim - smooth_distance(xc - x, yc - y)) * steepness)
-    for _ in range(int(field[POLYGONS])):
+            first += math.exp((rim - softened_distance(xa - x, ya - y)) * steepness)
+            second += math.exp((rim - softened_distance(xb - x, yb - y)) * steepness)
+            third += math.exp((rim - softened_distance(xc - x, yc - y)) * steepness)
+    for _ in range(int(field[RECORDS])):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges

@@ -16,7 +16,7 @@ from numba import float64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.numba_internals import carray, power_of_two, scratch_buffer
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
-from leapnav.envs.shapes.circle import circle_derivatives, smooth_distance
+from leapnav.envs.shapes.circle import circle_derivatives, softened_distance
 from leapnav.envs.shapes.field import GRID, LANES
 from leapnav.envs.shapes.polygon import polygon_derivatives
 
@@ -56,7 +56,7 @@ def exponential(x):
     fastmath={"contract", "nsz", "reassoc"},
 )
 def grid_proximity(x, y, radius, field):
-    """Return the proximity cost of a disc without the walls, from the obstacles in the grid; as `disc_proximity`."""
+    """Return, for a disc of a radius (m), (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy) of the circles and polygons."""
     k, steepness = field[0], 1.0 / field[1]
     grid = np.uint64(field[GRID])
     columns, lines = int(field[grid + 3]), int(field[grid + 4])
@@ -69,7 +69,7 @@ def grid_proximity(x, y, radius, field):
     value = gx = gy = hxx = hxy = hyy = 0.0
     for i in range(circles):
         dx, dy = x - field[at + i], y - field[at + circles + i]
-        smooth = smooth_distance(dx, dy)
+        smooth = softened_distance(dx, dy)
         term = exponential((field[at + circles + circles + i] + radius - smooth) * steepness)
         ax, ay, bxx, bxy, byy = circle_derivatives(dx, dy, smooth, term, steepness)
         value += term

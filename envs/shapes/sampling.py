@@ -10,9 +10,11 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, tuple_of
-from leapnav.envs.shapes.circle import smooth_distance
-from leapnav.envs.shapes.field import ARENA, CIRCLES, POLYGONS, SHAPES
+from leapnav.envs.shapes.circle import softened_distance
+from leapnav.envs.shapes.field import CENTRE, CIRCLES, LENGTH, RECORDS, RIM, SHAPES
+from leapnav.envs.shapes.half_plane import wall_distance
 from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance, polygon_term
+from leapnav.envs.shapes.records import first_polygon, record_distance, record_smooth_distance
 
 
 class PointGrid(NamedTuple):
@@ -50,8 +52,7 @@ def sample_grid(field, radius, grid, band):
             x, y = x0 + i * spacing, y0 + j * spacing
             phi[i, j], closest[i, j] = 0.0, band
             for side in range(4):
-                sign = 1.0 if side < 2 else -1.0
-                distance = sign * ((x if side % 2 == 0 else y) - field[ARENA + side]) - radius
+                distance = wall_distance(x, y, field, side) - radius
                 if distance < band:
                     phi[i, j] += weight * math.exp(-distance * steepness)
                     closest[i, j] = min(closest[i, j], distance)
@@ -67,9 +68,23 @@ def sample_grid(field, radius, grid, band):
                 dx, dy = x0 + i * spacing - cx, y0 + j * spacing - cy
                 distance = math.hypot(dx, dy) - r - radius
                 if distance < band:
-                    phi[i, j] += weight * math.exp((r + radius - smooth_distance(dx, dy)) * steepness)
+                    phi[i, j] += weight * math.exp((r + radius - softened_distance(dx, dy)) * steepness)
                     closest[i, j] = min(closest[i, j], distance)
-    for _ in range(int(field[POLYGONS])):
+    others = first_polygon(field)[1]
+    for _ in range(others):
+        cx, cy, r = field[at + CENTRE], field[at + CENTRE + 1], field[at + RIM]
+        first, last = _index_range(cx - r - reach, cx + r + reach, x0, spacing, columns)
+        bottom, top = _index_range(cy - r - reach, cy + r + reach, y0, spacing, lines)
+        for i in range(first, last):
+            for j in range(bottom, top):
+                x, y = x0 + i * spacing, y0 + j * spacing
+                distance = record_distance(x, y, field, at) - radius
+                if distance < band:
+                    smooth = record_smooth_distance(x, y, field, at)[0]
+                    phi[i, j] += weight * math.exp((radius - smooth) * steepness)
+                    closest[i, j] = min(closest[i, j], distance)
+        at += 2 + int(field[at + LENGTH])
+    for _ in range(int(field[RECORDS]) - others):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges

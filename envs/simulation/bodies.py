@@ -20,7 +20,7 @@ from numba import float64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
 from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import ARENA, unpack_field
+from leapnav.envs.shapes.field import ARENA, CENTRE, record_outline, unpack_field
 from leapnav.envs.shapes.proximity import proximity_value
 
 WALL_THICKNESS = 1.0  # m, outside the arena
@@ -105,8 +105,10 @@ class ContactWorld:
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
-        circles, polygons = unpack_field(field)
+        circles, records, polygons = unpack_field(field)
         shapes: list[pymunk.Shape] = [pymunk.Circle(static, r, (x, y)) for x, y, r in circles.tolist()]
+        for record in records:
+            shapes += _rounded_polygon(static, *record_outline(record), record[CENTRE : CENTRE + 2])
         shapes += [pymunk.Poly(static, polygon[:, 3:].tolist()) for polygon in polygons]
         x_min, y_min, x_max, y_max = field[ARENA : ARENA + 4].tolist()
         t = WALL_THICKNESS
@@ -186,6 +188,27 @@ class ContactWorld:
         """Return the proximity cost at a pose."""
         cos, sin = math.cos(heading), math.sin(heading)
         return sum(proximity_value(x + a * cos, y + a * sin, r, self._field) for a, r in self._discs.tolist())
+
+
+def _rounded_polygon(body: pymunk.Body, vertices: np.ndarray, radius: float, centre: np.ndarray) -> list[pymunk.Shape]:
+    """Return the shapes of a polygon rounded by a radius (m); a polygon that is not convex is divided into triangles.
+
+    The triangles from the centre to the sides cover a polygon that is star-shaped about it.
+    """
+    points = vertices.tolist()
+    if len(points) == 1:
+        return [pymunk.Circle(body, radius, points[0])]
+    if len(points) == 2:
+        return [pymunk.Segment(body, points[0], points[1], radius)]
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    following = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+    if np.all(turns >= 0) or np.all(turns <= 0):
+        return [pymunk.Poly(body, points, radius=radius)]
+    middle = centre.tolist()
+    return [
+        pymunk.Poly(body, [middle, a, b], radius=radius) for a, b in zip(points, points[1:] + points[:1], strict=True)
+    ]
 
 
 def _pose(body: pymunk.Body) -> tuple[float, float, float]:

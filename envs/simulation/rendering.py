@@ -106,8 +106,8 @@ def draw_scene(scene: Scene) -> np.ndarray:
             center, radius = to_pixels(*obstacle.circle.center), obstacle.circle.radius * scale
             pygame.draw.circle(canvas, OBSTACLE, center, radius)
             pygame.draw.circle(canvas, EDGE, center, radius, line)
-        elif obstacle.polygon is not None:
-            corners = [to_pixels(*vertex) for vertex in obstacle.polygon.vertices]
+        else:
+            corners = [to_pixels(*vertex) for vertex in obstacle.shape.outline().tolist()]
             pygame.draw.polygon(canvas, OBSTACLE, corners)
             pygame.draw.polygon(canvas, EDGE, corners, line)
     pygame.draw.rect(canvas, WALL, frame, 2 * line)

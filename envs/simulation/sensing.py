@@ -9,8 +9,9 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
-from leapnav.envs.shapes.field import ARENA, CIRCLES, POLYGONS, SHAPES
+from leapnav.envs.shapes.field import ARENA, CIRCLES, LENGTH, N_VERTICES, RECORDS, ROUNDING, SHAPES, VERTICES
 from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
+from leapnav.envs.shapes.records import first_polygon, record_distance, trace_rays
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
 
@@ -57,7 +58,11 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
             half = math.sqrt(square if square > 0.0 else 0.0)
             hit = along - half if square > 0.0 and along + half > 0.0 else reach
             nearest[k] = hit if hit < nearest[k] else nearest[k]
-    for _ in range(int(field[POLYGONS])):
+    others = first_polygon(field)[1] if field[RECORDS] > 0.0 and field[at] < 0.0 else 0
+    for _ in range(others):
+        trace_rays(x, y, dxs, dys, nearest, reach, field, at)
+        at += 2 + int(field[at + LENGTH])
+    for _ in range(int(field[RECORDS]) - others):
         edges = int(field[at])
         rows = at + 1
         at = rows + 5 * edges
@@ -85,12 +90,16 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
 
 @kernel(int64(CONSTANT))
 def max_vertices(field):
-    """Return the maximum number of vertices of a polygon in the field, 0 without polygons."""
+    """Return the maximum number of vertices of an obstacle in the field, 0 if all are circles."""
     at = SHAPES + 3 * int(field[CIRCLES])
     largest = 0
-    for _ in range(int(field[POLYGONS])):
-        largest = max(largest, int(field[at]))
-        at += 1 + 5 * int(field[at])
+    for _ in range(int(field[RECORDS])):
+        if field[at] > 0.0:
+            largest = max(largest, int(field[at]))
+            at += 1 + 5 * int(field[at])
+        else:
+            largest = max(largest, int(field[at + N_VERTICES]))
+            at += 2 + int(field[at + LENGTH])
     return largest
 
 
@@ -100,8 +109,8 @@ def max_vertices(field):
 def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
     """Describe the walls and the nearest obstacles in the robot's frame, in order of distance.
 
-    An obstacle is a polygon rounded by a radius; a disc has one vertex, a polygon the radius 0. Its row contains 1, the
-    radius and the vertices, which are repeated to fill the row. Rows without an obstacle are zeros.
+    An obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the radius 0. Its row
+    contains 1, the radius and the vertices, which are repeated to fill the row. Rows without an obstacle are zeros.
 
     Args:
         x, y: position of the robot (m).
@@ -117,15 +126,18 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
     width = 2 + 2 * vertices
     for k in range(WALL_ENTRIES, WALL_ENTRIES + obstacles * width):
         out[k] = 0.0
-    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
-    # Insertion sort into a list of the nearest obstacles; a polygon is marked by a negative index into the field.
+    circles, records = int(field[CIRCLES]), int(field[RECORDS])
+    # Insertion sort into a list of the nearest obstacles; one that is not a circle has a negative index into the field.
     distances = np.full(obstacles, np.inf)
     indices = np.zeros(obstacles, np.int64)
     at = SHAPES
-    for i in range(circles + polygons):
+    for i in range(circles + records):
         if i < circles:
             distance = math.sqrt((field[at] - x) ** 2 + (field[at + 1] - y) ** 2) - field[at + 2]
             size = 3
+        elif field[at] < 0.0:
+            distance = record_distance(x, y, field, at)
+            size = 2 + int(field[at + LENGTH])
         else:
             edges = int(field[at])
             distance = polygon_distance(x, y, field, at + 1, edges)
@@ -145,10 +157,15 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
         at = abs(indices[k])
         disc = indices[k] > 0
         out[row] = 1.0
-        out[row + 1] = field[at + 2] if disc else 0.0
-        edges = 1 if disc else int(field[at])
+        if disc:
+            first, stride, edges, rounding = at, 0, 1, field[at + 2]
+        elif field[at] < 0.0:
+            first, stride, edges, rounding = at + VERTICES, 2, int(field[at + N_VERTICES]), field[at + ROUNDING]
+        else:
+            first, stride, edges, rounding = at + 4, 5, int(field[at]), 0.0
+        out[row + 1] = rounding
         for j in range(vertices):
-            vertex = at if disc else at + 1 + 5 * (j % edges) + 3
+            vertex = first + stride * (j % edges)
             dx, dy = field[vertex] - x, field[vertex + 1] - y
             out[row + 2 + 2 * j] = cos * dx + sin * dy
             out[row + 3 + 2 * j] = cos * dy - sin * dx

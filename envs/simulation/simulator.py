@@ -215,7 +215,7 @@ class BatchSimulator:
             bank: the bank, or None.
 
         Raises:
-            ValueError: a polygon has more vertices than the map, or the scenario has another robot.
+            ValueError: an obstacle has more vertices than the map, or the scenario has another robot.
 
         """
         if choice is not None:
@@ -232,7 +232,7 @@ class BatchSimulator:
         vertices = max_vertices(field)
         if vertices > self.settings.map_vertices:
             raise ValueError(
-                f"map_vertices: expected at least {vertices}, the number of vertices of a polygon in the scenario, "
+                f"map_vertices: expected at least {vertices}, the number of vertices of an obstacle in the scenario, "
                 f"got {self.settings.map_vertices}"
             )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi
@@ -9,6 +10,7 @@ import numpy as np
 import sympy as sp
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes import Capsule
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.transcription.direct import follow_controls
 
@@ -109,7 +111,11 @@ def _proximity(scenario: Scenario, x: Any, y: Any, radius: float) -> Any:
         if obstacle.circle is not None:
             (cx, cy), r = obstacle.circle.center, obstacle.circle.radius
             total += casadi.exp(-(casadi.sqrt((x - cx) ** 2 + (y - cy) ** 2 + 1e-6) - r - radius) / sigma)
-        elif obstacle.polygon is not None:
+        elif isinstance(capsule := obstacle.shape, Capsule):
+            total += casadi.exp(-(_capsule_distance(capsule, sigma, x, y) - radius) / sigma)
+        elif obstacle.polygon is None:
+            raise ValueError(f"obstacles: IPOPT supports circles, polygons and capsules, got {obstacle.shape.kind!r}")
+        else:
             vertices = np.array(obstacle.polygon.vertices)
             edges = np.roll(vertices, -1, axis=0) - vertices
             normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
@@ -123,3 +129,17 @@ def _proximity(scenario: Scenario, x: Any, y: Any, radius: float) -> Any:
             normaliser = sum(casadi.exp((distance - maximum) / sigma) for distance in distances)
             total += casadi.exp((radius - maximum) / sigma) / normaliser
     return total
+
+
+def _capsule_distance(capsule: Capsule, sigma: float, x: Any, y: Any) -> Any:
+    """The smooth distance to a capsule; the excess beyond its ends is a difference of two softplus functions."""
+    (ax, ay), (bx, by) = capsule.start, capsule.end
+    length = math.dist(capsule.start, capsule.end)
+    ux, uy = ((bx - ax) / length, (by - ay) / length) if length > 0 else (1.0, 0.0)
+    along, across = (x - ax) * ux + (y - ay) * uy, (y - ay) * ux - (x - ax) * uy
+
+    def softplus(z: Any) -> Any:
+        return sigma * (casadi.fmax(z / sigma, 0) + casadi.log1p(casadi.exp(-casadi.fabs(z / sigma))))
+
+    excess = softplus(along - length) - softplus(-along)
+    return casadi.sqrt(excess**2 + across**2 + 1e-6) - capsule.radius

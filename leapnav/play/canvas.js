@@ -82,17 +82,6 @@ function drawSelection(x, y, radius) {
   context.setLineDash([]);
 }
 
-function traceObstacle(obstacle) {
-  context.beginPath();
-  if (obstacle.circle) {
-    context.arc(...toScreen(obstacle.circle.center), Math.max(view.scale * obstacle.circle.radius, 0), 0, 2 * Math.PI);
-  } else {
-    const vertices = obstacle.polygon.vertices;
-    vertices.forEach((point, i) => (i ? context.lineTo(...toScreen(point)) : context.moveTo(...toScreen(point))));
-    context.closePath();
-  }
-}
-
 // The pose at a time, interpolated between states at equal intervals.
 function poseAt(states, time, duration) {
   const position = Math.min(Math.max(time / duration, 0), 1) * (states.length - 1);

@@ -82,25 +82,11 @@ function advance(driving, elapsed) {
   if (driving.actions.length === maxCount || driving.time >= scenario.horizon + CONTROL_PERIOD) finishDriving();
 }
 
-function segmentDistance([x, y], [ax, ay], [bx, by]) {
-  const [dx, dy] = [bx - ax, by - ay], length = dx * dx + dy * dy;
-  const t = Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / (length || 1), 0), 1);
-  return Math.hypot(x - ax - t * dx, y - ay - t * dy);
-}
-
 // Whether the robot is in contact with an obstacle or a wall. The server decides; this only ends the driving.
 function isInContact(scenario, [x, y]) {
   const { radius } = scenario.robot, [x0, y0, x1, y1] = scenario.arena;
   if (Math.min(x - x0, x1 - x, y - y0, y1 - y) <= radius) return true;
-  return (scenario.obstacles || []).some((obstacle) => {
-    if (obstacle.circle) {
-      const [cx, cy] = obstacle.circle.center;
-      return Math.hypot(x - cx, y - cy) <= radius + obstacle.circle.radius;
-    }
-    const vertices = obstacle.polygon.vertices;
-    return isInside(obstacle, [x, y]) ||
-      vertices.some((vertex, i) => segmentDistance([x, y], vertex, vertices[(i + 1) % vertices.length]) <= radius);
-  });
+  return (scenario.obstacles || []).some((obstacle) => isInside(obstacle, [x, y], radius));
 }
 
 async function finishDriving() {

@@ -7,42 +7,6 @@ const TURN = Math.PI / 36, FINE_TURN = Math.PI / 180; // rad per key press
 const SCALE = 1.1, FINE_SCALE = 1.02; // change of size per key press
 const HANDLE_SIZE = { mouse: 10, pen: 14, touch: 22 }; // smallest radius of a handle (pixels)
 
-// ---- Geometry of obstacles
-
-function isInside(obstacle, [x, y]) {
-  if (obstacle.circle) {
-    const [cx, cy] = obstacle.circle.center;
-    return Math.hypot(x - cx, y - cy) <= obstacle.circle.radius;
-  }
-  const vertices = obstacle.polygon.vertices;
-  const sides = vertices.map(([ax, ay], i) => {
-    const [bx, by] = vertices[(i + 1) % vertices.length];
-    return (bx - ax) * (y - ay) - (by - ay) * (x - ax);
-  });
-  return sides.every((side) => side >= 0) || sides.every((side) => side <= 0);
-}
-
-function centerOf(obstacle) {
-  if (obstacle.circle) return obstacle.circle.center;
-  const vertices = obstacle.polygon.vertices;
-  return [0, 1].map((i) => vertices.reduce((sum, vertex) => sum + vertex[i], 0) / vertices.length);
-}
-
-// An obstacle after a map of its points and a factor of its size.
-function mapped(obstacle, map, factor = 1) {
-  if (obstacle.circle) return { circle: { center: map(obstacle.circle.center), radius: obstacle.circle.radius * factor } };
-  return { polygon: { vertices: obstacle.polygon.vertices.map(map) } };
-}
-
-const moved = (obstacle, dx, dy) => mapped(obstacle, ([x, y]) => [x + dx, y + dy]);
-
-// Scaled and rotated about its centre.
-function transformed(obstacle, factor, angle) {
-  const [cx, cy] = centerOf(obstacle), c = factor * Math.cos(angle), s = factor * Math.sin(angle);
-  const map = ([x, y]) => [cx + c * (x - cx) - s * (y - cy), cy + s * (x - cx) + c * (y - cy)];
-  return obstacle.circle ? mapped(obstacle, (center) => center, factor) : mapped(obstacle, map);
-}
-
 // ---- Changes of the selection
 
 const obstaclesOf = () => play.scenario.obstacles || [];
@@ -70,7 +34,7 @@ function rotateSelected(angle, group) {
   if (isPose(play.selected)) {
     const [x, y, heading] = poseOf(play.selected);
     setPose(play.selected, [x, y, wrapped((heading === null ? 0 : heading) + angle)], group);
-  } else if (play.selected !== null && obstaclesOf()[play.selected].polygon) {
+  } else if (play.selected !== null && canRotate(obstaclesOf()[play.selected])) {
     replaceObstacle(play.selected, transformed(obstaclesOf()[play.selected], 1, angle), group);
   }
 }
@@ -105,6 +69,9 @@ const addBox = () =>
   addObstacle((x, y) =>
     ({ polygon: { vertices: [[x - 0.6, y - 0.4], [x + 0.6, y - 0.4], [x + 0.6, y + 0.4], [x - 0.6, y + 0.4]] } }));
 
+const addCapsule = () =>
+  addObstacle((x, y) => ({ capsule: { start: [x - 0.8, y], end: [x + 0.8, y], radius: 0.2 } }));
+
 function selectNext(step) {
   if (!canEdit()) return;
   const all = ["start", "goal", ...obstaclesOf().keys()], current = all.indexOf(play.selected);
@@ -122,7 +89,7 @@ function describeSelection() {
   }
   const obstacle = obstaclesOf()[selected], position = at(centerOf(obstacle));
   if (obstacle.circle) return `disc ${selected} ${position}, radius ${obstacle.circle.radius.toFixed(2)} m`;
-  return `polygon ${selected} ${position}`;
+  return `${Object.keys(obstacle)[0]} ${selected} ${position}`;
 }
 
 // ---- Mouse and touch
@@ -215,6 +182,7 @@ const ACTIONS = {
   previous: () => selectNext(-1),
   "add-disc": addDisc,
   "add-box": addBox,
+  "add-capsule": addCapsule,
   undo,
   redo,
 };
@@ -226,7 +194,7 @@ const KEYS = {
   "+": "grow", "=": "grow", "-": "shrink", _: "shrink", "*": "grow",
   Delete: "remove", Backspace: "remove", f: "free-heading",
   n: "next", "]": "next", PageDown: "next", p: "previous", "[": "previous", PageUp: "previous",
-  a: "add-disc", b: "add-box",
+  a: "add-disc", b: "add-box", c: "add-capsule",
 };
 
 canvas.addEventListener("keydown", (event) => {
@@ -264,10 +232,10 @@ for (const button of document.querySelectorAll("[data-action]")) {
 // The buttons that apply to the selection.
 function showSelection() {
   const { selected } = play, isObstacle = typeof selected === "number";
-  const isDisc = isObstacle && Boolean((obstaclesOf()[selected] || {}).circle);
+  const isFixed = isObstacle && !canRotate(obstaclesOf()[selected] || {});
   const enabled = {
     left: selected !== null, right: selected !== null, up: selected !== null, down: selected !== null,
-    "turn-left": selected !== null && !isDisc, "turn-right": selected !== null && !isDisc,
+    "turn-left": selected !== null && !isFixed, "turn-right": selected !== null && !isFixed,
     grow: isObstacle, shrink: isObstacle, remove: isObstacle, undo: play.undo.length > 0, redo: play.redo.length > 0,
   };
   for (const [name, isEnabled] of Object.entries(enabled)) {

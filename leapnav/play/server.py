@@ -17,14 +17,17 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from leapnav.envs.robots.base import MODELS
+from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario, check_headings
 from leapnav.envs.utils import colors
+from leapnav.envs.utils.records import as_tuples
 from leapnav.experts.acting.policy import NoOptimumError
 from leapnav.play.solving import PlaySolver, bank_scenario
 
 MAX_REQUEST_SIZE = 1_000_000  # bytes
 SCRIPTS = (
     "state.js",
+    "shapes.js",
     "canvas.js",
     "plots.js",
     "editing.js",
@@ -112,6 +115,10 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
         check_headings(scenario)  # the content of a file or a link
         return {"scenario": scenario.to_dict()}
 
+    def outline(content: dict[str, Any]) -> dict[str, Any]:
+        obstacle = Obstacle.model_validate(as_tuples(content.get("obstacle")))
+        return {"outline": obstacle.shape.outline().tolist()}
+
     def follow(content: dict[str, Any]) -> dict[str, Any]:
         previous = content.get("previous")
         if previous is not None and not isinstance(previous, str):
@@ -120,6 +127,7 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
 
     handlers: dict[str, Handler] = {
         "/check": check,
+        "/outline": outline,
         "/follow": follow,
         "/search": lambda content: solver.search(_scenario(content)),
         "/sweeps": lambda content: solver.sweeps(_scenario(content)),

@@ -1,0 +1,75 @@
+"""An obstacle of a scenario: one shape, given by its kind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pydantic import SerializationInfo, ValidationError, model_serializer, model_validator
+from pydantic_core import ErrorDetails, InitErrorDetails
+
+from leapnav.envs.shapes import Circle, Polygon, Shape
+from leapnav.envs.shapes.base import KINDS
+from leapnav.envs.utils.records import Frozen
+
+
+class Obstacle(Frozen):
+    """An obstacle: exactly one shape, given by its kind.
+
+    In Python `Obstacle(circle=Circle(...))`, in the scenario file `{"circle": {...}}`. The kinds are the registered
+    shapes, see `leapnav.envs.Shape`.
+
+    Attributes:
+        shape: the shape.
+
+    """
+
+    shape: Shape
+
+    if TYPE_CHECKING:
+
+        def __init__(self, **shape: Shape | None) -> None: ...
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_shape(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping):
+            return fields
+        given = {kind: shape for kind, shape in fields.items() if shape is not None}
+        faults: list[InitErrorDetails] = [
+            {"type": "extra_forbidden", "loc": (kind,), "input": value}
+            for kind, value in given.items()
+            if kind not in KINDS
+        ]
+        if not faults and len(given) != 1:
+            kinds = [repr(kind) for kind in KINDS]
+            raise ValueError(f"an obstacle is exactly one of {', '.join(kinds[:-1])} or {kinds[-1]}")
+        if not faults:
+            ((kind, value),) = given.items()
+            try:
+                return {"shape": KINDS[kind].model_validate(value)}
+            except ValidationError as error:
+                faults = [_inside(kind, details) for details in error.errors(include_url=False)]
+        raise ValidationError.from_exception_data(cls.__name__, faults)
+
+    @model_serializer
+    def _serialize(self, info: SerializationInfo) -> dict[str, Any]:
+        return {self.shape.kind: self.shape.model_dump(mode=info.mode, exclude_none=info.exclude_none)}
+
+    @property
+    def circle(self) -> Circle | None:
+        """The circle, or None if the shape is another one."""
+        return self.shape if isinstance(self.shape, Circle) else None
+
+    @property
+    def polygon(self) -> Polygon | None:
+        """The polygon, or None if the shape is another one."""
+        return self.shape if isinstance(self.shape, Polygon) else None
+
+
+def _inside(kind: str, details: ErrorDetails) -> InitErrorDetails:
+    """Return a fault of a shape as one of its obstacle."""
+    fault: InitErrorDetails = {"type": details["type"], "loc": (kind, *details["loc"]), "input": details["input"]}
+    if "ctx" in details:
+        fault["ctx"] = details["ctx"]
+    return fault
