@@ -53,3 +53,19 @@ class Trailer(Unicycle):
 
     def parameters(self, cost) -> tuple[float, ...]:
         return (self.length,)
+
+
+if __name__ == "__main__":
+    import argparse
+
+    from leapnav.envs import sample_scenario
+    from leapnav.experts import find_optimum, plot_extremal
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--plot", default="trailer.png", help="picture of the optimum")
+    arguments = parser.parse_args()
+    scenario = sample_scenario("clutter", 3, robot="trailer")
+    optimum = find_optimum(scenario)
+    print(f"{optimum.status.value}: J = {optimum.cost:.6f}")
+    plot_extremal(optimum, arguments.plot, scenario)
+    print(f"wrote {arguments.plot}")
