@@ -64,6 +64,16 @@ def rates_of(scenario):
     return lambda q, u: np.array(function(q, u, parameters), dtype=float)
 
 
+del MODELS["trailer"]  # registered for the tests of this module only: other tests read the list of models
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trailer():
+    register(Trailer)
+    yield
+    del MODELS["trailer"]
+
+
 @pytest.fixture(scope="module")
 def optima():
     return {name: find_optimum(task(name)) for name in ROBOTS}
