@@ -35,9 +35,11 @@ def served(scenario=SCENARIO):
     while not server.started:
         assert thread.is_alive()
         time.sleep(0.01)
-    yield server.servers[0].sockets[0].getsockname()[1]
-    server.should_exit = True
-    thread.join()
+    try:
+        yield server.servers[0].sockets[0].getsockname()[1]
+    finally:  # a thread that still runs would keep the process of the tests alive
+        server.should_exit = True
+        thread.join()
 
 
 def ask_server(port, path, question=None, *, headers=None, body=None):
@@ -68,14 +70,16 @@ def opened(port, **options):
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_context(accept_downloads=True, **options).new_page()
-        page.set_default_timeout(0)
+        page.set_default_timeout(300_000)  # ms; an element that never appears must not stop the run
         problems = []
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.goto(f"http://127.0.0.1:{port}/")
         rest(page)
-        yield page
-        browser.close()
+        try:
+            yield page
+        finally:
+            browser.close()
     assert not [problem for problem in problems if REFUSED not in problem]
 
 

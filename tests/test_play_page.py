@@ -190,9 +190,14 @@ def test_everything_can_be_edited_by_keyboard(page):
     assert page.evaluate("document.activeElement.id") != "view"
 
 
+def open_robot_and_cost(page):
+    if not page.is_visible("#radius"):
+        page.click("text=Robot and cost")
+
+
 def test_robot_and_cost_are_edited_and_an_invalid_number_is_reported(page):
     load(page, SCENARIO.to_dict())
-    page.click("text=Robot and cost")
+    open_robot_and_cost(page)
     page.fill("#radius", "0.4")
     page.fill("#turn-weight", "2")
     page.keyboard.press("Enter")
@@ -212,7 +217,7 @@ def test_robot_and_cost_are_edited_and_an_invalid_number_is_reported(page):
 @pytest.mark.parametrize("model", ["car", "dynamic_unicycle", "differential_drive"])
 def test_another_robot_is_chosen(page, model):
     load(page, SCENARIO.to_dict())
-    page.click("text=Robot and cost")
+    open_robot_and_cost(page)
     page.select_option("#model", model)
     rest(page)
     scenario = Scenario.from_dict(page.evaluate("play.scenario"))

@@ -127,7 +127,7 @@ byId("model").addEventListener("change", () => {
   const { fields, weights } = play.robots[byId("model").value], { start_motion, goal_motion, ...scenario } = play.scenario;
   const cost = Object.entries(scenario.cost || {}).filter(([name]) => name.startsWith("proximity") || weights.includes(name));
   const radius = scenario.robot && scenario.robot.radius;
-  replaceScenario({ ...scenario, robot: { ...fields, ...(radius ? { radius } : {}) }, cost: Object.fromEntries(cost) });
+  changeScenario({ ...scenario, robot: { ...fields, ...(radius ? { radius } : {}) }, cost: Object.fromEntries(cost) });
 });
 
 byId("horizon").addEventListener("change", () => {

@@ -178,10 +178,10 @@ let lastGroup = null;
 
 // Changes fields of the scenario. Successive changes with the same group, such as those of a drag, are undone together.
 function edit(fields, group = null) {
-  replaceScenario({ ...play.scenario, ...fields }, group);
+  changeScenario({ ...play.scenario, ...fields }, group);
 }
 
-function replaceScenario(scenario, group = null) {
+function changeScenario(scenario, group = null) {
   if (group === null || group !== lastGroup) remember();
   lastGroup = group;
   play.scenario = scenario;
