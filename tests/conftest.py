@@ -7,6 +7,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from leapnav.envs.robots.base import MODELS
 from leapnav.envs.shapes.base import KINDS
 
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
@@ -79,9 +80,11 @@ def env():
 
 
 @pytest.fixture(autouse=True)
-def _registered_shapes():
-    """Forget the obstacle shapes that a test registers."""
-    before = dict(KINDS)
+def _registered():
+    """Forget the robot models and obstacle shapes that a test registers."""
+    registries = MODELS, KINDS
+    before = [dict(registry) for registry in registries]
     yield
-    KINDS.clear()
-    KINDS.update(before)
+    for registry, content in zip(registries, before, strict=True):
+        registry.clear()
+        registry.update(content)

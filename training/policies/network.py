@@ -16,6 +16,7 @@ from leapnav.experts.data.demonstrations import ENVIRONMENT
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
 ROBOT_RADIUS = 0.25  # radius of the robots in all families (m); a range minus this is the clearance along a beam
+CONTROL_PERIOD = 0.05  # default of the environment (s)
 
 
 class NavigationFeatures(BaseFeaturesExtractor):
@@ -27,7 +28,7 @@ class NavigationFeatures(BaseFeaturesExtractor):
     """
 
     POSE_FEATURES = 23  # features of the goal part
-    MOTION_FEATURES = 2  # features of each entry of the motion part
+    MOTION_FEATURES = 7  # features of each entry of the motion part
     BEAM_FEATURES = 3  # features of each lidar beam
 
     def __init__(self, observation_space: spaces.Box) -> None:
@@ -47,6 +48,7 @@ class NavigationFeatures(BaseFeaturesExtractor):
         bearing = th.atan2(goal[:, 1:2], goal[:, 0:1])
         needed_speeds, needed_turn_rate = observations[:, 5:8], observations[:, 8:9]  # to arrive on time
         motion, ranges = observations[:, GOAL_ENTRIES : self._first_beam], observations[:, self._first_beam :]
+        to_rest = _acceleration_to_rest(motion, th.cat([needed_speeds[:, :1], needed_turn_rate], dim=1), time_left)
         return th.cat(
             [
                 goal / 5,
@@ -69,12 +71,37 @@ class NavigationFeatures(BaseFeaturesExtractor):
                 th.sin(error - 2 * bearing),
                 (motion / 2).clamp(-3, 3),
                 th.tanh(motion / 0.3),
+                th.tanh(motion / 0.05),
+                (to_rest / 6).clamp(-3, 3),
+                th.tanh(to_rest),
                 ranges / 5,
                 th.exp(-(ranges - ROBOT_RADIUS) / 0.3),
                 ROBOT_RADIUS / ranges.clamp(min=0.1),
             ],
             dim=1,
         )
+
+
+def _acceleration_to_rest(rates: th.Tensor, needed: th.Tensor, time_left: th.Tensor) -> th.Tensor:
+    """Return the accelerations with which double integrators arrive at rest, for each pair of a rate and a distance.
+
+    The acceleration of least effort, the integral of its square, is linear in time (A. E. Bryson and Y.-C. Ho, Applied
+    Optimal Control, 1975, section 5.2); the result is its mean over the next control period.
+
+    Args:
+        rates: (B, k), rates of change.
+        needed: (B, 2), distances divided by the time left.
+        time_left: (B, 1), time until the arrival (s).
+
+    Returns:
+        (B, 2k), accelerations.
+
+    """
+    time_left = time_left.clamp(min=CONTROL_PERIOD)
+    elapsed = CONTROL_PERIOD / time_left  # fraction of the time left that the next control period takes
+    rates, needed = rates.unsqueeze(2), needed.unsqueeze(1)
+    elapsed, time_left = elapsed.unsqueeze(2), time_left.unsqueeze(2)
+    return ((6 * (1 - elapsed) * needed - (4 - 3 * elapsed) * rates) / time_left).flatten(1)
 
 
 def network(hidden: Sequence[int] = HIDDEN, critic: Sequence[int] | None = None) -> dict[str, Any]:
