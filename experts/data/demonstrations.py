@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -122,10 +122,10 @@ def demonstrate_disturbed(
 
     def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
         state, now = inner.state, inner.time
+        cost, costate = np.nan, np.full(len(state), np.nan)
         if feedback.update(state, now):
-            cost, costate = feedback.value(state, now)
-        else:
-            cost, costate = np.nan, np.full(len(state), np.nan)
+            with suppress(ValueError):  # no solution with the tighter tolerance of a value
+                cost, costate = feedback.value(state, now)
         costs.append(cost)
         costates.append(costate)
         ahead = min(inner.control_period, scenario.horizon - inner.time) / 2

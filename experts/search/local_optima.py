@@ -22,11 +22,11 @@ from leapnav.experts.search.lattice import TOLERATED_DEPTH, Place
 from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.nodes import SolverOptions
-from leapnav.experts.transcription.direct import DirectPath, discretise, optimise
+from leapnav.experts.transcription.direct import MAX_ITERATIONS, DirectPath, discretise, optimise
 
 TOLERANCE = 1e-9
 # Newton iterations of the last attempt, and of the attempts before it, after which the path is refined.
-NEWTON_ITERATIONS, FIRST_ITERATIONS = 25, 14
+NEWTON_ITERATIONS, FIRST_ITERATIONS, EXPENSIVE_ITERATIONS = 25, 14, 10
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
 INTERVALS_PER_SEGMENT, MIN_SEGMENTS = 8, 8
 MAX_ATTEMPTS = 3
@@ -115,7 +115,9 @@ class LocalOptima:
             self.add_direct(problem, direct)
 
     def _optimise(self, problem: OptimalControlProblem, guess: DirectPath) -> DirectPath:
-        return optimise(problem, guess, self.scenario.cost.speed_weight)
+        is_expensive = math.isfinite(guess.cost) and self._is_expensive(guess, DIRECT_ERROR)
+        iterations = EXPENSIVE_ITERATIONS if is_expensive else MAX_ITERATIONS
+        return optimise(problem, guess, self.scenario.cost.speed_weight, iterations)
 
     def add_direct(self, problem: OptimalControlProblem, direct: DirectPath) -> None:
         """Compute the extremal of a direct path, unless the path is a duplicate or unlikely to lead to a useful one."""
@@ -190,6 +192,9 @@ class LocalOptima:
         history: tuple[Iteration, ...] = ()
         total = 0
         n_attempts = MAX_ATTEMPTS if is_clear else MAX_ATTEMPTS - 1  # less effort for a path in collision
+        is_expensive = self._is_expensive(direct, REFINED_ERROR)
+        if is_expensive:  # not the optimum
+            n_attempts = 1
         for attempt in range(n_attempts):
             if attempt > 0:
                 direct = self._optimise(problem, direct.refined())
@@ -197,6 +202,7 @@ class LocalOptima:
                     if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
                         return extremal, total
             iterations = NEWTON_ITERATIONS if attempt == n_attempts - 1 else FIRST_ITERATIONS
+            iterations = EXPENSIVE_ITERATIONS if is_expensive else iterations
             times, nodes = _shooting_nodes(problem, direct, 2**attempt)
             status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, iterations)
             history += rows

@@ -84,11 +84,11 @@ def discretise(problem: OptimalControlProblem, path: Trajectory) -> DirectPath:
 def _controls(problem: OptimalControlProblem, times: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the controls (N, m) that follow the states (N + 1, n) best."""
     step, interval = np.diff(states, axis=0), np.diff(times)[:, None]
-    if problem.system == unicycle():
+    if problem.system in (unicycle(), differential_drive()):
         heading = (states[1:, 2] + states[:-1, 2]) / 2
         controls = np.column_stack([step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading), step[:, 2]])
         controls /= interval
-        return controls
+        return controls if problem.system == unicycle() else controls @ _wheels(problem).T
     return follow_controls(problem, (states[1:] + states[:-1]) / 2, step / interval)
 
 
@@ -99,13 +99,19 @@ def follow_controls(problem: OptimalControlProblem, states: np.ndarray, rates: n
     return np.linalg.solve(gram, np.einsum("kij,ki->kj", fields, rates - drift)[:, :, None])[:, :, 0]
 
 
-def optimise(problem: OptimalControlProblem, guess: DirectPath, speed_weight: float | None = None) -> DirectPath:
+def optimise(
+    problem: OptimalControlProblem,
+    guess: DirectPath,
+    speed_weight: float | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
 
     Args:
         problem: the problem of a scenario, with the winding of the goal heading chosen.
         guess: initial guess; its states, controls and costates need not be consistent.
         speed_weight: cost weight of the squared speed, the unit of the costs; None for that of the first control.
+        max_iterations: number of iterations after which the result has not converged.
 
     """
     arrays = problem.arrays
@@ -122,14 +128,14 @@ def optimise(problem: OptimalControlProblem, guess: DirectPath, speed_weight: fl
         turn_weight, limits, wheels = on_arcs
         motion = controls if wheels is None else np.ascontiguousarray(np.linalg.solve(wheels, controls.T).T)
         task = arcs.DiscreteProblem(h, arrays.end, turn_weight, 1.0 / speed_weight, limits, arrays.field)
-        converged, cost, violation = arcs_descent.descend(task, states, motion, costates, tolerance, MAX_ITERATIONS)
+        converged, cost, violation = arcs_descent.descend(task, states, motion, costates, tolerance, max_iterations)
         controls = motion if wheels is None else motion @ wheels.T
         within_limits = wheels is None or bool((np.abs(controls) <= arrays.data[4:6] + 1e-9).all())
     if on_arcs is None or not within_limits:
         general = midpoint.DiscreteProblem(
             h, arrays.end, arrays.data, arrays.field, 1.0 / speed_weight, *problem.compiled_dynamics
         )
-        converged, cost, violation = descent.descend(general, states, controls, costates, tolerance, MAX_ITERATIONS)
+        converged, cost, violation = descent.descend(general, states, controls, costates, tolerance, max_iterations)
     costates, cost = costates * speed_weight, cost * speed_weight
     return DirectPath(guess.times, states, controls, costates, cost, violation, converged)
 
@@ -150,6 +156,11 @@ def _on_arcs(problem: OptimalControlProblem) -> tuple[float, np.ndarray, np.ndar
         return second / first, limits, None
     if problem.system == differential_drive() and first == second:
         track = problem.parameters[0]
-        wheels = np.array([[1.0, -track / 2], [1.0, track / 2]])
-        return track**2 / 4, np.array([limits.max(), 2 * limits.max() / track]), wheels
+        return track**2 / 4, np.array([limits.max(), 2 * limits.max() / track]), _wheels(problem)
     return None
+
+
+def _wheels(problem: OptimalControlProblem) -> np.ndarray:
+    """Return the matrix (2, 2) that maps speed and turn rate of a differential drive to wheel speeds."""
+    track = problem.parameters[0]
+    return np.array([[1.0, -track / 2], [1.0, track / 2]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,6 +15,7 @@ from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
     from leapnav.envs.scenarios.bank import ScenarioBank
+    from leapnav.training.scoring.policy_specs import PolicySpec
 
 POLICIES = """Policies: "expert", "random", "go-to-goal", an included policy (the name of its family), the directory
 of a policy or of a run, or a model saved by Stable-Baselines3 (.zip). Runs that differ only in their seed share a row,
@@ -27,8 +29,8 @@ class Evaluate:
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
     family: FamilyOrAll = "clutter"
     """Family of the scenarios."""
-    robot: Robot = "unicycle"
-    """Model of the robot of the included banks."""
+    robot: Robot | None = None
+    """Model of the robot of the included banks; by default that of the policies."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None
@@ -63,10 +65,11 @@ class Evaluate:
         for plot in (self.plot, self.episodes_plot):
             check_outputs(self.json, plot)
         # All are loaded before the first episode, so that a damaged file is reported at once.
-        environment, banks = parse_environment(self.env), self._banks()
+        environment = parse_environment(self.env)
         specs = [
             load_policy_spec(name, seed=self.seed, environment=environment, trust=self.trust) for name in self.policies
         ]
+        banks = self._banks(specs)
         n_scenarios = sum(len(bank) if self.count is None else min(self.count, len(bank)) for bank in banks)
         announce(of_evaluation(self.policies, n_scenarios), "the evaluation")
         comparison = compare_policies(specs, banks, count=self.count, seed=self.seed)
@@ -82,11 +85,12 @@ class Evaluate:
             print(f"wrote {self.episodes_plot}")
         return 0
 
-    def _banks(self) -> list[ScenarioBank]:
+    def _banks(self, specs: Sequence[PolicySpec]) -> list[ScenarioBank]:
         from leapnav.envs.scenarios.bank import ScenarioBank
         from leapnav.envs.scenarios.families import ALL, FAMILIES
+        from leapnav.training.scoring.comparison import included_banks
 
         if self.bank is not None:
             return [ScenarioBank(self.bank)]
-        families = FAMILIES if self.family == ALL else (self.family,)
-        return [ScenarioBank.shipped(family, self.split, self.robot) for family in families]
+        families = tuple(FAMILIES) if self.family == ALL else (self.family,)
+        return included_banks(specs, families, self.split, self.robot)

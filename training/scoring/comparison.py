@@ -118,7 +118,12 @@ def compare(
     for label, given in policies.items():
         for number, member in enumerate(given if isinstance(given, list) else [given]):
             specs.append(_spec(label, f"{label}[{number}]", member, environment, seed))
-    return compare_policies(specs, _as_banks(bank), count=count, seed=seed, progress=progress)
+    if isinstance(bank, str):
+        check_family(bank)
+        banks = included_banks(specs, tuple(FAMILIES) if bank == ALL else (bank,))
+    else:
+        banks = [bank] if isinstance(bank, ScenarioBank) else list(bank)
+    return compare_policies(specs, banks, count=count, seed=seed, progress=progress)
 
 
 def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | None, seed: int) -> PolicySpec:
@@ -135,13 +140,26 @@ def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | No
     return PolicySpec(name, label, None, given, (environment or {}) if own is None else own)
 
 
-def _as_banks(bank: ScenarioBank | str | Sequence[ScenarioBank]) -> list[ScenarioBank]:
-    if isinstance(bank, ScenarioBank):
-        return [bank]
-    if not isinstance(bank, str):
-        return list(bank)
-    check_family(bank)
-    return [ScenarioBank.shipped(family, "test") for family in (FAMILIES if bank == ALL else (bank,))]
+def included_banks(
+    specs: Sequence[PolicySpec], families: Sequence[str], split: str = "test", robot: str | None = None
+) -> list[ScenarioBank]:
+    """Return the included banks of families for the robot of policies.
+
+    Args:
+        specs: the policies.
+        families: the families.
+        split: "train" or "test".
+        robot: model of the robot; None: that of the policies, or the unicycle if all of them are baselines.
+
+    Raises:
+        ValueError: there is no such bank, or the policies have different robots.
+
+    """
+    robots = {spec.robot for spec in specs} - {None} if robot is None else {robot}
+    if len(robots) > 1:
+        raise ValueError(f"policies: expected policies of one robot, got {', '.join(sorted(map(str, robots)))}")
+    model = robots.pop() if robots else None
+    return [ScenarioBank.shipped(family, split, model or "unicycle") for family in families]
 
 
 def compare_policies(

@@ -17,7 +17,7 @@ from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_choice, in_words
@@ -242,7 +242,7 @@ def evaluate(
         policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class or a
             function of an environment, with a parameter `env`, that returns one, such as `ExpertPolicy`; or any other
             function, which maps one observation to an action.
-        bank: a bank, or the name of a family for its test split.
+        bank: a bank, or the name of a family for its test split, with the robot of `environment`.
         count: number of scenarios, from the first of the bank; None: all.
         environment: arguments of the environment, such as `observation`.
         seed: random seed of the disturbances.
@@ -265,7 +265,8 @@ def evaluate(
             if not isinstance(bank, str):
                 raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
             check_choice("family", bank, FAMILIES)
-        bank = ScenarioBank.shipped(bank, "test")
+        robot = check_robot((environment or {}).get("robot") or "unicycle")
+        bank = ScenarioBank.shipped(bank, "test", robot.model)
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
     arguments = dict(environment or {})

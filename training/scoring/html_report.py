@@ -28,7 +28,7 @@ from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.training.config import RunConfig, read_config
-from leapnav.training.scoring.comparison import Comparison, compare_policies
+from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
 from leapnav.training.scoring.evaluation import Episode, Evaluation
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.reports import COLUMNS, NEGATIVE_REGRET, cell, draw_profiles, plot_episodes, row_name
@@ -95,7 +95,7 @@ def write_report(
         raise ValueError("runs: expected at least one, got none")
     specs = [load_policy_spec(os.fspath(run), environment=environment, trust=trust) for run in runs]
     records = [_read_run(spec) for spec in specs if (Path(spec.name) / "config.json").is_file()]
-    banks = [ScenarioBank.shipped(name, "test") for name in _report_families(family, records)]
+    banks = included_banks(specs, _report_families(family, records))
     baselines = [load_policy_spec(name) for name in BASELINES if name not in {spec.name for spec in specs}]
     comparison = compare_policies([*specs, *baselines], banks, count=count, seed=seed, progress=progress)
     groups = group_by_row(specs)

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
 from leapnav.training.policies.files import BASELINES as BASELINES
@@ -36,6 +37,11 @@ class PolicySpec:
     method: str | None
     policy: PolicyOrFactory
     environment: Mapping[str, Any]
+
+    @property
+    def robot(self) -> str | None:
+        """Model of the robot that the policy drives; None for a baseline, which drives any."""
+        return None if self.name in BASELINES else check_robot(self.environment.get("robot") or "unicycle").model
 
 
 def load_policy_spec(
