@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from numba import float64
 from pydantic import Field
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, sinc
+from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, rotation
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, POSE, CostWeights, Dynamics, RobotModel, Symmetry, register
 from leapnav.envs.robots.moves import Moves, curved_moves
 from leapnav.envs.robots.unicycle import POSE_LABELS
@@ -19,26 +20,37 @@ from leapnav.envs.utils.records import Positive
 MAX_LATTICE_CELL = 0.25  # minimum turning radii: larger cells would make the lattice's turns much too wide
 
 
+@kernel(float64(float64, float64, float64))
+def mean_sine(sine, cosine, x):
+    """Return the mean of sin(s + y) for y from 0 to x, from sin(s) and cos(s)."""
+    square = x * x
+    if square > 0.04:
+        along, across = math.sin(x) / x, (1.0 - math.cos(x)) / x
+    else:  # series with errors below 1e-11
+        along = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        across = 0.5 * x * (1.0 - square / 12.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0)))
+    return sine * along + cosine * across
+
+
 @kernel(ADVANCE_SIGNATURE)
 def advance(q, u, h, parameters, new):
     """Integrate exactly: the heading in closed form, the position by Gauss's rule."""
     x, y, heading, steering = q[0], q[1], q[2], q[3]
     speed, rate, curvature = u[0], u[1], parameters[0]
-    # With s = steering + rate t, the integral of sin(s) from 0 to t is t sin(s at t / 2) sinc(rate t / 2).
+    sine, cosine = math.sin(steering), math.cos(steering)
     scale = speed * curvature
     panels = max(math.ceil(abs(scale * h) / MAX_PANEL_TURN), math.ceil(abs(rate * h) / MAX_PANEL_TURN))
     panels = max(panels, 1)
-    dx = dy = 0.0
+    dx = dy = 0.0  # along and across the heading at the start
     for panel in range(panels):
         for k in range(len(GAUSS_NODES)):
             t = (panel + GAUSS_NODES[k]) / panels * h
-            half = 0.5 * rate * t
-            angle = heading + scale * t * math.sin(steering + half) * sinc(half)
-            dx += GAUSS_WEIGHTS[k] * math.cos(angle)
-            dy += GAUSS_WEIGHTS[k] * math.sin(angle)
-    half = 0.5 * rate * h
-    new[0], new[1] = x + speed * h / panels * dx, y + speed * h / panels * dy
-    new[2] = heading + scale * h * math.sin(steering + half) * sinc(half)
+            along, across = rotation(scale * t * mean_sine(sine, cosine, rate * t))
+            dx += GAUSS_WEIGHTS[k] * along
+            dy += GAUSS_WEIGHTS[k] * across
+    distance, cos, sin = speed * h / panels, math.cos(heading), math.sin(heading)
+    new[0], new[1] = x + distance * (cos * dx - sin * dy), y + distance * (sin * dx + cos * dy)
+    new[2] = heading + scale * h * mean_sine(sine, cosine, rate * h)
     new[3] = steering + rate * h
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN
+from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, rotation
 from leapnav.envs.robots.base import (
     ADVANCE_SIGNATURE,
     POSE,
@@ -30,15 +30,16 @@ def advance(q, u, h, parameters, new):
     x, y, heading, speed, turn_rate = q[0], q[1], q[2], q[3], q[4]
     panels = math.ceil((abs(turn_rate) + abs(u[1]) * h) * h / MAX_PANEL_TURN)
     panels = max(panels, 1)
-    dx = dy = 0.0
+    dx = dy = 0.0  # along and across the heading at the start
     for panel in range(panels):
         for k in range(len(GAUSS_NODES)):
             t = (panel + GAUSS_NODES[k]) / panels * h
-            angle = heading + (turn_rate + 0.5 * u[1] * t) * t
+            along, across = rotation((turn_rate + 0.5 * u[1] * t) * t)
             driven = GAUSS_WEIGHTS[k] * (speed + u[0] * t)
-            dx += driven * math.cos(angle)
-            dy += driven * math.sin(angle)
-    new[0], new[1] = x + h / panels * dx, y + h / panels * dy
+            dx += driven * along
+            dy += driven * across
+    panel_time, cos, sin = h / panels, math.cos(heading), math.sin(heading)
+    new[0], new[1] = x + panel_time * (cos * dx - sin * dy), y + panel_time * (sin * dx + cos * dy)
     new[2] = heading + (turn_rate + 0.5 * u[1] * h) * h
     new[3], new[4] = speed + u[0] * h, turn_rate + u[1] * h
 

@@ -14,7 +14,7 @@ from numba import float64, types
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.numba_internals import FunctionPointer
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.proximity import proximity_values
@@ -28,8 +28,12 @@ from leapnav.envs.simulation.arcs import (
 
 ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
-SAMPLES = 4  # parts of a path whose mean speeds bound the speed, with a safety factor
-SPEED_SAFETY = 1.1
+# Fractions of the period at which a path is sampled: the nodes of Gauss's three-point rule, and the end.
+NODES = 3
+SAMPLED_FRACTIONS = np.array([0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6), 1.0])
+# The bound of the speed exceeds the largest mean speed between two samples by these fractions of itself, for the
+# curvature of the path, and of the spread of the mean speeds, for accelerations.
+CURVATURE_MARGIN, ACCELERATION_MARGIN = 0.01, 0.25
 
 
 class RobotMotion(NamedTuple):
@@ -54,23 +58,29 @@ def no_state_cost(q, parameters):
     return 0.0
 
 
-@kernel(float64(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, VECTOR))
-def max_disc_speed(motion, q, u, duration, parameters, discs, new):
-    """Return an upper bound of the speed (m/s) of the footprint's discs; `new` becomes the state at the end."""
+@kernel(float64(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, MATRIX))
+def sample_path(motion, q, u, duration, parameters, discs, samples):
+    """Fill the states (4, n) at the sampled fractions; return a bound of the distance (m) that a disc travels."""
     arm = 0.0
     for k in range(len(discs)):
         arm = max(arm, abs(discs[k, 0]))
-    x, y, heading, largest = q[0], q[1], q[2], 0.0
-    for part in range(1, SAMPLES + 1):
-        motion.advance(q, u, duration * part / SAMPLES, parameters, new)
-        travelled = math.hypot(new[0] - x, new[1] - y) + arm * abs(new[2] - heading)
-        largest = max(largest, travelled)
-        x, y, heading = new[0], new[1], new[2]
-    return SPEED_SAFETY * largest * SAMPLES / duration
+    x, y, heading, before, smallest, largest = q[0], q[1], q[2], 0.0, np.inf, 0.0
+    for k in range(len(SAMPLED_FRACTIONS)):
+        fraction, new = SAMPLED_FRACTIONS[k], samples[k]
+        motion.advance(q, u, duration * fraction, parameters, new)
+        travelled = math.sqrt((new[0] - x) ** 2 + (new[1] - y) ** 2) + arm * abs(new[2] - heading)
+        mean = travelled / (fraction - before)
+        smallest, largest = min(smallest, mean), max(largest, mean)
+        x, y, heading, before = new[0], new[1], new[2], fraction
+    return (1.0 + CURVATURE_MARGIN) * largest + ACCELERATION_MARGIN * (largest - smallest)
 
 
-@kernel(types.UniTuple(float64, 3)(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, VECTOR))
-def follow_path(motion, q, u, duration, parameters, discs, field, new):
+@kernel(
+    types.UniTuple(float64, 3)(
+        MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, float64, float64, VECTOR
+    )
+)
+def follow_path(motion, q, u, duration, parameters, discs, field, before, total, new):
     """Find the smallest clearance along a path, and the first contact.
 
     Args:
@@ -81,23 +91,23 @@ def follow_path(motion, q, u, duration, parameters, discs, field, new):
         parameters: parameters of the model.
         discs (D, 2): footprint.
         field: packed obstacle field.
-        new: overwritten by the state at the end of the path.
+        before: clearance (m) at the start.
+        total: bound of the distance (m) that a disc of the footprint travels.
+        new: the state at the end of the period; overwritten by that at the end of the path.
 
     Returns:
         The smallest clearance (m), the fraction of the period before the first contact, and the clearance (m) at the
         end, with the errors of `leapnav.envs.simulation.arcs.follow_arc`.
 
     """
-    before = footprint_clearance(q[0], q[1], q[2], discs, field)[0]
     if before <= 0.0:
         for i in range(len(q)):
             new[i] = q[i]
         return before, 0.0, before
     # Clearance is Lipschitz continuous with constant 1 in the distance travelled, which is at most `total`.
-    total = max_disc_speed(motion, q, u, duration, parameters, discs, new) * duration
     s0, c0 = 0.0, before
     s1, c1 = total, footprint_clearance(new[0], new[1], new[2], discs, field)[0]
-    c_end = c1
+    c_end, is_end = c1, True
     lowest = min(before, c1)
     while s0 < total and lowest > 0.0:
         if (c0 + c1 - (s1 - s0)) / 2 >= lowest - max(CLEARANCE_TOLERANCE, RELATIVE_CLEARANCE_TOLERANCE * lowest):
@@ -105,11 +115,13 @@ def follow_path(motion, q, u, duration, parameters, discs, field, new):
             s1, c1 = total, c_end
         else:
             s1 = (s0 + s1) / 2
+            is_end = False
             motion.advance(q, u, duration * s1 / total, parameters, new)
             c1 = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
             lowest = min(lowest, c1)
     if lowest > 0.0:
-        motion.advance(q, u, duration, parameters, new)
+        if not is_end:
+            motion.advance(q, u, duration, parameters, new)
         return lowest, 1.0, c_end
     # As for arcs: steps of at most the clearance, then bisection.
     for _ in range(200):
@@ -134,26 +146,31 @@ def follow_path(motion, q, u, duration, parameters, discs, field, new):
     return min(lowest, 0.0), fraction, c0
 
 
-@kernel(types.UniTuple(float64, 2)(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, VECTOR))
-def path_costs(motion, q, u, duration, parameters, discs, field, work):
+@kernel(
+    types.UniTuple(float64, 2)(
+        MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, float64, MATRIX, MATRIX
+    )
+)
+def path_costs(motion, q, u, duration, parameters, discs, field, total, samples, poses):
     """Return the means of the proximity cost and of the state cost over a path, by three-point Gauss rules.
 
-    The panels are at most 1.5 proximity scales long. `work` (n,) is overwritten; the other arguments are those of
-    `follow_path`.
+    The panels are at most 1.5 proximity scales long. The arguments are those of `follow_path`, and `samples` (4, n)
+    from `sample_path`; `samples` and `poses` (3, 4) are overwritten.
     """
-    travelled = max_disc_speed(motion, q, u, duration, parameters, discs, work) / SPEED_SAFETY * duration
-    panels = min(max(math.ceil(travelled / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
+    panels = min(max(math.ceil(total / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
     width = 1.0 / panels
-    offset = 0.5 * math.sqrt(0.6) * width
     proximity, state_cost = 0.0, 0.0
-    poses = np.empty((3, 4))
+    has_arms = len(discs) > 1 or discs[0, 0] != 0.0
+    poses[:, 2:] = 0.0
     for panel in range(int(panels)):
-        middle = (panel + 0.5) * width
-        for k in range(3):
-            motion.advance(q, u, duration * (middle + (k - 1) * offset), parameters, work)
-            state_cost += (8.0 if k == 1 else 5.0) * motion.state_cost(work, parameters)
-            poses[k, 0], poses[k, 1] = work[0], work[1]
-            poses[k, 2], poses[k, 3] = math.cos(work[2]), math.sin(work[2])
+        for k in range(NODES):
+            state = samples[k]
+            if panels > 1.0:
+                motion.advance(q, u, duration * (panel + SAMPLED_FRACTIONS[k]) * width, parameters, state)
+            state_cost += (8.0 if k == 1 else 5.0) * motion.state_cost(state, parameters)
+            poses[k, 0], poses[k, 1] = state[0], state[1]
+            if has_arms:
+                poses[k, 2], poses[k, 3] = math.cos(state[2]), math.sin(state[2])
         for d in range(len(discs)):
             a, radius = discs[d, 0], discs[d, 1]
             if radius <= 0.0:

@@ -40,7 +40,7 @@ from leapnav.envs.settings import (
 )
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.simulation.arcs import arc_proximity, follow_arc
-from leapnav.envs.simulation.paths import MOTION, follow_path, path_costs
+from leapnav.envs.simulation.paths import MOTION, NODES, SAMPLED_FRACTIONS, follow_path, path_costs, sample_path
 from leapnav.envs.simulation.state import (
     CLEARANCE,
     COLLIDED,
@@ -206,7 +206,7 @@ def drive_paths(packed, motion):
     bodies, state, settings = sim.bodies, sim.state, sim.settings
     general, m, n = settings[DRIVE] == GENERAL, int(settings[N_CONTROLS]), 3 + int(settings[N_MOTION])
     first = LIMITS + 2 * m + 2 * (n - 3)
-    q, new, work = np.empty(n), np.empty(n), np.empty(n)
+    q, new, samples, poses = np.empty(n), np.empty(n), np.empty((len(SAMPLED_FRACTIONS), n)), np.empty((NODES, 4))
     for i in range(len(state)):
         if general:
             bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
@@ -219,7 +219,11 @@ def drive_paths(packed, motion):
             u[0], u[1] = state[i, SPEED], state[i, TURN_RATE]
         for k in range(n):
             q[k] = bodies[i, k] if k < 3 else robot[k - 3]
-        lowest, fraction, after = follow_path(motion, q, u, duration, parameters, discs, field, new)
+        total = sample_path(motion, q, u, duration, parameters, discs, samples)
+        for k in range(n):
+            new[k] = samples[NODES, k]
+        before = state[i, POSE_CLEARANCE]
+        lowest, fraction, after = follow_path(motion, q, u, duration, parameters, discs, field, before, total, new)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
         if fraction < 1.0:
             state[i, IN_CONTACT] = 1.0
@@ -227,7 +231,9 @@ def drive_paths(packed, motion):
             state[i, REMAINING] = duration * (1.0 - fraction)
         driven = duration * fraction
         if driven > 0.0:
-            proximity, state_cost = path_costs(motion, q, u, driven, parameters, discs, field, work)
+            if fraction < 1.0:
+                total = sample_path(motion, q, u, driven, parameters, discs, samples)
+            proximity, state_cost = path_costs(motion, q, u, driven, parameters, discs, field, total, samples, poses)
             state[i, EFFORT] += (control_effort(sim.tasks, u, i) + state_cost) * driven
             state[i, PROXIMITY] += proximity * driven
         for k in range(3):
