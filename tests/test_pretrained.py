@@ -9,7 +9,7 @@ from leapnav.training.scoring.policy_specs import load_policy_spec
 
 
 def test_the_policies_that_ship_are_small():
-    assert sum(file.stat().st_size for file in SHIPPED.glob("*/*")) < 2_000_000
+    assert sum(file.stat().st_size for file in SHIPPED.glob("*/*")) < 4_000_000
     assert {folder.name for folder in SHIPPED.iterdir()} == set(shipped_policies())
 
 
@@ -19,11 +19,12 @@ def test_a_policy_that_ships_is_loaded_by_its_name_and_drives(name):
     env = gym.make("leapnav/Navigate-v0", family="open", **sensors)
     observation, _ = env.reset(seed=0)
     assert env.action_space.contains(policy.predict(observation, deterministic=True)[0])
-    families = FAMILIES if name == "all" else (name,)
+    family = name.rpartition("-")[2]  # after the robot, if it is not the unicycle
+    families = FAMILIES if family == "all" else (family,)
     found = [evaluate(policy, family, count=30, environment=sensors, progress=False) for family in families]
     min_success = 0.7 if name == "rooms" else 0.9  # an open door is not visible from behind a wall
     assert np.mean([evaluation.success for evaluation in found]) >= min_success
-    assert read_description(name)["training"]["family"] == name
+    assert read_description(name)["training"]["family"] == family
 
 
 def test_a_shipped_policys_name_is_a_policy_wherever_one_is_asked_for(tmp_path, monkeypatch):

@@ -71,6 +71,7 @@ class BatchSimulator:
         self._n_motion, self._n_controls = n - 3, m
         self._robots = np.zeros((count, n - 3 + m + 2 + 2))
         self.tasks = np.zeros((count, LIMITS + 2 * m + 2 * (n - 3)))
+        self._footprints: list[np.ndarray | None] = [None] * count
         self._known_bank: tuple[ScenarioBank, np.ndarray] | None = None
         self._drive, self._drives_paths = settings.model.drive, settings.model.drive == GENERAL
         self._pointers: tuple[FunctionPointer, FunctionPointer] | None = None
@@ -148,7 +149,8 @@ class BatchSimulator:
             self._check_fits(field)
         tasks = [self._get_task(choice, bank) for choice in choices]
         footprints = [choice.discs if isinstance(choice, Scenario) else self._bank_discs(bank) for choice in choices]
-        self._make_room(max(map(len, tasks)), max(map(_required_discs, footprints)))
+        distinct = {id(discs): discs for discs in footprints}  # one for all scenarios of a bank
+        self._make_room(max(map(len, tasks)), max(map(_required_discs, distinct.values())))
         longest = max(map(len, fields))
         if longest > self.fields.shape[1]:
             # Rows at multiples of a large power of two would map to the same cache sets, so a row has an odd number of
@@ -163,8 +165,10 @@ class BatchSimulator:
         for i, choice, task, discs in zip(indices.tolist(), choices, tasks, footprints, strict=True):
             self.tasks[i, : len(task)] = task
             row = self._robots[i]
-            row[first:] = 0.0
-            row[first : first + discs.size] = discs.ravel()
+            if self._footprints[i] is not discs:
+                self._footprints[i] = discs
+                row[first:] = 0.0
+                row[first : first + discs.size] = discs.ravel()
             if self.settings.reward == "shaped":
                 if self._drive == ARCS:
                     row[first - 2 : first] = task[LIMITS + m : LIMITS + 2 * m]

@@ -149,9 +149,10 @@ def command(actions, active, packed):
     state, tasks, settings, robots = sim.state, sim.tasks, sim.settings, sim.robots
     first, m, drive = int(settings[N_MOTION]), int(settings[N_CONTROLS]), settings[DRIVE]
     for i in range(len(state)):
-        for j in range(m):
-            if active[i] and not math.isfinite(actions[i, j]):
-                return i
+        if active[i]:
+            for j in range(m):
+                if not math.isfinite(actions[i, j]):
+                    return i
     disturbed = settings[ACTUATION_NOISE] != 0.0 or settings[SLIP] != 0.0
     for i in range(len(state)):
         for column in (IN_CONTACT, REMAINING, SPEED, TURN_RATE, DURATION):
@@ -385,11 +386,11 @@ def end_periods(active, packed):
             state[i, COLLISION] = settings[COLLISION_PENALTY]
             state[i, COLLIDED] = 1.0
         last = state[i, STEPS] >= state[i, LAST_STEP]
-        reached = at_goal(i, sim)
-        state[i, SUCCESS] = 1.0 if last and reached and state[i, COLLIDED] == 0.0 else 0.0
+        reached = last and at_goal(i, sim)
+        state[i, SUCCESS] = 1.0 if reached and state[i, COLLIDED] == 0.0 else 0.0
         ended = last or (state[i, COLLIDED] != 0.0 and settings[TERMINATE_ON_COLLISION] != 0.0)
         state[i, TERMINATED] = 1.0 if ended else 0.0
-        if ended and not (last and reached):
+        if ended and not reached:
             state[i, MISS] = settings[MISS_PENALTY]
         reward = -state[i, EFFORT] - state[i, PROXIMITY] - state[i, COLLISION] - state[i, MISS]
         if settings[SHAPED] != 0.0:
