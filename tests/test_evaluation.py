@@ -15,6 +15,7 @@ from leapnav.training import (
     Evaluation,
     GoToGoal,
     RandomPolicy,
+    compare,
     evaluate,
     make_policy,
     network,
@@ -321,3 +322,13 @@ def test_policies_by_name_drive_single_and_vector_environments(policies):
             assert action.shape == env.action_space.shape
     with pytest.raises(FileNotFoundError):
         load_policy_spec("nobody")
+
+
+def test_the_included_bank_is_that_of_the_policy_s_robot():
+    found = evaluate(ExpertPolicy, "clutter", count=2, environment={"robot": "car"}, timed=False, progress=False)
+    bank = ScenarioBank.shipped("clutter", "test", "car")
+    assert [episode.reference_cost for episode in found] == pytest.approx(bank.costs[:2])
+    comparison = compare({"expert": "expert", "mine": (ExpertPolicy, {"robot": "car"})}, "clutter", count=2)
+    assert [bank.robot.model for bank in comparison.banks] == ["car"]
+    with pytest.raises(ValueError, match="policies: expected policies of one robot, got car, unicycle"):
+        compare({"a": (ExpertPolicy, {"robot": "car"}), "b": (ExpertPolicy, {})}, "clutter", count=2)

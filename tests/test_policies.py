@@ -8,6 +8,7 @@ import torch as th
 from helpers import SMALL
 from stable_baselines3 import A2C, PPO, SAC, TD3
 
+from leapnav.envs import NavigateEnv
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
 from leapnav.training.robots.rewards import ScaledReward
 
@@ -131,3 +132,19 @@ def test_loading_a_policy_executes_nothing(clone, tmp_path):
     with pytest.raises(ValueError, match="not the weights of this policy"):
         load_policy(tmp_path)
     assert not (tmp_path / "executed").exists()
+
+
+def test_the_motion_features_contain_the_acceleration_that_stops_at_the_goal():
+    distance, rate, period, steps = 2.0, 0.7, 0.05, 40
+    space = NavigateEnv("open", robot="dynamic_unicycle").observation_space
+    features = NavigationFeatures(space)
+    for step in range(steps):
+        time_left = (steps - step) * period
+        observation = th.zeros(1, *space.shape)
+        observation[0, 4], observation[0, 5], observation[0, 9] = time_left, distance / time_left, rate
+        observation[0, 11:] = 5.0
+        first = 23 + 3 * 2  # after the features of the goal and three values of each of the two rates
+        acceleration = 6 * float(features(observation)[0, first])  # of the speed, towards the goal
+        distance -= rate * period + acceleration * period**2 / 2
+        rate += acceleration * period
+    assert distance == pytest.approx(0, abs=0.01) and rate == pytest.approx(0, abs=1e-3)

@@ -29,6 +29,7 @@ class PolicySpec:
         method: text that is identical for runs that differ only in their seed; None if unknown.
         policy: the policy, or a function that makes it for an environment.
         environment: arguments of the environment that determine the policy's observations.
+        is_baseline: whether the policy drives any robot.
 
     """
 
@@ -37,11 +38,12 @@ class PolicySpec:
     method: str | None
     policy: PolicyOrFactory
     environment: Mapping[str, Any]
+    is_baseline: bool = False
 
     @property
     def robot(self) -> str | None:
-        """Model of the robot that the policy drives; None for a baseline, which drives any."""
-        return None if self.name in BASELINES else check_robot(self.environment.get("robot") or "unicycle").model
+        """Model of the robot that the policy drives; None for a baseline."""
+        return None if self.is_baseline else check_robot(self.environment.get("robot") or "unicycle").model
 
 
 def load_policy_spec(
@@ -69,7 +71,7 @@ def load_policy_spec(
             "random": lambda env: RandomPolicy(_single_action_space(env), seed),
             "go-to-goal": GoToGoal,
         }
-        return PolicySpec(place, label, None, factories[place], {})
+        return PolicySpec(place, label, None, factories[place], {}, is_baseline=True)
     if is_zip(place):
         model, arguments = load_zip(place, environment, trust=trust)
         return PolicySpec(place, label, None, model, arguments)
