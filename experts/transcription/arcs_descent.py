@@ -17,7 +17,8 @@ from leapnav.experts.transcription.arcs import (
     expand,
     violations,
 )
-from leapnav.experts.transcription.arcs_riccati import MODEL, Model, Regularisation, backward, end_multipliers
+from leapnav.experts.transcription.arcs_riccati import backward
+from leapnav.experts.transcription.quadratic_model import MODEL, Model, Regularisation, end_multipliers
 
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of the horizon (s)
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.

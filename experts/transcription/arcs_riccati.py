@@ -1,72 +1,19 @@
-"""Riccati recursion for the quadratic model of the discretised problem (kernels).
+"""Riccati recursion for the quadratic model of the discretised problem of the unicycle (kernels).
 
-A. E. Bryson and Y.-C. Ho, Applied Optimal Control (1975), section 5.3: the value function depends on the multipliers of
-the end conditions.
+`leapnav.experts.transcription.riccati` is the same for any robot; this one uses the sparsity of the derivatives.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64
+from numba import boolean
 
-from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import CUBE, MATRIX, SIGNS, VECTOR
-from leapnav.experts.numerics.flow import END_CONDITION
-from leapnav.experts.numerics.linear import eliminate, substitute
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR
 from leapnav.experts.transcription.arcs import DISCRETE_PROBLEM, EXPANSION
-
-
-class Model(NamedTuple):
-    """The value function of the quadratic model, and the controls that minimise it.
-
-    At node k the value function is 1/2 dq'P dq + p'dq + dq'F nu + 1/2 nu'G nu + g'nu with the multipliers nu of the end
-    conditions. The minimising controls are -(step + gain dq + end_gain nu).
-
-    Attributes:
-        P: (N + 1, 3, 3).
-        p: (N + 1, 3).
-        F: (N + 1, 3, 3).
-        step: (N, 2).
-        gain: (N, 2, 3).
-        end_gain: (N, 2, 3).
-        G: (3, 3), at the first node.
-        g: (3,), at the first node.
-
-    """
-
-    P: np.ndarray
-    p: np.ndarray
-    F: np.ndarray
-    step: np.ndarray
-    gain: np.ndarray
-    end_gain: np.ndarray
-    G: np.ndarray
-    g: np.ndarray
-
-
-MODEL = record_type(Model, P=CUBE, p=MATRIX, F=CUBE, step=MATRIX, gain=CUBE, end_gain=CUBE, G=MATRIX, g=VECTOR)
-
-
-class Regularisation(NamedTuple):
-    """Modifications that make the quadratic model convex.
-
-    Attributes:
-        shift: term added to the diagonal of the Hessian, per second.
-        penalty: weight of a quadratic penalty on the end conditions. It does not change the solution, which meets them.
-        convex: whether to omit the curvature of the dynamics and negative curvature of the proximity cost, for an
-            initial guess far from any optimum.
-
-    """
-
-    shift: float
-    penalty: float
-    convex: bool
-
-
-REGULARISATION = record_type(Regularisation, shift=float64, penalty=float64, convex=boolean)
+from leapnav.experts.transcription.quadratic_model import MODEL, REGULARISATION
 
 
 @kernel(boolean(DISCRETE_PROBLEM, MATRIX, SIGNS, VECTOR, REGULARISATION, EXPANSION, MODEL))
@@ -178,23 +125,4 @@ def backward(problem, u, held, last_state, regularisation, expansion, model):
         P[k, 1, 0] += hxy
         P[k, 1, 1] += hyy + shift * duration
         P[k, 2, 2] += turn_weight * shift * duration
-    return True
-
-
-@kernel(boolean(MATRIX, VECTOR, VECTOR, END_CONDITION, VECTOR))
-def end_multipliers(G, g, last_state, end, nu):
-    """Solve G nu = goal - last_state - g for the fixed components; return False if G is not negative definite."""
-    extended = np.empty((3, 4))
-    for i in range(3):
-        for j in range(3):
-            extended[i, j] = G[i, j]
-        extended[i, 3] = 0.0 if end.free[i] else end.goal[i] - last_state[i] - g[i]
-        if end.free[i]:
-            extended[i, i] = -1.0
-    if eliminate(extended, False, 0.0) == 0.0:
-        return False
-    for i in range(3):
-        if not extended[i, i] < 0.0:
-            return False
-    substitute(extended, nu)
     return True

@@ -12,7 +12,6 @@ from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR, tuple_of
-from leapnav.experts.transcription.arcs_riccati import Regularisation
 from leapnav.experts.transcription.midpoint import (
     DISCRETE_PROBLEM,
     EXPANSION,
@@ -21,7 +20,8 @@ from leapnav.experts.transcription.midpoint import (
     expand,
     violations,
 )
-from leapnav.experts.transcription.riccati import MODEL, Model, backward, end_multipliers
+from leapnav.experts.transcription.quadratic_model import MODEL, Model, Regularisation, end_multipliers
+from leapnav.experts.transcription.riccati import backward
 
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of the horizon (s)
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
