@@ -14,7 +14,7 @@ from numba import float64, types
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.numba_internals import FunctionPointer
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR
+from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.proximity import proximity_values
@@ -52,22 +52,50 @@ class RobotMotion(NamedTuple):
 MOTION = record_type(RobotMotion, advance=ADVANCE_FUNCTION, state_cost=STATE_COST_FUNCTION)
 
 
+class HeldPath(NamedTuple):
+    """The path of a robot with held controls.
+
+    Attributes:
+        motion: kernels of the robot's model.
+        q (n,): state at the start.
+        u (m,): held controls.
+        parameters: parameters of the model.
+        discs (D, 2): footprint.
+
+    """
+
+    motion: RobotMotion
+    q: np.ndarray
+    u: np.ndarray
+    parameters: np.ndarray
+    discs: np.ndarray
+
+
+HELD_PATH = record_type(HeldPath, motion=MOTION, q=VECTOR, u=VECTOR, parameters=VECTOR, discs=MATRIX)
+
+
 @kernel(STATE_COST_SIGNATURE)
 def no_state_cost(q, parameters):
     """Return the state cost of a robot without one."""
     return 0.0
 
 
-@kernel(float64(MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, MATRIX))
-def sample_path(motion, q, u, duration, parameters, discs, samples):
+@kernel(NOTHING(HELD_PATH, float64, VECTOR))
+def state_after(path, duration, new):
+    """Overwrite new (n,) by the state of the path after a duration (s)."""
+    path.motion.advance(path.q, path.u, duration, path.parameters, new)
+
+
+@kernel(float64(HELD_PATH, float64, MATRIX))
+def sample_path(path, duration, samples):
     """Fill the states (4, n) at the sampled fractions; return a bound of the distance (m) that a disc travels."""
-    arm = 0.0
+    q, discs, arm = path.q, path.discs, 0.0
     for k in range(len(discs)):
         arm = max(arm, abs(discs[k, 0]))
     x, y, heading, before, smallest, largest = q[0], q[1], q[2], 0.0, np.inf, 0.0
     for k in range(len(SAMPLED_FRACTIONS)):
         fraction, new = SAMPLED_FRACTIONS[k], samples[k]
-        motion.advance(q, u, duration * fraction, parameters, new)
+        state_after(path, duration * fraction, new)
         travelled = math.sqrt((new[0] - x) ** 2 + (new[1] - y) ** 2) + arm * abs(new[2] - heading)
         mean = travelled / (fraction - before)
         smallest, largest = min(smallest, mean), max(largest, mean)
@@ -75,21 +103,13 @@ def sample_path(motion, q, u, duration, parameters, discs, samples):
     return (1.0 + CURVATURE_MARGIN) * largest + ACCELERATION_MARGIN * (largest - smallest)
 
 
-@kernel(
-    types.UniTuple(float64, 3)(
-        MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, float64, float64, VECTOR
-    )
-)
-def follow_path(motion, q, u, duration, parameters, discs, field, before, total, new):
+@kernel(types.UniTuple(float64, 3)(HELD_PATH, float64, CONSTANT, float64, float64, VECTOR))
+def follow_path(path, duration, field, before, total, new):
     """Find the smallest clearance along a path, and the first contact.
 
     Args:
-        motion: kernels of the robot's model.
-        q: state at the start.
-        u: held controls.
+        path: the robot's path.
         duration: duration of the period (s), positive.
-        parameters: parameters of the model.
-        discs (D, 2): footprint.
         field: packed obstacle field.
         before: clearance (m) at the start.
         total: bound of the distance (m) that a disc of the footprint travels.
@@ -100,9 +120,10 @@ def follow_path(motion, q, u, duration, parameters, discs, field, before, total,
         end, with the errors of `leapnav.envs.simulation.arcs.follow_arc`.
 
     """
+    discs = path.discs
     if before <= 0.0:
-        for i in range(len(q)):
-            new[i] = q[i]
+        for i in range(len(new)):
+            new[i] = path.q[i]
         return before, 0.0, before
     # Clearance is Lipschitz continuous with constant 1 in the distance travelled, which is at most `total`.
     s0, c0 = 0.0, before
@@ -116,17 +137,17 @@ def follow_path(motion, q, u, duration, parameters, discs, field, before, total,
         else:
             s1 = (s0 + s1) / 2
             is_end = False
-            motion.advance(q, u, duration * s1 / total, parameters, new)
+            state_after(path, duration * s1 / total, new)
             c1 = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
             lowest = min(lowest, c1)
     if lowest > 0.0:
         if not is_end:
-            motion.advance(q, u, duration, parameters, new)
+            state_after(path, duration, new)
         return lowest, 1.0, c_end
     # As for arcs: steps of at most the clearance, then bisection.
     for _ in range(200):
         s = min(s0 + 0.999 * c0, total)
-        motion.advance(q, u, duration * s / total, parameters, new)
+        state_after(path, duration * s / total, new)
         following = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
         if following <= 0.0:
             break
@@ -135,23 +156,19 @@ def follow_path(motion, q, u, duration, parameters, discs, field, before, total,
             break
     while c0 >= CONTACT_TOLERANCE and s1 - s0 > 1e-12 * total:
         middle = (s0 + s1) / 2
-        motion.advance(q, u, duration * middle / total, parameters, new)
+        state_after(path, duration * middle / total, new)
         following = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
         if following <= 0.0:
             s1 = middle
         else:
             s0, c0 = middle, following
     fraction = min(s0 / total, 1.0 - 1e-15)
-    motion.advance(q, u, duration * fraction, parameters, new)
+    state_after(path, duration * fraction, new)
     return min(lowest, 0.0), fraction, c0
 
 
-@kernel(
-    types.UniTuple(float64, 2)(
-        MOTION, VECTOR, VECTOR, float64, CONSTANT, CONSTANT_MATRIX, CONSTANT, float64, MATRIX, MATRIX
-    )
-)
-def path_costs(motion, q, u, duration, parameters, discs, field, total, samples, poses):
+@kernel(types.UniTuple(float64, 2)(HELD_PATH, float64, CONSTANT, float64, MATRIX, MATRIX))
+def path_costs(path, duration, field, total, samples, poses):
     """Return the means of the proximity cost and of the state cost over a path, by three-point Gauss rules.
 
     The panels are at most 1.5 proximity scales long. The arguments are those of `follow_path`, and `samples` (4, n)
@@ -159,15 +176,15 @@ def path_costs(motion, q, u, duration, parameters, discs, field, total, samples,
     """
     panels = min(max(math.ceil(total / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
     width = 1.0 / panels
-    proximity, state_cost = 0.0, 0.0
+    discs, proximity, state_cost = path.discs, 0.0, 0.0
     has_arms = len(discs) > 1 or discs[0, 0] != 0.0
     poses[:, 2:] = 0.0
     for panel in range(int(panels)):
         for k in range(NODES):
             state = samples[k]
             if panels > 1.0:
-                motion.advance(q, u, duration * (panel + SAMPLED_FRACTIONS[k]) * width, parameters, state)
-            state_cost += (8.0 if k == 1 else 5.0) * motion.state_cost(state, parameters)
+                state_after(path, duration * (panel + SAMPLED_FRACTIONS[k]) * width, state)
+            state_cost += (8.0 if k == 1 else 5.0) * path.motion.state_cost(state, path.parameters)
             poses[k, 0], poses[k, 1] = state[0], state[1]
             if has_arms:
                 poses[k, 2], poses[k, 3] = math.cos(state[2]), math.sin(state[2])

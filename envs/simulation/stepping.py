@@ -40,7 +40,15 @@ from leapnav.envs.settings import (
 )
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.simulation.arcs import arc_proximity, follow_arc
-from leapnav.envs.simulation.paths import MOTION, NODES, SAMPLED_FRACTIONS, follow_path, path_costs, sample_path
+from leapnav.envs.simulation.paths import (
+    MOTION,
+    NODES,
+    SAMPLED_FRACTIONS,
+    HeldPath,
+    follow_path,
+    path_costs,
+    sample_path,
+)
 from leapnav.envs.simulation.state import (
     CLEARANCE,
     COLLIDED,
@@ -220,11 +228,12 @@ def drive_paths(packed, motion):
             u[0], u[1] = state[i, SPEED], state[i, TURN_RATE]
         for k in range(n):
             q[k] = bodies[i, k] if k < 3 else robot[k - 3]
-        total = sample_path(motion, q, u, duration, parameters, discs, samples)
+        path = HeldPath(motion, q, u, parameters, discs)
+        total = sample_path(path, duration, samples)
         for k in range(n):
             new[k] = samples[NODES, k]
         before = state[i, POSE_CLEARANCE]
-        lowest, fraction, after = follow_path(motion, q, u, duration, parameters, discs, field, before, total, new)
+        lowest, fraction, after = follow_path(path, duration, field, before, total, new)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
         if fraction < 1.0:
             state[i, IN_CONTACT] = 1.0
@@ -233,8 +242,8 @@ def drive_paths(packed, motion):
         driven = duration * fraction
         if driven > 0.0:
             if fraction < 1.0:
-                total = sample_path(motion, q, u, driven, parameters, discs, samples)
-            proximity, state_cost = path_costs(motion, q, u, driven, parameters, discs, field, total, samples, poses)
+                total = sample_path(path, driven, samples)
+            proximity, state_cost = path_costs(path, driven, field, total, samples, poses)
             state[i, EFFORT] += (control_effort(sim.tasks, u, i) + state_cost) * driven
             state[i, PROXIMITY] += proximity * driven
         for k in range(3):

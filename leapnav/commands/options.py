@@ -12,7 +12,21 @@ from leapnav.training.config import FamilyName, RobotName
 Family = Literal["open", "clutter", "polygons", "rooms", "slalom"]
 FamilyOrAll = FamilyName
 Robot = RobotName
-PolicyName = Literal["expert", "go-to-goal", "random", "open", "clutter", "polygons", "rooms", "slalom"] | str
+PolicyName = (
+    Literal[
+        "expert",
+        "go-to-goal",
+        "random",
+        "open",
+        "clutter",
+        "polygons",
+        "rooms",
+        "slalom",
+        "car-clutter",
+        "dynamic_unicycle-clutter",
+    ]
+    | str
+)
 EnvironmentOption = tuple[str, ...]
 
 
