@@ -38,6 +38,8 @@ SHORT_DISTANCE = 4.0  # m from start to goal; below it, the distance of duplicat
 # Relative error of the cost of a direct path, and of a refined direct path. Among 6,000 refined paths, six exceeded the
 # cost of their extremal by more; these were different extremals from the closest ones.
 DIRECT_ERROR, REFINED_ERROR = 0.01, 0.002
+UNCONVERGED_ERROR = 0.02  # the same for a path whose iteration has not converged
+FAILURE_WEIGHT = 4  # of the evaluations for an expensive path that leads to no extremal, in the budget for these
 # Depth in an obstacle (robot radii) up to which a collision-free path of similar cost may exist close to an extremal.
 MAX_SLIGHT_DEPTH = TOLERATED_DEPTH
 # A path repeats a failure if it reaches this fraction of the failed path's depth, within this distance (robot radii).
@@ -152,6 +154,8 @@ class LocalOptima:
         clearance = self._clearances(path)
         if self._is_expensive(path, error) and (clearance.min() <= 0 or self._budget <= 0):
             return True
+        if not path.converged and self._is_expensive(path, UNCONVERGED_ERROR):
+            return True
         if self._repeats_failure(path, clearance):
             return True
         if clearance.min() < -2.0 * self._slight_depth:
@@ -170,7 +174,7 @@ class LocalOptima:
         if self._failed_evaluations < MAX_FAILED_EVALUATIONS and (is_feasible or not self.certified):
             extremal, evaluations = self._extremal(problem, refined, clearance.min() >= 0.0)
         if is_expensive:
-            self._budget -= evaluations
+            self._budget -= evaluations if extremal is not None else FAILURE_WEIGHT * evaluations
         if extremal is None:
             self._failed_evaluations += evaluations
             is_doubt = is_feasible and clearance.min() >= -self._slight_depth
