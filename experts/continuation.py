@@ -117,6 +117,10 @@ def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction:
     """
     if first.system != second.system or first.state_cost != second.state_cost:
         raise ValueError("problems: two successive problems differ in their system or state cost")
+    if (first.horizon is None) != (second.horizon is None):
+        raise ValueError(
+            f"problems: only one of two successive problems has a free horizon: {first.horizon!r}, {second.horizon!r}"
+        )
     if [g is None for g in first.goal] != [g is None for g in second.goal]:
         raise ValueError(
             f"problems: two successive problems differ in the free goal components: {first.goal!r}, {second.goal!r}"
@@ -143,7 +147,8 @@ def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction:
         first,
         start=tuple(map(between, first.start, second.start)),
         goal=goal,
-        horizon=between(first.horizon, second.horizon),
+        horizon=None if first.horizon is None or second.horizon is None else between(first.horizon, second.horizon),
+        time_weight=between(first.time_weight, second.time_weight),
         control_weight=tuple(map(between, first.control_weight, second.control_weight)),
         control_bounds=bounds,
         field=field,

@@ -135,7 +135,7 @@ def plot_extremal(
 
 def _dense_times(extremal: Extremal) -> np.ndarray:
     """Evenly spaced times and the steps of the integrator, which are dense in sharp turns; shape (K,)."""
-    return np.union1d(extremal.times, np.linspace(0.0, extremal.problem.horizon, N_POINTS))
+    return np.union1d(extremal.times, np.linspace(0.0, extremal.horizon, N_POINTS))
 
 
 def _labels(system: ControlAffineSystem) -> list[str]:
@@ -146,7 +146,7 @@ def _labels(system: ControlAffineSystem) -> list[str]:
 
 def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> None:
     """Draw states, controls, costates and Hamiltonian on four axes."""
-    problem, horizon = extremal.problem, extremal.problem.horizon
+    problem, horizon = extremal.problem, extremal.horizon
     system = problem.system
     names, known = [sp.latex(symbol) for symbol in system.state], _labels(system)
     times = _dense_times(extremal)
@@ -215,7 +215,7 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
     states = extremal.evaluate(_dense_times(extremal))[0]
     _draw_sweeps(axes, extremal.problem, sweeps, lambda _, states: (states[:, ix], states[:, iy]))
     axes.plot(states[:, ix], states[:, iy], color=OPTIMUM, linewidth=1.8, zorder=3)
-    drawn = extremal.evaluate(np.linspace(0.0, extremal.problem.horizon, N_ROBOTS + 2))[0]
+    drawn = extremal.evaluate(np.linspace(0.0, extremal.horizon, N_ROBOTS + 2))[0]
     poses = [(q[ix], q[iy], None if heading is None else q[heading]) for q in drawn]
     if scenario is not None:
         draw_scenario(axes, scenario)

@@ -140,7 +140,8 @@ def _from_guess(
         points = POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1
         values = guess.interpolate(np.linspace(0.0, guess.times[-1], points))
         # If the horizons differ, time is scaled.
-        path = Trajectory(np.linspace(0.0, problem.horizon, points), values[:, :n], values[:, n:])
+        duration = float(guess.times[-1]) if problem.horizon is None else problem.horizon
+        path = Trajectory(np.linspace(0.0, duration, points), values[:, :n], values[:, n:])
     elif isinstance(guess, Trajectory):
         path = _check_path(guess, problem)
     else:
@@ -169,8 +170,9 @@ def _check_path(guess: Trajectory, problem: OptimalControlProblem) -> Trajectory
     times = path.times
     if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
         raise ValueError("guess: its times must be an increasing array of at least two")
-    if abs(times[0]) > 1e-6 * problem.horizon or abs(times[-1] - problem.horizon) > 1e-6 * problem.horizon:
-        raise ValueError(f"guess: its times must run from 0 to {problem.horizon:g}, not {times[0]:g} to {times[-1]:g}")
+    horizon = problem.horizon_of(path)
+    if abs(times[0]) > 1e-6 * horizon or abs(times[-1] - horizon) > 1e-6 * horizon:
+        raise ValueError(f"guess: its times must run from 0 to {horizon:g}, not {times[0]:g} to {times[-1]:g}")
     for name, array in (("states", path.states), ("costates", path.costates)):
         if array is not None and array.shape != (len(times), n):
             raise ValueError(f"guess: its {name} must have shape {(len(times), n)}, got {array.shape}")

@@ -42,11 +42,13 @@ class EndCondition(NamedTuple):
     Attributes:
         goal: (n,), ignored where a component is free.
         free: (n,), bool.
+        free_time: whether the final time is free; the Hamiltonian, which is constant, is then 0.
 
     """
 
     goal: np.ndarray
     free: np.ndarray
+    free_time: bool
 
 
 class NewtonOptions(NamedTuple):
@@ -67,7 +69,7 @@ class NewtonOptions(NamedTuple):
 
 
 FLOW = record_type(ExtremalFlow, function=FLOW_FUNCTION, data=CONSTANT, field=CONSTANT)
-END_CONDITION = record_type(EndCondition, goal=VECTOR, free=FLAGS)
+END_CONDITION = record_type(EndCondition, goal=VECTOR, free=FLAGS, free_time=types.boolean)
 NEWTON_OPTIONS = record_type(
     NewtonOptions, tolerance=float64, accuracy=float64, max_iterations=types.int64, predict=types.boolean
 )

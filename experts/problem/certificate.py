@@ -8,6 +8,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from leapnav.experts.numerics.integrator import DENSE_TERMS, propagate
+from leapnav.experts.numerics.shooting import time_curvature
 from leapnav.experts.problem.conjugate_points import conjugate_time, first_even_conjugate_time, first_focal_time
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, Status
 from leapnav.experts.problem.frames import orthonormalise
@@ -20,6 +21,8 @@ ACCURACY = 1e-12
 UNCONVERGED_ACCURACY = 1e-9
 # Initial size of the table of integration steps; it grows by a factor of 4 when it is full.
 MIN_ROWS, ROWS_PER_SEGMENT = 512, 24
+# Nodes between which the derivative of the Hamiltonian by the horizon is computed, and the integrator's tolerance.
+MAX_CURVATURE_NODES, CURVATURE_ACCURACY = 65, 1e-8
 MAX_ROWS = 100_000  # integration steps; an extremal that needs more has diverged
 
 CERTIFICATE_KERNELS = (trace, dense_clearance, propagate, orthonormalise)
@@ -92,12 +95,19 @@ def certify(
         heading = -1 if system.heading is None else system.state.index(system.heading)
         places = np.array([*map(system.state.index, problem.system.position), heading])
         clearance = float(dense_clearance(problem.field, problem.discs, places, extremal.times, z, terms))
+    residual = float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max()))
+    curvature = None
+    if problem.horizon is None:
+        residual = max(residual, float(np.abs(hamiltonian).max()))
+        at = np.unique(np.linspace(0, n_rows - 1, min(n_rows, MAX_CURVATURE_NODES)).astype(int))
+        curvature = time_curvature(arrays.flow, extremal.times[at], z[at], arrays.end, CURVATURE_ACCURACY)
     certificate = Certificate(
-        residual=float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max())),
+        residual=residual,
         defect=float(defect),
         hamiltonian_drift=float(np.ptp(hamiltonian)),
         conjugate_point=conjugate_point,
         clearance=clearance,
+        time_curvature=curvature,
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     return replace(extremal, certificate=certificate, status=status)

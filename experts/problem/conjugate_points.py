@@ -47,7 +47,7 @@ def conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float
 
     step = float(extremal.times[k + 1] - extremal.times[k])
     time = float(extremal.times[k]) + _zero(determinant, step)
-    return time if time < extremal.problem.horizon * (1 - 1e-9) else None
+    return time if time < extremal.horizon * (1 - 1e-9) else None
 
 
 def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import warnings
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ class Status(Enum):
     NOT_CERTIFIED = "the solver converged but re-integration did not confirm it. Try a smaller tol."
     COLLISION = "the extremal passes through an obstacle. Try find_optimum, or another guess."
     CONJUGATE_POINT = "the extremal is no local minimum (conjugate point before the horizon). Try another guess."
+    TIME_NOT_MINIMAL = "the extremal is no local minimum over the free horizon. Try a guess with another duration."
     SUBPROBLEM = "a Leapfrog sub-problem did not converge, so the sweeps stopped. Try more segments or polish=True."
 
 
@@ -58,12 +60,15 @@ class Certificate:
     """Evidence that a path is a local minimum, from re-integration that is independent of the solver.
 
     Attributes:
-        residual: largest violation of the boundary conditions, transversality conditions included.
+        residual: largest violation of the boundary conditions, transversality conditions included; with a free horizon
+            these are completed by H = 0.
         defect: largest difference between a node and the extremal flow from the node before it, integrated at 1e-12.
         hamiltonian_drift: largest minus smallest Hamiltonian. The Hamiltonian is constant along an extremal.
         conjugate_point: time (s) of a conjugate point before the horizon, at which dq(t)/dlambda(0) loses rank; with
             free final components, of a focal point. None if there is none: the extremal is a local minimum.
         clearance: smallest clearance (m) to an obstacle or a wall along the interpolated path; None without obstacles.
+        time_curvature: with a free horizon, d2J/dT2 for extremals with the same ends, positive at a minimum over T;
+            None with a fixed horizon.
         TOLERANCE: largest residual and defect of a certified extremal.
 
     """
@@ -73,6 +78,7 @@ class Certificate:
     hamiltonian_drift: float
     conjugate_point: float | None
     clearance: float | None
+    time_curvature: float | None = None
 
     # Rounding errors leave about this much of a Newton solution at tolerance 1e-9 over a long horizon.
     TOLERANCE: ClassVar[float] = 1e-8
@@ -83,7 +89,9 @@ class Certificate:
             return Status.NOT_CERTIFIED
         if self.clearance is not None and not self.clearance > 0:
             return Status.COLLISION
-        return Status.SUCCESS if self.conjugate_point is None else Status.CONJUGATE_POINT
+        if self.conjugate_point is not None:
+            return Status.CONJUGATE_POINT
+        return Status.SUCCESS if self.time_curvature is None or self.time_curvature > 0 else Status.TIME_NOT_MINIMAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +175,13 @@ class Extremal:
         return f"Extremal({self.status.name}, cost={self.cost:.9g}, {len(self.times)} points, {self.certificate})"
 
     @property
+    def horizon(self) -> float:
+        """The horizon (s): that of the problem, or the optimal one if it is free; NaN without a path."""
+        if self.problem.horizon is not None:
+            return self.problem.horizon
+        return float(self.times[-1]) if len(self.times) else math.nan
+
+    @property
     def success(self) -> bool:
         """Whether the certificate proves a local minimum, collision-free if there are obstacles."""
         return self.status is Status.SUCCESS
@@ -209,7 +224,7 @@ class Extremal:
 
     def _interpolate(self, times: np.ndarray) -> np.ndarray:
         """Return states, costates and accumulated cost (K, 2n + 1) at times (K,)."""
-        times = np.clip(times, 0.0, self.problem.horizon)
+        times = np.clip(times, 0.0, self.horizon)
         k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         s = ((times - self.times[k]) / (self.times[k + 1] - self.times[k]))[:, None]
         value = np.zeros((len(times), self.terms.shape[2]))

@@ -14,9 +14,17 @@ from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
-from leapnav.experts.problem.system import ControlAffineSystem, as_expression, state_cost_of, system_of
+from leapnav.experts.problem.system import (
+    ControlAffineSystem,
+    as_expression,
+    state_cost_of,
+    system_of,
+    time_weight_symbol,
+)
 
 if TYPE_CHECKING:
+    import sympy as sp
+
     from leapnav.experts.problem.generated_dynamics import CompiledDynamics
     from leapnav.experts.problem.generated_flow import Obstacles
 
@@ -47,16 +55,16 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class OptimalControlProblem:
-    """An optimal control problem with a fixed horizon, for a control-affine system.
+    """An optimal control problem with a fixed or a free horizon, for a control-affine system.
 
-    Minimise the integral of 1/2 u'Ru + Phi(q) over [0, T], subject to q' = a(q) + sum_j u_j b_j(q), q(0) = start and
-    q(T) = goal.
+    Minimise the integral of c + 1/2 u'Ru + Phi(q) over [0, T], subject to q' = a(q) + sum_j u_j b_j(q), q(0) = start
+    and q(T) = goal. If the horizon is free, T > 0 is minimised over as well, and the Hamiltonian of an extremal is 0.
 
     Args:
         system: the dynamics, with n states and m controls.
         start: q(0), n numbers.
         goal: q(T), n numbers or None. None leaves a component free; its costate vanishes at T.
-        horizon: T > 0 (s).
+        horizon: T > 0 (s); None if it is free.
         control_weight: diagonal of R, m positive numbers.
         state_cost: Phi, a SymPy expression in the system's state and parameters.
         control_bounds: m pairs (minimum, maximum); None for unbounded controls.
@@ -64,22 +72,25 @@ class OptimalControlProblem:
         parameters: values of the system's parameters, in the order of their declaration.
         footprint: offset along the heading and radius (m) of each disc of the robot; None for one disc with the radius
             of the field.
+        time_weight: c >= 0, cost per second.
 
     Raises:
-        ValueError: an argument has a wrong length or an invalid value.
+        ValueError: an argument has a wrong length or an invalid value, or the horizon is free and nothing in the
+            running cost depends on time: both `time_weight` and `state_cost` are 0.
 
     """
 
     system: ControlAffineSystem
     start: Sequence[float]
     goal: Sequence[float | None]
-    horizon: float
+    horizon: float | None
     control_weight: Sequence[float]
     state_cost: Any = 0
     control_bounds: Sequence[tuple[float, float]] | None = None
     field: np.ndarray | None = None
     parameters: Sequence[float] = ()
     footprint: tuple[tuple[float, float], ...] | None = None
+    time_weight: float = 0.0
 
     def __post_init__(self) -> None:
         n, m = self.system.n, self.system.m
@@ -97,8 +108,10 @@ class OptimalControlProblem:
                 raise ValueError(f"{name}: expected finite numbers, got {values!r}")
         if not all(w > 0 for w in self.control_weight):
             raise ValueError(f"control_weight: expected positive numbers, got {self.control_weight!r}")
-        if not (_is_finite(self.horizon) and self.horizon > 0):
-            raise ValueError(f"horizon: expected a positive number, got {self.horizon!r}")
+        if self.horizon is not None and not (_is_finite(self.horizon) and self.horizon > 0):
+            raise ValueError(f"horizon: expected a positive number, or None for a free horizon, got {self.horizon!r}")
+        if not (_is_finite(self.time_weight) and self.time_weight >= 0):
+            raise ValueError(f"time_weight: expected a number of at least 0, got {self.time_weight!r}")
         if self.control_bounds is not None:
             if len(self.control_bounds) != m:
                 raise ValueError(f"control_bounds: expected {m} pairs, got {len(self.control_bounds)}")
@@ -109,14 +122,15 @@ class OptimalControlProblem:
         for name in ("start", "goal", "control_weight", "parameters"):
             values = tuple(None if v is None else float(v) for v in getattr(self, name))
             object.__setattr__(self, name, values)
-        object.__setattr__(self, "horizon", float(self.horizon))
+        object.__setattr__(self, "horizon", None if self.horizon is None else float(self.horizon))
+        object.__setattr__(self, "time_weight", float(self.time_weight))
         if self.control_bounds is not None:
             bounds = tuple((float(low), float(high)) for low, high in self.control_bounds)
             object.__setattr__(self, "control_bounds", bounds)
-        unknown = as_expression("state_cost", self.state_cost).free_symbols - {
-            *self.system.state,
-            *self.system.parameters,
-        }
+        state_cost = as_expression("state_cost", self.state_cost)
+        if self.horizon is None and self.time_weight == 0 and state_cost == 0 and self.field is None:
+            raise ValueError("time_weight: expected a positive number with a free horizon, got 0: no path is the best")
+        unknown = state_cost.free_symbols - {*self.system.state, *self.system.parameters}
         if unknown:
             raise ValueError(
                 f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}"
@@ -150,6 +164,35 @@ class OptimalControlProblem:
                 goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
         return replace(self, goal=tuple(goal))
 
+    def with_horizon(self, horizon: float) -> OptimalControlProblem:
+        """Return the problem with a fixed horizon (s)."""
+        return replace(self, horizon=horizon)
+
+    @property
+    def fixed_horizon(self) -> float:
+        """The horizon (s).
+
+        Raises:
+            ValueError: it is free.
+
+        """
+        if self.horizon is None:
+            raise ValueError("horizon: expected a fixed one, got None")
+        return self.horizon
+
+    def horizon_of(self, path: Trajectory) -> float:
+        """Return the horizon (s), or the duration of a path if the horizon is free."""
+        return float(path.times[-1]) if self.horizon is None else self.horizon
+
+    @property
+    def _compiled(self) -> tuple[ControlAffineSystem, sp.Expr]:
+        """System and state cost in the form that is compiled: with a time weight, this is a parameter more."""
+        state_cost = as_expression("state_cost", self.state_cost)
+        if self.time_weight == 0.0:
+            return self.system, state_cost
+        weight = time_weight_symbol()
+        return replace(self.system, parameters=(*self.system.parameters, weight)), state_cost + weight
+
     @property
     def _obstacles(self) -> Obstacles:
         if self.field is None:
@@ -168,7 +211,7 @@ class OptimalControlProblem:
         """The compiled dynamics with controls as arguments, for direct transcription."""
         from leapnav.experts.problem.generated_dynamics import compile_dynamics
 
-        return compile_dynamics(self.system, as_expression("state_cost", self.state_cost), self._obstacles)
+        return compile_dynamics(*self._compiled, self._obstacles)
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions cannot be pickled; the receiving process creates its own.
@@ -180,20 +223,20 @@ class OptimalControlProblem:
         from leapnav.experts.problem.generated_flow import compile_flow
 
         m = self.system.m
-        state_cost = as_expression("state_cost", self.state_cost)
-        flow, control = compile_flow(self.system, state_cost, self._obstacles)
+        flow, control = compile_flow(*self._compiled, self._obstacles)
         bounds = np.array(
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
         goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
         discs = () if self._obstacles != "footprint" else self.discs.ravel().tolist()
-        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *self.parameters, *discs])
+        parameters = self.parameters if self.time_weight == 0.0 else (*self.parameters, self.time_weight)
+        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *discs])
         field = _constant([]) if self.field is None else self.field
         return ProblemArrays(
             flow=ExtremalFlow(flow, data, field),
             control=control,
             start=np.array(self.start, dtype=float),
-            end=EndCondition(goal, np.array([g is None for g in self.goal])),
+            end=EndCondition(goal, np.array([g is None for g in self.goal]), self.horizon is None),
         )
 
     def estimate_costates(self, path: Trajectory) -> np.ndarray:
@@ -216,11 +259,14 @@ class OptimalControlProblem:
         return drift, fields
 
     def straight_line(self, points: int = 33) -> Trajectory:
-        """Return the straight line from start to goal; free components keep their initial value."""
+        """Return the straight line from start to goal; free components keep their initial value.
+
+        If the horizon is free, it takes 1 s.
+        """
         start = np.array(self.start, dtype=float)
         goal = np.array([s if g is None else g for s, g in zip(self.start, self.goal, strict=True)], dtype=float)
         fraction = np.linspace(0.0, 1.0, points)[:, None]
-        return Trajectory(np.linspace(0.0, self.horizon, points), start + fraction * (goal - start))
+        return Trajectory(np.linspace(0.0, self.horizon or 1.0, points), start + fraction * (goal - start))
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,6 +126,14 @@ class ControlAffineSystem:
         return len(self.fields)
 
 
+@cache
+def time_weight_symbol() -> sp.Symbol:
+    """Return the symbol of the cost per second, which no user's symbol equals."""
+    import sympy as sp
+
+    return sp.Symbol("time_weight", nonnegative=True, finite=True)
+
+
 def as_expression(where: str, value: Any) -> sp.Expr:
     """Convert a value to a SymPy expression.
 

@@ -1,10 +1,14 @@
 """Collocation with `scipy.integrate.solve_bvp`: three-stage Lobatto IIIA with residual control.
 
 J. Kierzenka and L. F. Shampine, A BVP solver based on residual control and the MATLAB PSE, ACM TOMS 27 (2001). It is
-called with the compiled flow, its analytic Jacobian, and costates that are consistent with the minimum principle.
+called with the compiled flow, its analytic Jacobian, and costates that are consistent with the minimum principle. The
+unknown parameter of a problem with a free horizon is the factor of all times.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import int64
@@ -13,11 +17,11 @@ from scipy.integrate import solve_bvp
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CUBE, MATRIX, VECTOR
 from leapnav.experts.numerics.flow import FLOW
+from leapnav.experts.numerics.shooting import hamiltonian, set_identity
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
-from leapnav.experts.solvers.newton import set_identity
 from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
 
 # Tolerance if Newton's method follows. The error of the cubics decreases with the fourth power of the step only, so a
@@ -46,24 +50,34 @@ def collocation(problem: OptimalControlProblem, path: Trajectory, options: Solve
     end = np.arange(n) + np.where(arrays.free, n, 0)  # the costate of a free component vanishes
     at_end[np.arange(n, 2 * n), end] = 1.0
     goal = np.where(arrays.free, 0.0, arrays.goal)
-    evaluations = 0
+    dz, evaluations = np.empty(2 * n), 0
 
-    def rates(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def rates(_: np.ndarray, z: np.ndarray, factor: Sequence[float] = (1.0,)) -> np.ndarray:
         nonlocal evaluations
         out = np.empty((z.shape[1], 2 * n))
         evaluations += _rates(arrays.flow, np.ascontiguousarray(z.T), out, np.empty(len(out)))
-        return out.T
+        return factor[0] * out.T
 
-    def jacobians(_: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def jacobians(t: np.ndarray, z: np.ndarray, factor: Sequence[float] | None = None) -> Any:
         nonlocal evaluations
         out = np.empty((z.shape[1], 2 * n, 2 * n))
         evaluations += _jacobians(arrays.flow, np.ascontiguousarray(z.T), out)
         if not np.abs(out).max() < MAX_ENTRY:  # also if there are NaN
             raise _DivergedError
-        return out.transpose(1, 2, 0)
+        by_state = out.transpose(1, 2, 0)
+        return by_state if factor is None else (factor[0] * by_state, rates(t, z)[:, None, :])
 
-    def ends(first: np.ndarray, last: np.ndarray) -> np.ndarray:
-        return np.concatenate([first[:n] - arrays.start, last[end] - goal])
+    def ends(first: np.ndarray, last: np.ndarray, factor: Sequence[float] | None = None) -> np.ndarray:
+        conditions = [first[:n] - arrays.start, last[end] - goal]
+        return np.concatenate(conditions if factor is None else [*conditions, [hamiltonian(arrays.flow, first, dz)]])
+
+    def end_jacobians(first: np.ndarray, _: np.ndarray, factor: Sequence[float] | None = None) -> Any:
+        if factor is None:
+            return at_start, at_end
+        hamiltonian(arrays.flow, first, dz)
+        gradient = np.concatenate([-dz[n:], dz[:n]])
+        none = np.zeros((1, 2 * n))
+        return np.vstack([at_start, gradient]), np.vstack([at_end, none]), np.zeros((2 * n + 1, 1))
 
     tolerance = max(options.tol, COARSE_TOLERANCE) if options.polish else options.tol
     try:
@@ -73,25 +87,27 @@ def collocation(problem: OptimalControlProblem, path: Trajectory, options: Solve
                 ends,
                 times,
                 nodes.T,
+                [1.0] if problem.horizon is None else None,  # the factor of a free horizon
                 fun_jac=jacobians,
-                bc_jac=lambda *_: (at_start, at_end),
+                bc_jac=end_jacobians,
                 tol=tolerance,
                 max_nodes=MAX_NODES,
             )
     except _DivergedError:
         return certify(problem, times, nodes, Status.DIVERGED, (), evaluations)
+    mesh = found.x if found.p is None else found.x * found.p[0]
     nodes = np.ascontiguousarray(found.y.T)
     status = STATUS.get(found.status, Status.STALLED)
-    if not np.isfinite(nodes).all():
+    if not (np.isfinite(nodes).all() and mesh[-1] > 0.0):
         return certify(problem, times, start_nodes(problem, path, times)[1], Status.DIVERGED, (), evaluations)
     residual = float(np.max(found.rms_residuals, initial=0.0))
-    history = (Iteration("collocation", len(found.x) - 1, _cost(problem, found.x, nodes), residual),)
+    history = (Iteration("collocation", len(mesh) - 1, _cost(problem, mesh, nodes), residual),)
     if status is not Status.SUCCESS or not options.polish:
-        return certify(problem, found.x, nodes, status, history, evaluations)
+        return certify(problem, mesh, nodes, status, history, evaluations)
     # Every k-th node of the mesh, which solve_bvp refined where the path needs it.
-    every = -(-(len(found.x) - 1) // MAX_POLISHED_SEGMENTS)
-    chosen = np.unique(np.append(np.arange(0, len(found.x), every), len(found.x) - 1))
-    times, nodes = found.x[chosen], nodes[chosen]
+    every = -(-(len(mesh) - 1) // MAX_POLISHED_SEGMENTS)
+    chosen = np.unique(np.append(np.arange(0, len(mesh), every), len(mesh) - 1))
+    times, nodes = mesh[chosen], nodes[chosen]
     status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations)
     return confirm(problem, times, nodes, status, (*history, *rows), evaluations + count, options)
 

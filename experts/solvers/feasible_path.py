@@ -14,6 +14,7 @@ import numpy as np
 
 from leapnav.experts.numerics.flow import NewtonOptions
 from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.problem.extremal import Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.solvers.initial_paths import local_minima
@@ -26,6 +27,8 @@ MAX_STATE_DEFECT = 5e-10  # a larger defect of the states requires a more accura
 DISPLAY_ACCURACY = 1e-10
 # Intervals and initial controls of the search for an arc that shooting does not find.
 STEERING_INTERVALS, STEERING_STARTS = 16, 6
+# Smallest factor of a free horizon per sweep, largest number of halved steps, and relative rounding error of the cost.
+MIN_FACTOR, MAX_HALVINGS, COST_ROUNDING = 0.5, 4, 1e-13
 
 
 @dataclass
@@ -105,7 +108,7 @@ class FeasiblePath:
             self.problem,
             start=tuple(self.nodes[a, :n]),
             goal=self.problem.goal if last else tuple(self.nodes[b, :n]),
-            horizon=float(self.times[b] - self.times[a]),
+            horizon=(duration := float(self.times[b] - self.times[a])),
         )
         arrays = part.arrays
         minima = local_minima(part, STEERING_INTERVALS, STEERING_STARTS) if search else [(0.0, None)]
@@ -113,7 +116,7 @@ class FeasiblePath:
             nodes, cost = self.nodes[[a, b]], np.empty(1)
             if path is not None and path.costates is not None:
                 nodes[0, n:] = path.costates[0]
-            arcs = ArcPath(np.array([0.0, part.horizon]), nodes, cost)
+            arcs = ArcPath(np.array([0.0, duration]), nodes, cost)
             failed, evaluations = connect(arrays.flow, arcs, arrays.end, self._newton(MAX_ITERATIONS))
             self.evaluations += evaluations
             if not failed:
@@ -142,14 +145,41 @@ class FeasiblePath:
         return float(self.costs.sum())
 
     def sweep(self, red_black: bool = False) -> None:
-        """Move every inner node once: in order, or with `red_black` first the odd and then the even nodes."""
+        """Move every inner node once: in order, or with `red_black` first the odd and then the even nodes.
+
+        With a free horizon, all times are scaled afterwards.
+        """
         rejected = np.zeros(self.segments + 1, dtype=bool)
         arrays, newton = self.problem.arrays, self._newton(MAX_ITERATIONS)
         for first, stride in ((1, 2), (2, 2)) if red_black else ((1, 1),):
             self.evaluations += sweep(
                 arrays.flow, self._arcs, arrays.end, newton, self.half_cost, first, stride, rejected
             )
+        if self.problem.horizon is None:
+            self.rescale()
         self._record("sweep", tuple(np.flatnonzero(rejected).tolist()))
+
+    def rescale(self) -> None:
+        """Scale all times where that reduces the cost; the nodes keep their states.
+
+        The derivative of the cost by the factor s of the times is the sum of the Hamiltonians of the arcs times their
+        durations. The step is exact for systems without drift, whose cost is E / s + P s.
+        """
+        arrays, rates = self.problem.arrays, np.empty(self.nodes.shape[1])
+        values = np.array([hamiltonian(arrays.flow, node, rates) for node in self.nodes[:-1]])
+        slope, before = float(values @ np.diff(self.times)), self.cost
+        self.evaluations += len(values)
+        ratio = (before - slope) / (before + slope) if before > abs(slope) else math.copysign(math.inf, -slope)
+        factor = math.sqrt(min(max(ratio, MIN_FACTOR**2), MIN_FACTOR**-2))
+        times, nodes, costs = self.times, self.nodes, self.costs
+        for _ in range(MAX_HALVINGS):
+            self.times, self.nodes = factor * times, nodes.copy()
+            self.nodes[:, self.problem.system.n :] /= factor  # exact without drift and state cost
+            self._connect()
+            if self.cost <= before + COST_ROUNDING * (1.0 + abs(before)):
+                return
+            factor = 1.0 + 0.5 * (factor - 1.0)
+        self.times, self.nodes, self.costs = times, nodes, costs
 
     def reduce(self) -> int:
         """Remove at most every other node where that does not raise the cost; return the number of removed nodes."""

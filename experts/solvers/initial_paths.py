@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from leapnav.experts.numerics.linear import solve_positive
+from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.condensing import ControlRollout, condense, roll_out
 
@@ -27,6 +28,9 @@ MAX_ITERATIONS = 40
 HARMONICS = 4  # of random initial controls
 COST_TOLERANCE = 1e-4  # relative; paths whose costs agree to this are one local minimum, or its mirror image
 WINDINGS = (0, -1, 1)
+# Free horizon: first guess (s), smallest factor and largest number of its steps, relative tolerance, and initial
+# controls per step.
+FIRST_HORIZON, MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE, HORIZON_STARTS = 1.0, 0.25, 12, 0.05, 4
 
 
 @dataclass
@@ -54,13 +58,38 @@ def initial_paths(problem: OptimalControlProblem, seed: int = 0) -> Iterator[tup
     """
     found: list[tuple[float, OptimalControlProblem, Trajectory]] = []
     for variant in _windings(problem):
-        found += [(cost, variant, path) for cost, path in local_minima(variant, seed=seed)]
+        fixed = variant if variant.horizon is not None else variant.with_horizon(estimate_horizon(variant, seed))
+        found += [(cost, variant, path) for cost, path in local_minima(fixed, seed=seed)]
     found.sort(key=lambda entry: entry[0])
     last: float | None = None
     for cost, variant, path in found:
         if last is None or cost > last + COST_TOLERANCE * (abs(last) + abs(cost)):
             last = cost
             yield variant, path
+
+
+def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
+    """Estimate the optimal horizon (s) of a problem with a free horizon.
+
+    The best local minimum in a fixed time gives the derivative of its cost by the horizon, which is the Hamiltonian.
+    The next horizon minimises a cost of the form a / T + b T with this value and derivative.
+    """
+    horizon = FIRST_HORIZON
+    for _ in range(MAX_HORIZON_STEPS):
+        minima = local_minima(problem.with_horizon(horizon), starts=HORIZON_STARTS, seed=seed)
+        if not minima:
+            horizon /= MIN_HORIZON_FACTOR
+            continue
+        cost, path = min(minima, key=lambda entry: entry[0])
+        assert path.costates is not None  # `local_minima` computes them
+        z = np.concatenate([path.states[0], path.costates[0]])
+        slope = horizon * hamiltonian(problem.arrays.flow, z, np.empty_like(z))
+        ratio = (cost - slope) / (cost + slope) if cost > abs(slope) else math.copysign(math.inf, -slope)
+        factor = math.sqrt(min(max(ratio, MIN_HORIZON_FACTOR**2), MIN_HORIZON_FACTOR**-2))
+        horizon *= factor
+        if abs(factor - 1.0) < HORIZON_TOLERANCE:
+            break
+    return horizon
 
 
 def _windings(problem: OptimalControlProblem) -> Iterator[OptimalControlProblem]:
@@ -81,7 +110,7 @@ def local_minima(
     """Find local minima on piecewise constant controls.
 
     Args:
-        problem: the problem, with the windings of its goal angles chosen.
+        problem: the problem, with a fixed horizon and the windings of its goal angles chosen.
         intervals: number of control intervals.
         starts: largest number of initial controls: along the straight line, zero, and random ones.
         seed: random seed of the initial controls.
@@ -100,7 +129,7 @@ def local_minima(
     if np.isfinite(fields).all() and np.isfinite(drift).all():
         along = (np.linalg.pinv(fields) @ (rates - drift)[:, :, None])[:intervals, :, 0]
     # Typical size of the controls, until a solution is known.
-    size = np.full(m, np.linalg.norm(rates[0]) + n / problem.horizon)
+    size = np.full(m, np.linalg.norm(rates[0]) + n / problem.fixed_horizon)
     phases = np.cos(np.outer(np.linspace(0.0, np.pi, intervals), np.arange(HARMONICS)))
     for index in range(starts):
         U = along.copy() if index == 0 else np.zeros_like(along)
@@ -123,7 +152,7 @@ def _optimise(problem: OptimalControlProblem, U: np.ndarray) -> tuple[float, Tra
     """Return cost, path and controls of the local minimum reached from controls U (N, m), or None."""
     intervals = len(U)
     weight = np.tile(problem.control_weight, intervals)
-    h = problem.horizon / intervals
+    h = problem.fixed_horizon / intervals
     fixed = np.flatnonzero(~problem.arrays.free)
     lower, upper = (np.tile(bound, intervals) for bound in _bounds(problem))
     point = _evaluate(problem, U)
@@ -165,7 +194,7 @@ def _optimise(problem: OptimalControlProblem, U: np.ndarray) -> tuple[float, Tra
     costates[-1] += h / 2 * point.rollout.phi_q[-1]
     for k in range(intervals - 1, -1, -1):
         costates[k] = point.rollout.Ad[k].T @ costates[k + 1] + (h if k > 0 else h / 2) * point.rollout.phi_q[k]
-    times = np.linspace(0.0, problem.horizon, intervals + 1)
+    times = np.linspace(0.0, problem.fixed_horizon, intervals + 1)
     return point.cost, Trajectory(times, point.rollout.X, costates), point.U
 
 
@@ -205,7 +234,7 @@ def _evaluate(problem: OptimalControlProblem, U: np.ndarray) -> _Point | None:
     """Return the point with controls U (N, m), or None if its path is not finite."""
     arrays, n, m = problem.arrays, problem.system.n, problem.system.m
     intervals = len(U)
-    h = problem.horizon / intervals
+    h = problem.fixed_horizon / intervals
     rollout = ControlRollout(
         X=np.empty((intervals + 1, n)),
         phi=np.empty(intervals + 1),

@@ -9,6 +9,9 @@ half of its cost. The path stays feasible, and its cost never increases, because
 rejected. Costates need no guess: they are estimated from the chord between two nodes, and later taken from the last
 sweep. When a sweep reduces the cost by less than the fraction MIN_GAIN, two arcs are replaced by one if that does not
 raise the cost, until p = 2 and the last sub-problem is the whole problem.
+
+With a free horizon the sub-problems keep their durations, and after each sweep all times are scaled by a factor that
+reduces the cost, so that the path stays feasible and its cost still never increases.
 """
 
 from __future__ import annotations
@@ -54,13 +57,13 @@ def _sweep_and_polish(iterate: FeasiblePath, options: SolverOptions) -> Extremal
         while done < sweeps:
             iterate.sweep(options.order == "red_black")
             done += 1
-        nodes = iterate.nodes.copy()
-        status, rows, evaluations = polish(iterate.problem, iterate.times, nodes, options.tol, options.max_iterations)
+        times, nodes = iterate.times.copy(), iterate.nodes.copy()
+        status, rows, evaluations = polish(iterate.problem, times, nodes, options.tol, options.max_iterations)
         iterate.evaluations += evaluations
         # An extremal that costs more than the feasible path is not the one to which the sweeps converge.
         if status is Status.SUCCESS and rows[-1].cost <= iterate.cost + COST_TOLERANCE * (1 + abs(iterate.cost)):
             history = (*iterate.history, *rows)
-            extremal = confirm(iterate.problem, iterate.times, nodes, status, history, iterate.evaluations, options)
+            extremal = confirm(iterate.problem, times, nodes, status, history, iterate.evaluations, options)
             # An extremal with a conjugate point is a saddle, and further sweeps reduce the cost.
             if extremal.status is not Status.CONJUGATE_POINT or sweeps == SWEEPS_BEFORE_NEWTON[-1]:
                 return extremal
@@ -74,7 +77,8 @@ def _sweep_and_reduce(iterate: FeasiblePath, options: SolverOptions) -> Extremal
     min_gain, failures, n_rejected_sweeps, status = MIN_GAIN, 0, 0, Status.MAX_ITERATIONS
     for _ in range(MAX_SWEEPS):
         before = iterate.cost
-        if iterate.segments > 2:  # with two arcs the only sub-problem is the whole problem, which a reduction solves
+        # With two arcs the only sub-problem is the whole problem in a fixed time, which a reduction solves.
+        if iterate.segments > 2:
             iterate.sweep(options.order == "red_black")
         if before - iterate.cost > min_gain * abs(before):
             continue

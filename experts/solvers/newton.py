@@ -2,26 +2,29 @@
 
 Both integrate only as accurately as the current residual requires, accept steps by the same criteria, and may skip the
 evaluation of the last iterate, whose residual is predicted from quadratic convergence.
+
+A free final time is another unknown, with the equation that the Hamiltonian at the start is zero.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64
 
-from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import END_CONDITION, FLOW, NEWTON_OPTIONS
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.linear import solve_banded, solve_dense
+from leapnav.experts.numerics.shooting import NewtonSystem, evaluate, hamiltonian, set_identity
 
 # Exit codes of the Newton kernels.
 CONVERGED, STALLED, DIVERGED, SINGULAR, MAX_ITERATIONS = 0, 1, 2, 3, 4
 
 MIN_DAMPING = 1.0 / 64.0
+MIN_TIME_FACTOR = 0.25  # a step may not reduce a free final time to less than this fraction
 COARSE_ACCURACY = 1e-4  # tolerance of the integrator far from the solution
 # The tolerance in the options is this fraction of the residual that the caller accepts. A residual up to that level is
 # accepted if no step decreases it.
@@ -57,33 +60,32 @@ def is_sufficient_decrease(norm_squared, previous_squared, reduction, slack):
     return norm_squared < np.inf and math.sqrt(norm_squared) <= (1.0 - reduction) * math.sqrt(previous_squared) + slack
 
 
-@kernel(NOTHING(MATRIX, int64))
-def set_identity(S, first_row):
-    """Set S to zero, with ones at S[first_row + i, i]."""
-    for i in range(S.shape[0]):
-        for j in range(S.shape[1]):
-            S[i, j] = 1.0 if i == first_row + j else 0.0
+@kernel(float64(float64, float64, float64))
+def time_damping(step, duration, damping):
+    """Return the damping that limits the reduction of a free final time by a step."""
+    return damping if step >= 0.0 else min(damping, (1.0 - MIN_TIME_FACTOR) * duration / -step)
 
 
 @kernel(
-    tuple_of(int64, int64, float64, float64, int64)(
-        FLOW, VECTOR, END_CONDITION, float64, NEWTON_OPTIONS, VECTOR, MATRIX
-    )
+    tuple_of(int64, int64, float64, float64, int64)(FLOW, VECTOR, END_CONDITION, VECTOR, NEWTON_OPTIONS, VECTOR, MATRIX)
 )
-def solve_costate(flow, z, end, duration, options, z_end, log):
+def solve_costate(flow, z, end, time, options, z_end, log):
     """Apply damped Newton's method to the costate in z = (q_0, lam_0), in place; z_end becomes the end of the extremal.
 
-    `log` (max_iterations + 1, 2) receives residual and cost of each iterate, except for a last iterate whose residual
-    is predicted; the cost of that is corrected to first order. Returns (exit code, iterations, residual, cost,
-    evaluations of the flow). Converged means max |residual| <= tolerance.
+    `time` (1,) is the duration (s), changed in place if it is free. `log` (max_iterations + 1, 2) receives residual and
+    cost of each iterate, except for a last iterate whose residual is predicted; the cost of that is corrected to first
+    order. Returns (exit code, iterations, residual, cost, evaluations of the flow). Converged means max |residual| <=
+    tolerance.
     """
     goal, free = end.goal, end.free
     tolerance, accuracy = options.tolerance, options.accuracy
     n = len(goal)
+    unknowns = n + 1 if end.free_time else n
     S = np.empty((2 * n, n))
-    jacobian = np.empty((n, n))
-    rhs, step = np.empty(n), np.empty(n)
+    jacobian = np.zeros((unknowns, unknowns))
+    rhs, step = np.empty(unknowns), np.empty(unknowns)
     start, best, trial = z.copy(), z.copy(), np.empty(2 * n)
+    rates, duration, best_duration = np.empty(2 * n), time[0], time[0]
     best_norm, best_residual, cost, evaluations = np.inf, np.inf, np.inf, 0
     damping, hint = 1.0, 0.0
     current, required = np.inf, max(accuracy, COARSE_ACCURACY)
@@ -98,6 +100,14 @@ def solve_costate(flow, z, end, duration, options, z_end, log):
             if count < 0:
                 norm = np.inf
             else:
+                if end.free_time:
+                    rhs[n] = -hamiltonian(flow, start, rates)
+                    norm, residual = rhs[n] ** 2, abs(rhs[n])
+                    for j in range(n):
+                        jacobian[n, j] = rates[j]
+                    hamiltonian(flow, trial, rates)
+                    for i in range(n):
+                        jacobian[i, n] = rates[n + i if free[i] else i]
                 for i in range(n):
                     row = n + i if free[i] else i
                     rhs[i] = -trial[row] if free[i] else goal[i] - trial[row]
@@ -106,7 +116,7 @@ def solve_costate(flow, z, end, duration, options, z_end, log):
                     for j in range(n):
                         jacobian[i, j] = S[row, j]
             # The first iterate is accepted if it is finite, because its `best_norm` is infinite.
-            slack = accuracy_slack(current, required, n)
+            slack = accuracy_slack(current, required, unknowns)
             if is_sufficient_decrease(norm, best_norm, damping / 2.0, slack):
                 break
             if iteration == 0:
@@ -116,11 +126,15 @@ def solve_costate(flow, z, end, duration, options, z_end, log):
             if damping < MIN_DAMPING:
                 for i in range(2 * n):
                     z[i] = best[i]
+                time[0] = best_duration
                 # This iterate was rejected, so the last row of the log is the one before.
                 return STALLED, iteration - 1, best_residual, cost, evaluations
             for i in range(n):
                 start[n + i] = best[n + i] + damping * step[i]
+            if end.free_time:
+                duration = best_duration + damping * step[n]
         previous = best_residual
+        time[0] = best_duration = duration
         for i in range(2 * n):
             best[i] = z[i] = start[i]
             z_end[i] = trial[i]
@@ -134,7 +148,7 @@ def solve_costate(flow, z, end, duration, options, z_end, log):
             required = accuracy  # a guess that is a solution is evaluated again, without a step: S may be singular
             continue
         required = required_accuracy(residual, current, accuracy)
-        for i in range(n):
+        for i in range(unknowns):
             step[i] = rhs[i]
         if not solve_dense(jacobian, step):
             return SINGULAR, iteration, residual, cost, evaluations
@@ -148,89 +162,27 @@ def solve_costate(flow, z, end, duration, options, z_end, log):
             for i in range(2 * n):
                 for j in range(n):
                     z_end[i] += S[i, j] * step[j]
+                if end.free_time:
+                    z_end[i] += rates[i] * step[n]
+            if end.free_time:
+                time[0] += step[n]
             return CONVERGED, iteration, prediction, cost, evaluations
         damping = min(1.0, 2.0 * damping)
+        if end.free_time:
+            damping = time_damping(step[n], duration, damping)
+            duration = best_duration + damping * step[n]
         for i in range(n):
             start[n + i] = best[n + i] + damping * step[i]
     return MAX_ITERATIONS, options.max_iterations, best_residual, cost, evaluations
 
 
-class _NewtonSystem(NamedTuple):
-    """The linear system of a Newton step, with by-products of its evaluation.
-
-    Attributes:
-        rows: (unknowns, 3 half + 1), the banded matrix, see `solve_banded`.
-        rhs: (unknowns,), negative residuals.
-        costs: (segments,), cost of each segment.
-        hints: (segments,), last step size of the integrator in each segment.
-
-    """
-
-    rows: np.ndarray
-    rhs: np.ndarray
-    costs: np.ndarray
-    hints: np.ndarray
-
-
-_SYSTEM = record_type(_NewtonSystem, rows=MATRIX, rhs=VECTOR, costs=VECTOR, hints=VECTOR)
-
-
-@kernel(tuple_of(float64, float64, int64)(FLOW, VECTOR, MATRIX, VECTOR, END_CONDITION, float64, _SYSTEM))
-def _residual(flow, times, Z, start, end, accuracy, system):
-    """Evaluate the Newton system at Z; return (norm^2, largest residual, evaluations), infinite if the flow diverged.
-
-    The rows are n start conditions, 2n continuity conditions per segment, and n end conditions. With the unknowns in
-    the order of time the half-width of the band is 3n - 1.
-    """
-    rows, rhs, goal, free = system.rows, system.rhs, end.goal, end.free
-    n = len(goal)
-    size = 2 * n
-    half = 3 * n - 1
-    segments = len(times) - 1
-    for i in range(rows.shape[0]):
-        for j in range(rows.shape[1]):
-            rows[i, j] = 0.0
-    z = np.empty(size)
-    S = np.empty((size, size))
-    evaluations = 0
-    for i in range(n):
-        rows[i, half] = 1.0
-        rhs[i] = start[i] - Z[0, i]
-    for k in range(segments):
-        for i in range(size):
-            z[i] = Z[k, i]
-        set_identity(S, 0)
-        cost, _, hint, count = propagate(flow, z, S, times[k + 1] - times[k], accuracy, system.hints[k], False)
-        evaluations += abs(count)
-        if count < 0:
-            return np.inf, np.inf, evaluations
-        system.costs[k] = cost
-        system.hints[k] = hint
-        for i in range(size):
-            row = n + size * k + i
-            rhs[row] = Z[k + 1, i] - z[i]
-            for j in range(size):
-                rows[row, size * k + j - row + half] = S[i, j]
-            rows[row, size * (k + 1) + i - row + half] = -1.0
-    for i in range(n):
-        row = n + size * segments + i
-        column = size * segments + (n + i if free[i] else i)
-        rows[row, column - row + half] = 1.0
-        rhs[row] = -Z[segments, n + i] if free[i] else goal[i] - Z[segments, i]
-    norm, largest = 0.0, 0.0
-    for i in range(len(rhs)):
-        norm += rhs[i] * rhs[i]
-        largest = max(largest, abs(rhs[i]))
-    return norm, largest, evaluations
-
-
 @kernel(NOTHING(MATRIX, MATRIX, VECTOR, float64))
 def _move(Z, moved, step, damping):
-    """Compute moved = Z + damping * step."""
-    size = Z.shape[1]
+    """Compute moved = Z + damping * step; the step may have further entries for each node."""
+    size, stride = Z.shape[1], len(step) // len(Z)
     for k in range(len(Z)):
         for i in range(size):
-            moved[k, i] = Z[k, i] + damping * step[size * k + i]
+            moved[k, i] = Z[k, i] + damping * step[stride * k + i]
 
 
 @kernel(
@@ -239,22 +191,24 @@ def _move(Z, moved, step, damping):
 def solve_nodes(flow, times, Z, start, end, options, costs, log):
     """Apply damped Newton's method to the nodes Z (segments + 1, 2n), in place, and fill the segments' `costs`.
 
-    `log` (max_iterations + 1, 3) receives residual, cost and damping of each iterate, except for a last iterate whose
-    residual is predicted. A residual of tolerance / MARGIN is accepted if no step decreases it; whether it
-    is sufficient is left to the certificate. Returns (exit code, iterations, residual, evaluations).
+    A free final time changes all times in proportion, in place. `log` (max_iterations + 1, 3) receives residual, cost
+    and damping of each iterate, except for a last iterate whose residual is predicted. A residual of tolerance / MARGIN
+    is accepted if no step decreases it; whether it is sufficient is left to the certificate. Returns (exit code,
+    iterations, residual, evaluations).
     """
     tolerance, accuracy = options.tolerance, options.accuracy
     n = len(end.goal)
     segments = len(times) - 1
-    unknowns = 2 * n * (segments + 1)
-    half = 3 * n - 1
+    extra = 1 if end.free_time else 0
+    unknowns = (2 * n + extra) * (segments + 1)
+    half = 3 * n - 1 + 2 * extra
     step = np.empty(unknowns)
     rows, rhs = np.empty((unknowns, 3 * half + 1)), np.empty(unknowns)
-    system = _NewtonSystem(rows, rhs, costs, np.zeros(segments))
-    tried = _NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
+    system = NewtonSystem(rows, rhs, costs, np.zeros(segments))
+    tried = NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
     trial = np.empty((segments + 1, 2 * n))
     current = max(accuracy, COARSE_ACCURACY)
-    norm, residual, evaluations = _residual(flow, times, Z, start, end, current, system)
+    norm, residual, evaluations = evaluate(flow, times, 1.0, Z, start, end, current, system)
     if norm == np.inf:
         return DIVERGED, 0, np.inf, evaluations
     damping, previous = 1.0, 0.0
@@ -262,7 +216,7 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
         if residual <= tolerance and current > accuracy:
             # A guess that is a solution is evaluated again, without a step: the matrix may be singular.
             current = accuracy
-            norm, residual, count = _residual(flow, times, Z, start, end, current, system)
+            norm, residual, count = evaluate(flow, times, 1.0, Z, start, end, current, system)
             evaluations += count
         log[iteration, 0] = residual
         log[iteration, 1] = costs.sum()
@@ -278,14 +232,21 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
         prediction = predicted_residual(residual, previous, damping)
         if options.predict and prediction <= PREDICTION_SAFETY * tolerance and current <= accuracy:
             _move(Z, Z, step, 1.0)
+            if end.free_time:
+                times *= 1.0 + step[2 * n]
             return CONVERGED, iteration, prediction, evaluations
         required = accuracy if residual < 1e-2 else required_accuracy(residual, current, accuracy)
         damping = min(1.0, 2.0 * damping)
+        if end.free_time:
+            damping = time_damping(step[2 * n], 1.0, damping)
+        factor = 1.0
         while True:
             _move(Z, trial, step, damping)
+            if end.free_time:
+                factor = 1.0 + damping * step[2 * n]
             for k in range(segments):
                 tried.hints[k] = system.hints[k]
-            trial_norm, trial_residual, count = _residual(flow, times, trial, start, end, required, tried)
+            trial_norm, trial_residual, count = evaluate(flow, times, factor, trial, start, end, required, tried)
             evaluations += count
             slack = accuracy_slack(current, required, unknowns)
             if is_sufficient_decrease(trial_norm, norm, damping / 4.0, slack):
@@ -302,6 +263,8 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
         for k in range(segments + 1):
             for i in range(2 * n):
                 Z[k, i] = trial[k, i]
+        if end.free_time:
+            times *= factor
         previous = residual
         norm, residual, current = trial_norm, trial_residual, required
     return MAX_ITERATIONS, options.max_iterations, residual, evaluations

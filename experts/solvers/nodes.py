@@ -41,14 +41,14 @@ def start_nodes(
 
     Args:
         problem: the problem.
-        path: the path; its costates are estimated if it has none.
+        path: the path; its costates are estimated if it has none. Its duration is the guess of a free horizon.
         segments: number of segments of equal duration, or the times (segments + 1,) of the nodes.
 
     Returns:
         Times (segments + 1,) and nodes (segments + 1, 2n).
 
     """
-    times = np.linspace(0.0, problem.horizon, segments + 1) if isinstance(segments, int) else segments
+    times = np.linspace(0.0, problem.horizon_of(path), segments + 1) if isinstance(segments, int) else segments
     resampled = path.resample(times)
     costates = resampled.costates if resampled.costates is not None else problem.estimate_costates(resampled)
     arrays = problem.arrays

@@ -11,6 +11,7 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import FLAGS, MATRIX, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import END_CONDITION, FLOW, NEWTON_OPTIONS, EndCondition
 from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.solvers.newton import CONVERGED, solve_costate
 
 MIN_FRACTION = 0.05  # smallest distance in time of a node from its neighbours, relative to the sub-problem's duration
@@ -42,28 +43,34 @@ def _solve_arc(flow, z, target, end, duration, options, z_end):
     `end.free` marks the free components of the target.
     """
     log = np.empty((options.max_iterations + 1, 2))
-    condition = EndCondition(target[: len(end.free)], end.free)
-    status, _, _, cost, evaluations = solve_costate(flow, z, condition, duration, options, z_end, log)
+    condition = EndCondition(target[: len(end.free)], end.free, False)
+    time = np.array([duration])
+    status, _, _, cost, evaluations = solve_costate(flow, z, condition, time, options, z_end, log)
     return status, cost, evaluations
 
 
 @kernel(END_CONDITION(END_CONDITION, boolean))
 def _condition(end, at_horizon):
-    """Return the end condition of a sub-problem; components may be free only at the horizon."""
+    """Return the end condition of a sub-problem, in a fixed time; components may be free only at the horizon."""
     free = np.empty(len(end.free), np.bool_)
     for i in range(len(free)):
         free[i] = at_horizon and end.free[i]
-    return EndCondition(end.goal, free)
+    return EndCondition(end.goal, free, False)
 
 
 @kernel(tuple_of(float64, float64, int64)(FLOW, ARC_PATH, END_CONDITION, float64))
 def measure_defects(flow, path, end, accuracy):
-    """Return the largest defects of states and of costates at the nodes, and the number of evaluations of the flow."""
+    """Return the largest defects of states and of costates at the nodes, and the number of evaluations of the flow.
+
+    If the final time is free, the Hamiltonian at the start counts as a defect of the costates.
+    """
     times, Z = path.times, path.nodes
     n = len(end.goal)
     p = len(times) - 1
     S = np.empty((2 * n, 0))
     states, costates, evaluations = 0.0, 0.0, 0
+    if end.free_time:
+        costates = abs(hamiltonian(flow, Z[0], np.empty(2 * n)))
     for k in range(p):
         z = Z[k].copy()
         _, _, _, count = propagate(flow, z, S, times[k + 1] - times[k], accuracy, 0.0, False)

@@ -1,0 +1,155 @@
+"""The equations of multiple shooting and their linearisation (kernels)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import float64, int64
+
+from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
+from leapnav.experts.numerics.flow import END_CONDITION, FLOW, EndCondition
+from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.numerics.linear import solve_banded
+
+
+@kernel(NOTHING(MATRIX, int64))
+def set_identity(S, first_row):
+    """Set S to zero, with ones at S[first_row + i, i]."""
+    for i in range(S.shape[0]):
+        for j in range(S.shape[1]):
+            S[i, j] = 1.0 if i == first_row + j else 0.0
+
+
+@kernel(float64(FLOW, VECTOR, VECTOR))
+def hamiltonian(flow, z, dz):
+    """Return the Hamiltonian at z = (q, lam), and fill dz = z'."""
+    n = len(z) // 2
+    none, d_none = np.empty((2 * n, 0)), np.empty((2 * n, 0))
+    value = flow.function(z, flow.data, flow.field, none, dz, d_none)
+    for i in range(n):
+        value += z[n + i] * dz[i]
+    return value
+
+
+class NewtonSystem(NamedTuple):
+    """The linear system of a Newton step, with by-products of its evaluation.
+
+    Attributes:
+        rows: (unknowns, 3 half + 1), the banded matrix, see `solve_banded`.
+        rhs: (unknowns,), negative residuals.
+        costs: (segments,), cost of each segment.
+        hints: (segments,), last step size of the integrator in each segment.
+
+    """
+
+    rows: np.ndarray
+    rhs: np.ndarray
+    costs: np.ndarray
+    hints: np.ndarray
+
+
+SYSTEM = record_type(NewtonSystem, rows=MATRIX, rhs=VECTOR, costs=VECTOR, hints=VECTOR)
+
+
+@kernel(tuple_of(float64, float64, int64)(FLOW, VECTOR, float64, MATRIX, VECTOR, END_CONDITION, float64, SYSTEM))
+def evaluate(flow, times, factor, Z, start, end, accuracy, system):
+    """Evaluate the Newton system at Z; return (norm^2, largest residual, evaluations), infinite if the flow diverged.
+
+    All times are multiplied by `factor`. The rows are n start conditions, 2n continuity conditions per segment, and n
+    end conditions. With the unknowns in the order of time the half-width of the band is 3n - 1.
+
+    If the final time is free, the relative change of all times is an unknown of every node, which keeps the matrix
+    banded: there is another start condition, that the Hamiltonian vanishes, and another continuity condition, that the
+    changes of neighbouring nodes agree. The half-width is 3n + 1.
+    """
+    rows, rhs, goal, free = system.rows, system.rhs, end.goal, end.free
+    n = len(goal)
+    extra = 1 if end.free_time else 0
+    size = 2 * n
+    stride, first = size + extra, n + extra  # unknowns of a node, and start conditions
+    half = 3 * n - 1 + 2 * extra
+    segments = len(times) - 1
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rows[i, j] = 0.0
+    z, rates = np.empty(size), np.empty(size)
+    S = np.empty((size, size))
+    evaluations = 0
+    for i in range(n):
+        rows[i, half] = 1.0
+        rhs[i] = start[i] - Z[0, i]
+    if end.free_time:
+        rhs[n] = -hamiltonian(flow, Z[0], rates)
+        for i in range(n):
+            rows[n, i - n + half] = -rates[n + i]
+            rows[n, i + half] = rates[i]
+    for k in range(segments):
+        for i in range(size):
+            z[i] = Z[k, i]
+        set_identity(S, 0)
+        duration = times[k + 1] - times[k]
+        cost, _, hint, count = propagate(flow, z, S, factor * duration, accuracy, system.hints[k], False)
+        evaluations += abs(count)
+        if count < 0:
+            return np.inf, np.inf, evaluations
+        system.costs[k] = cost
+        system.hints[k] = hint
+        for i in range(size):
+            row = first + stride * k + i
+            rhs[row] = Z[k + 1, i] - z[i]
+            for j in range(size):
+                rows[row, stride * k + j - row + half] = S[i, j]
+            rows[row, stride * (k + 1) + i - row + half] = -1.0
+        if end.free_time:
+            hamiltonian(flow, z, rates)
+            for i in range(size):
+                row = first + stride * k + i
+                rows[row, stride * k + size - row + half] = factor * duration * rates[i]
+            row = first + stride * k + size
+            rhs[row] = 0.0
+            rows[row, stride * k + size - row + half] = 1.0
+            rows[row, stride * (k + 1) + size - row + half] = -1.0
+    for i in range(n):
+        row = first + stride * segments + i
+        column = stride * segments + (n + i if free[i] else i)
+        rows[row, column - row + half] = 1.0
+        rhs[row] = -Z[segments, n + i] if free[i] else goal[i] - Z[segments, i]
+    norm, largest = 0.0, 0.0
+    for i in range(len(rhs)):
+        norm += rhs[i] * rhs[i]
+        largest = max(largest, abs(rhs[i]))
+    return norm, largest, evaluations
+
+
+@kernel(float64(FLOW, VECTOR, MATRIX, END_CONDITION, float64))
+def time_curvature(flow, times, Z, end, accuracy):
+    """Return d2J/dT2 for extremals with the same ends, which is the derivative of the Hamiltonian; NaN if undefined.
+
+    `times` and Z (segments + 1, 2n) are those of an extremal.
+    """
+    n = len(end.goal)
+    segments = len(times) - 1
+    half = 3 * n - 1
+    unknowns = 2 * n * (segments + 1)
+    rows, rhs = np.empty((unknowns, 3 * half + 1)), np.empty(unknowns)
+    system = NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
+    fixed = EndCondition(end.goal, end.free, False)
+    norm, _, _ = evaluate(flow, times, 1.0, Z, Z[0, :n].copy(), fixed, accuracy, system)
+    if norm == np.inf:
+        return np.nan
+    rates = np.empty(2 * n)
+    for i in range(unknowns):
+        rhs[i] = 0.0
+    for k in range(segments):
+        hamiltonian(flow, Z[k + 1], rates)
+        for i in range(2 * n):
+            rhs[n + 2 * n * k + i] = -(times[k + 1] - times[k]) / times[segments] * rates[i]
+    if not solve_banded(rows, rhs, half):
+        return np.nan
+    hamiltonian(flow, Z[0], rates)
+    curvature = 0.0
+    for i in range(n):
+        curvature += rates[i] * rhs[n + i] - rates[n + i] * rhs[i]
+    return curvature
