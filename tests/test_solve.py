@@ -201,6 +201,12 @@ def hyper_sensitive(horizon):
     return OptimalControlProblem(system, (1.5,), (1.0,), horizon, (1.0,), state_cost=x**2 / 2)
 
 
+def oscillator(horizon=None):
+    """Back to the start with a free horizon: J has minima close to multiples of the period, and maxima in between."""
+    system = ControlAffineSystem(state=(x, y), drift=(y, -x), fields=((0, 1),))
+    return OptimalControlProblem(system, (1, 0), (1, 0), horizon, (1.0,), time_weight=0.02)
+
+
 def past_a_conjugate_point():
     # x = 0 minimises the integral of (u^2 - x^2) / 2 from 0 to 0 only up to T = pi.
     system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
@@ -237,6 +243,7 @@ FAILURES = {
     Status.NOT_CERTIFIED: lambda: solve(VAN_DER_POL, method="multiple_shooting", tol=1e-2),
     Status.COLLISION: lambda: solve(in_the_way(), method="multiple_shooting", guess=straight(in_the_way())),
     Status.CONJUGATE_POINT: lambda: solve(past_a_conjugate_point(), method="multiple_shooting"),
+    Status.TIME_NOT_MINIMAL: lambda: solve(oscillator(), guess=solve(oscillator(2.6)), method="multiple_shooting"),
     Status.SUBPROBLEM: lambda: solve(unreachable(), method="leapfrog"),
 }
 
