@@ -21,7 +21,7 @@ from leapnav.envs.utils.validation import check_integer
 from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.search.candidates import Candidate, CandidateSearch
+from leapnav.experts.search.candidates import Candidate, CandidateSearch, shortest_durations
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
@@ -66,7 +66,7 @@ class Optimum(Extremal):
     @property
     def path_class(self) -> tuple[Side, ...]:
         """The side of the path on which each obstacle lies, in the order of the scenario."""
-        times = np.linspace(0.0, self.problem.horizon, 513)
+        times = np.linspace(0.0, self.horizon, 513)
         assert self.problem.field is not None
         return path_sides(self.interpolate(times)[:, :2], self.problem.field)
 
@@ -151,10 +151,8 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
     prepare(*KERNELS, *(() if is_unicycle else (descent.descend,)))
     problem = OptimalControlProblem.from_scenario(scenario)
-    if (
-        np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2]))
-        > scenario.robot.speed_limits()[0] * scenario.horizon
-    ):
+    horizon = math.inf if scenario.horizon is None else scenario.horizon
+    if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
     search = LocalOptima(scenario, problem, ALTERNATIVES_BUDGET * candidates)
     grids = Grids(cache(partial(Lattice, scenario)), cache(partial(is_connected, scenario)))
@@ -214,7 +212,12 @@ def shortest_horizon(scenario: Scenario) -> float | None:
         The horizon (s), rounded up to 0.1 s; the search before the rounding is accurate to 2 %. None if no horizon up
         to 1,000 times that of the scenario suffices.
 
+    Raises:
+        ValueError: the horizon of the scenario is free.
+
     """
+    if scenario.horizon is None:
+        raise ValueError("horizon: expected a number, got None: a free horizon is never too short")
 
     def suffices(horizon: float) -> bool:
         return find_optimum(scenario.model_copy(update={"horizon": horizon}), N_BISECTED, thorough=False).success
@@ -252,7 +255,7 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
             if not batch:
                 break
             taken += batch
-            shortest_time = min(shortest_time, *(_shortest_time(c.poses, scenario) for c in batch))
+            shortest_time = min(shortest_time, *(float(shortest_durations(c.poses, scenario).sum()) for c in batch))
             search.add(Trajectory(c.times, c.poses) for c in batch)
             if not thorough:
                 break
@@ -270,7 +273,7 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
         return None
     if shortest_time == np.inf:
         return Status.NO_PATH
-    return Status.HORIZON_TOO_SHORT if shortest_time > scenario.horizon else None
+    return Status.HORIZON_TOO_SHORT if scenario.horizon is not None and shortest_time > scenario.horizon else None
 
 
 def _result(search: LocalOptima) -> Optimum:
@@ -285,11 +288,3 @@ def _result(search: LocalOptima) -> Optimum:
 def as_optimum(extremal: Extremal) -> Optimum:
     """Convert an extremal to an `Optimum` without alternatives."""
     return Optimum(**{field.name: getattr(extremal, field.name) for field in fields(Extremal)})
-
-
-def _shortest_time(poses: np.ndarray, scenario: Scenario) -> float:
-    """Duration (s) of a path at the limits of the robot."""
-    step = np.abs(np.diff(poses, axis=0))
-    max_speed, max_turn_rate = scenario.robot.speed_limits()
-    driving = np.hypot(step[:, 0], step[:, 1]) / max_speed
-    return float(np.maximum(driving, step[:, 2] / max_turn_rate).sum())

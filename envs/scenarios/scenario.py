@@ -41,12 +41,16 @@ class ScenarioError(ValueError):
 
 
 class Cost(Frozen):
-    """Weights of the running cost 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(q), see the robot's model."""
+    """Weights of the running cost c + 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(q), see the robot's model.
+
+    The time weight c is the cost per second.
+    """
 
     speed_weight: Positive = 1.0
     turn_weight: Positive = 0.5
     proximity_weight: NotNegative = 1.0
     proximity_scale: Positive = 0.1
+    time_weight: NotNegative = 0.0
 
 
 class Scenario(Frozen):
@@ -58,7 +62,7 @@ class Scenario(Frozen):
         robot: model, footprint and limits of the robot, a model of `leapnav.envs.robots`.
         start: pose (x, y, heading) at time 0.
         goal: pose (x, y, heading) at the horizon; a heading of None is free.
-        horizon: duration of the task (s).
+        horizon: duration of the task (s); None if it is free, with a positive time weight.
         obstacles: the obstacles, which may overlap; each has one shape, see `Obstacle`.
         cost: weights of the running cost.
         start_motion: further states of the robot at time 0, such as speed and turn rate; None for zeros.
@@ -74,7 +78,7 @@ class Scenario(Frozen):
     robot: SerializeAsAny[RobotModel] = Unicycle()
     start: tuple[Finite, Finite, Finite]
     goal: tuple[Finite, Finite, Finite | None]
-    horizon: Positive
+    horizon: Positive | None
     obstacles: tuple[Obstacle, ...] = ()
     cost: Cost = Cost()
     start_motion: tuple[Finite, ...] | None = None
@@ -112,6 +116,12 @@ class Scenario(Frozen):
             value = getattr(self.cost, field)
             if field not in robot.cost_fields and value != Cost.model_fields[field].default:
                 raise ValueError(f"cost.{field}: not used by the robot {name!r}, got {value:g}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_horizon(self) -> Self:
+        if self.horizon is None and self.cost.time_weight == 0:
+            raise ValueError("cost.time_weight: expected a positive number, since the horizon is free, got 0")
         return self
 
     @model_validator(mode="after")
@@ -166,7 +176,8 @@ class Scenario(Frozen):
         goal = [math.nan if value is None else value for value in self.goal_state]
         controls = (*robot.limits(), *robot.control_weight(cost))
         further = (*self.start_state[3:], *goal[3:], *robot.parameters(cost))
-        task = np.array([*self.start, *goal[:3], self.horizon, *controls, *further])
+        horizon = math.inf if self.horizon is None else self.horizon
+        task = np.array([*self.start, *goal[:3], horizon, *controls, *further])
         task.flags.writeable = False
         return task
 
@@ -202,7 +213,10 @@ class Scenario(Frozen):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as dictionaries, lists and numbers, with the structure of the scenario file."""
-        return self.model_dump(mode="json", exclude_none=True)
+        fields = self.model_dump(mode="json", exclude_none=True)
+        if self.horizon is None:
+            fields["horizon"] = None
+        return fields
 
     @classmethod
     def from_dict(cls, fields: Any) -> Scenario:

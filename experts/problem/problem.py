@@ -151,6 +151,7 @@ class OptimalControlProblem:
             field=scenario.field,
             parameters=robot.parameters(cost),
             footprint=None if robot.footprint is None else tuple(map(tuple, scenario.discs.tolist())),
+            time_weight=cost.time_weight,
         )
 
     def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:

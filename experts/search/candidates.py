@@ -1,11 +1,12 @@
 """Candidate paths of a scenario: shortest paths over (x, y, heading) in the Jacobi metric of the problem.
 
-On an extremal of the driftless robot H = -E is constant, so |u|_R = sqrt(2 (E + Phi)), and the optimum is a shortest
+On an extremal of the driftless robot H = c - E is constant, so |u|_R = sqrt(2 (E + Phi)), and the optimum is a shortest
 path for ds = sqrt(2 (E + Phi)) sqrt(r_v ds_xy^2 + r_w dtheta^2) (Maupertuis' principle). E follows from the horizon,
-T = integral of ds / (2 (E + Phi)). The search therefore covers reversing, cusps, windings of the heading and the
-allocation of time. Costs of shortest paths in the plane, for which rotation is free, are lower bounds of the costs on
-the lattice, and guide an A* search from the goal, whose costs guide a search from the start. A path through an edge
-that both trees have in common is locally shortest. The cheapest distinct paths of this kind are the candidates.
+T = integral of ds / (2 (E + Phi)); if the horizon is free, E is the time weight c. The search therefore covers
+reversing, cusps, windings of the heading and the allocation of time. Costs of shortest paths in the plane, for which
+rotation is free, are lower bounds of the costs on the lattice, and guide an A* search from the goal, whose costs guide
+a search from the start. A path through an edge that both trees have in common is locally shortest. The cheapest
+distinct paths of this kind are the candidates.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.robots.moves import HEADINGS
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import (
@@ -38,6 +40,7 @@ MAX_LOG_ENERGY_ERROR = 0.5  # error of log E above which E is corrected; the ord
 MIN_ENERGY = 1e-4
 MIN_ENERGY_FRACTION = 0.3  # smallest E of a path, relative to its E for a small Phi
 LATTICE_ERROR = 1.07  # relative length error of lattice paths, see `suffices`; at most 1.067 in 200 scenarios
+LIMIT_MARGIN = 1.05  # duration of a step relative to the shortest, at least; the limits leave no freedom at 1
 # Nodes within this distance (cells, heading steps) of a candidate belong to it.
 DUPLICATE_CELLS, DUPLICATE_HEADINGS = 2, 3
 # The same for `distinct_from`, which yields paths that differ by more.
@@ -101,6 +104,8 @@ class CandidateSearch:
         nodes = path_through(self._meetings[0], self._from_start.parent, self._to_goal.parent)
         lengths, phi = lattice.metric_lengths(lattice.poses(nodes))
         horizon = lattice.scenario.horizon
+        if horizon is None:
+            return
         # Phi is large in a passage that is narrower than the robot, so the horizon alone may give E = 0, for which the
         # metric is degenerate.
         energy = max(
@@ -137,7 +142,8 @@ class CandidateSearch:
     def suffices(self, cost: float, first: float, last: float) -> bool:
         """Return whether further candidates are unlikely to lead to a cheaper extremal.
 
-        For any E, a path of length D in the metric has J >= D - E T, with equality for an extremal of that E. Lattice
+        For any E, a path of length D in the metric has J >= D - (E - c) T with the time weight c, and equality for an
+        extremal of that E. Lattice
         paths are slightly longer than the extremals close to them, at most by the factor LATTICE_ERROR in hundreds of
         scenarios, and rarely shorter. So no more candidates are needed if the first one is about as short as the best
         extremal, or if the last one is too long to be close to a cheaper extremal.
@@ -148,7 +154,10 @@ class CandidateSearch:
             last: cost of the last candidate.
 
         """
-        length = cost + self.energy * self.lattice.scenario.horizon
+        scenario = self.lattice.scenario
+        # J contains the cost of time: c T, with c = E if the horizon is free.
+        rest = 0.0 if scenario.horizon is None else (self.energy - scenario.cost.time_weight) * scenario.horizon
+        length = cost + rest
         return first >= length / LATTICE_ERROR or last >= length * LATTICE_ERROR
 
     def _distinct(self, taken: Iterable[Candidate], cells: int, headings: int) -> Iterator[Candidate]:
@@ -167,12 +176,11 @@ class CandidateSearch:
         scenario = self.lattice.scenario
         weight, horizon = self.lattice.weights[0], scenario.horizon
         start, goal = scenario.start, scenario.goal
+        if horizon is None:
+            return scenario.cost.time_weight if math.isfinite(self._plane_distance(scenario.cost.time_weight)) else 0.0
         energy = max(0.5 * weight * (math.dist(start[:2], goal[:2]) / horizon) ** 2, MIN_ENERGY)
         for _ in range(3):
-            metric = self._metric(energy)
-            cost = _plane_costs(metric, self.lattice.nodes_around(*start, metric.plane))
-            targets = self.lattice.nodes_around(*goal, metric.plane).nodes // HEADINGS
-            shortest = float(cost[targets].min()) if len(targets) else math.inf
+            shortest = self._plane_distance(energy)
             if not math.isfinite(shortest):
                 return 0.0
             # Assumes that Phi is small compared with E, which holds once E is larger than that of the straight line.
@@ -181,6 +189,13 @@ class CandidateSearch:
             if abs(math.log(energy / before)) < MAX_LOG_ENERGY_ERROR:
                 break
         return energy
+
+    def _plane_distance(self, energy: float) -> float:
+        """Return the cost of the shortest path if rotation were free; infinite if there is none."""
+        scenario, metric = self.lattice.scenario, self._metric(energy)
+        cost = _plane_costs(metric, self.lattice.nodes_around(*scenario.start, metric.plane))
+        targets = self.lattice.nodes_around(*scenario.goal, metric.plane).nodes // HEADINGS
+        return float(cost[targets].min()) if len(targets) else math.inf
 
     def _metric(self, energy: float) -> Metric:
         """Return the metric for a given E."""
@@ -209,10 +224,20 @@ class CandidateSearch:
         lengths, phi = self.lattice.metric_lengths(poses)
         # The time of a path of length zero (the goal is the start) is distributed evenly.
         lengths = np.maximum(lengths, 1e-9)
-        durations = lengths / np.sqrt(2 * (energy_of(lengths, phi, horizon) + phi))
+        energy = self.energy if horizon is None else energy_of(lengths, phi, horizon)
+        durations = lengths / np.sqrt(2 * (energy + phi))
+        if horizon is None:
+            durations = np.maximum(durations, LIMIT_MARGIN * shortest_durations(poses, self.lattice.scenario))
         times = np.concatenate([[0.0], np.cumsum(durations)])
         cost = float(self._from_start.cost[node] + self._to_goal.cost[node])
-        return Candidate(times * (horizon / times[-1]), poses, cost, nodes)
+        return Candidate(times if horizon is None else times * (horizon / times[-1]), poses, cost, nodes)
+
+
+def shortest_durations(poses: np.ndarray, scenario: Scenario) -> np.ndarray:
+    """Return the durations (N - 1,) (s) of the steps of a path (N, 3) at the limits of the robot."""
+    step = np.abs(np.diff(poses, axis=0))
+    max_speed, max_turn_rate = scenario.robot.speed_limits()
+    return np.maximum(np.hypot(step[:, 0], step[:, 1]) / max_speed, step[:, 2] / max_turn_rate)
 
 
 def best_candidate(lattice: Lattice) -> Candidate | None:

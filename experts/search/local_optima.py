@@ -129,7 +129,8 @@ class LocalOptima:
         if self._is_discarded(problem, direct, direct, DIRECT_ERROR):
             return
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
-        refined = self._optimise(problem, direct.refined())
+        finer = direct.refined()
+        refined = self._optimise(problem, finer if problem.horizon is not None else finer.rescaled(problem))
         is_duplicate = self._is_seen(refined)
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if is_duplicate:

@@ -16,10 +16,11 @@ Newton steps.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.problem.system import differential_drive, unicycle
 from leapnav.experts.transcription import arcs, arcs_descent, descent, midpoint
@@ -28,6 +29,7 @@ INTERVALS_PER_STEP = 2.0  # intervals per step of a lattice path (0.2 to 0.45 m)
 MIN_INTERVALS, MAX_INTERVALS = 32, 1024
 MAX_ITERATIONS = 40
 MIN_GRAM = 1e-9  # keeps B'B regular where the fields are linearly dependent
+MIN_TIME_FACTOR = 0.5  # smallest factor by which a free horizon changes at once
 STEP_TOLERANCE = 1e-3  # m and rad, less on short paths; the iteration has converged when a full step is smaller
 
 
@@ -63,6 +65,21 @@ class DirectPath:
         )
         controls = np.repeat(self.controls, 2, axis=0)
         return DirectPath(times, states, controls, costates, self.cost, self.violation, False)
+
+    def rescaled(self, problem: OptimalControlProblem) -> DirectPath:
+        """Return the path with all times scaled by a factor that reduces its cost, for a problem with a free horizon.
+
+        The derivative of the cost by the factor s is the integral of the Hamiltonian. The cost is of the form
+        E / s + P s for systems without drift.
+        """
+        arrays, rates = problem.arrays, np.empty(2 * problem.system.n)
+        z = np.concatenate([self.states, self.costates], axis=1)
+        values = np.array([hamiltonian(arrays.flow, row, rates) for row in z])
+        slope = float(np.trapezoid(values, self.times))
+        ratio = (self.cost - slope) / (self.cost + slope) if self.cost > abs(slope) else math.copysign(math.inf, -slope)
+        factor = math.sqrt(min(max(ratio, MIN_TIME_FACTOR**2), MIN_TIME_FACTOR**-2))
+        controls, costates = self.controls / factor, self.costates / factor
+        return replace(self, times=factor * self.times, controls=controls, costates=costates)
 
 
 def discretise(problem: OptimalControlProblem, path: Trajectory) -> DirectPath:
@@ -129,6 +146,7 @@ def optimise(
         motion = controls if wheels is None else np.ascontiguousarray(np.linalg.solve(wheels, controls.T).T)
         task = arcs.DiscreteProblem(h, arrays.end, turn_weight, 1.0 / speed_weight, limits, arrays.field)
         converged, cost, violation = arcs_descent.descend(task, states, motion, costates, tolerance, max_iterations)
+        cost += problem.time_weight * guess.times[-1] / speed_weight
         controls = motion if wheels is None else motion @ wheels.T
         within_limits = wheels is None or bool((np.abs(controls) <= arrays.data[4:6] + 1e-9).all())
     if on_arcs is None or not within_limits:

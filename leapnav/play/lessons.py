@@ -92,13 +92,15 @@ def compare_methods() -> dict[str, Any]:
 
 def _single_shooting(problem: OptimalControlProblem, start: np.ndarray) -> dict[str, Any]:
     """The iterates of Newton's method on the initial costate, from the start (2n,) of the guess."""
-    arrays, span = problem.arrays, np.array([0.0, problem.horizon])
+    arrays, duration = problem.arrays, problem.fixed_horizon
+    span = np.array([0.0, duration])
     iterates: list[dict[str, Any]] = []
     code = CONVERGED
     for limit in range(MAX_NEWTON_STEPS + 1):
         z, end, log = start.copy(), start.copy(), np.empty((limit + 1, 2))
         newton = NewtonOptions(TOLERANCE, ACCURACY, limit)
-        code, steps, residual, cost, _ = solve_costate(arrays.flow, z, arrays.end, problem.horizon, newton, end, log)
+        time = np.array([duration])
+        code, steps, residual, cost, _ = solve_costate(arrays.flow, z, arrays.end, time, newton, end, log)
         if steps < limit:
             break
         iterates.append(_iterate(problem, span, np.stack([z, end]), cost, residual))
@@ -263,7 +265,7 @@ def _find_saddle(fold: float, last: Extremal) -> Extremal:
     """
     near = _resolve(fold + FOLD_DISTANCE, last)
     far = _resolve(fold + 4 * FOLD_DISTANCE, near)
-    times = np.linspace(0.0, near.problem.horizon, PATH_POINTS)
+    times = np.linspace(0.0, near.horizon, PATH_POINTS)
     at_near, at_far = near.interpolate(times), far.interpolate(times)
     guess = at_near + 2.0 * (at_near - at_far)
     n = near.states.shape[1]
@@ -282,19 +284,20 @@ def conjugate_time(extremal: Extremal) -> float | None:
         The time; None if there is none up to EXTENSION times the horizon.
 
     """
-    horizon = extremal.problem.horizon
+    horizon = extremal.horizon
     longer = replace(extremal.problem, horizon=EXTENSION * horizon)
     ends = np.concatenate([extremal.states[[0, -1]], extremal.costates[[0, -1]]], axis=1)
     # The last node only marks the end of the integration, so it may have any value.
     nodes = np.concatenate([ends, ends[-1:]])
-    certificate = certify(longer, np.array([0.0, horizon, longer.horizon]), nodes, Status.MAX_ITERATIONS).certificate
+    times = np.array([0.0, horizon, longer.fixed_horizon])
+    certificate = certify(longer, times, nodes, Status.MAX_ITERATIONS).certificate
     return None if certificate is None else certificate.conjugate_point
 
 
 def _step(heading: float, branch: str, extremal: Extremal) -> dict[str, Any]:
     """A step of the second lesson on one of the branches."""
     optimum = find_optimum(cusp_scenario(heading))
-    time, horizon = conjugate_time(extremal), extremal.problem.horizon
+    time, horizon = conjugate_time(extremal), extremal.horizon
     shown = "none" if time is None else f"at {time:.2f} s"
     if branch == "minimum":
         text = f"Conjugate point {shown}, horizon {horizon:g} s. {MINIMUM}"
@@ -340,7 +343,7 @@ def _fields(
         "status": extremal.status.name,
         "cost": extremal.cost,
         "conjugate_time": time,
-        "horizon": extremal.problem.horizon,
+        "horizon": extremal.horizon,
         "states": _states(extremal),
         "optimum": {"cost": optimum.cost, "states": _states(optimum)},
         "title": title,
@@ -352,7 +355,7 @@ LESSONS: dict[str, Callable[[], dict[str, Any]]] = {"methods": compare_methods, 
 
 
 def _states(extremal: Extremal) -> list[list[float]]:
-    return _rows(extremal.interpolate(np.linspace(0.0, extremal.problem.horizon, PATH_POINTS))[:, :3], 4)
+    return _rows(extremal.interpolate(np.linspace(0.0, extremal.horizon, PATH_POINTS))[:, :3], 4)
 
 
 def _rows(array: np.ndarray, digits: int = 6) -> list[list[float]]:

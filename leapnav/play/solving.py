@@ -159,7 +159,7 @@ def bank_scenario(family: str, index: int) -> Scenario:
 
 def _path(scenario: Scenario, optimum: Optimum, points: int = OPTIMUM_POINTS) -> dict[str, Any]:
     """A local optimum over time, for the plots."""
-    times = np.linspace(0.0, optimum.problem.horizon, points)
+    times = np.linspace(0.0, optimum.horizon, points)
     _, controls, costates = optimum.evaluate(times)
     certificate = optimum.certificate
     return {
@@ -180,7 +180,7 @@ def _clearances(scenario: Scenario, values: np.ndarray) -> np.ndarray:
 
 
 def _summary(optimum: Optimum, points: int) -> dict[str, Any]:
-    states = optimum.interpolate(np.linspace(0.0, optimum.problem.horizon, points))[:, :3]
+    states = optimum.interpolate(np.linspace(0.0, optimum.horizon, points))[:, :3]
     certificate = optimum.certificate
     return {
         "cost": optimum.cost,
