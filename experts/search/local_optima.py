@@ -24,7 +24,7 @@ from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.nodes import SolverOptions
 from leapnav.experts.transcription.direct import MAX_ITERATIONS, DirectPath, discretise, optimise
 
-TOLERANCE = 1e-9
+TOLERANCE, COARSE_TOLERANCE = 1e-9, 1e-5
 # Newton iterations of the last attempt, and of the attempts before it, after which the path is refined.
 NEWTON_ITERATIONS, FIRST_ITERATIONS, EXPENSIVE_ITERATIONS = 25, 14, 10
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
@@ -130,7 +130,9 @@ class LocalOptima:
             return
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
         finer = direct.refined()
-        refined = self._optimise(problem, finer if problem.horizon is not None else finer.rescaled(problem))
+        if problem.horizon is None and direct.converged:
+            finer = finer.rescaled(problem)
+        refined = self._optimise(problem, finer)
         is_duplicate = self._is_seen(refined)
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if is_duplicate:
@@ -209,7 +211,7 @@ class LocalOptima:
             iterations = NEWTON_ITERATIONS if attempt == n_attempts - 1 else FIRST_ITERATIONS
             iterations = EXPENSIVE_ITERATIONS if is_expensive else iterations
             times, nodes = _shooting_nodes(problem, direct, 2**attempt)
-            status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, iterations)
+            status, rows, evaluations = _polish(problem, times, nodes, iterations)
             history += rows
             total += evaluations
             if status is Status.SUCCESS:
@@ -287,6 +289,24 @@ class LocalOptima:
         """Return whether a collision-free path of similar cost is possible close to an extremal."""
         clearance = extremal.certificate.clearance if extremal.certificate is not None else None
         return clearance is None or clearance >= -self._slight_depth
+
+
+def _polish(
+    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, iterations: int
+) -> tuple[Status, tuple[Iteration, ...], int]:
+    """Apply Newton's method, with a free horizon if necessary in two stages, of which the first keeps the times."""
+    first = nodes.copy()
+    status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, iterations)
+    if status is Status.SUCCESS or problem.horizon is not None:
+        return status, rows, evaluations
+    fixed = problem.with_horizon(float(times[-1]))
+    status, more, count = polish(fixed, times, first, COARSE_TOLERANCE, iterations)
+    rows, evaluations = rows + more, evaluations + count
+    if status is Status.SUCCESS:
+        nodes[:] = first
+        status, more, count = polish(problem, times, nodes, TOLERANCE, iterations)
+        rows, evaluations = rows + more, evaluations + count
+    return status, rows, evaluations
 
 
 def _shooting_nodes(

@@ -29,7 +29,7 @@ INTERVALS_PER_STEP = 2.0  # intervals per step of a lattice path (0.2 to 0.45 m)
 MIN_INTERVALS, MAX_INTERVALS = 32, 1024
 MAX_ITERATIONS = 40
 MIN_GRAM = 1e-9  # keeps B'B regular where the fields are linearly dependent
-MIN_TIME_FACTOR = 0.5  # smallest factor by which a free horizon changes at once
+MIN_TIME_FACTOR = 0.8  # smallest factor by which a free horizon changes at once
 STEP_TOLERANCE = 1e-3  # m and rad, less on short paths; the iteration has converged when a full step is smaller
 
 
