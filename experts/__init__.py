@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from leapnav.deprecated import deprecated_names
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.continuation import continuation
+from leapnav.experts.minimum_time import MinimumTime, minimum_time
 from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum, shortest_horizon
 from leapnav.experts.problem.certificate import certify, verify
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, SolveError, Status
@@ -27,6 +28,7 @@ __all__ = [
     "ExpertPolicy",
     "Extremal",
     "Iteration",
+    "MinimumTime",
     "NoOptimumError",
     "OptimalControlProblem",
     "Optimum",
@@ -41,6 +43,7 @@ __all__ = [
     "find_optimum",
     "find_reached_optimum",
     "load_demonstrations",
+    "minimum_time",
     "plot_extremal",
     "rollout",
     "shortest_horizon",

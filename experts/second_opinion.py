@@ -106,7 +106,8 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     steered = [_steered(tracks[k], rng) for k in rng.integers(len(tracks), size=N_STEERED)]
     search.add(steered)
     record("driving modes", len(steered))
-    minima = [path for _, path in local_minima(problem, CONTROL_INTERVALS, N_CONTROL_STARTS)]
+    timed = problem.with_horizon(problem.horizon_of(paths[0]))
+    minima = [path for _, path in local_minima(timed, CONTROL_INTERVALS, N_CONTROL_STARTS)]
     search.add(minima)
     record("controls", len(minima))
     if find_spec("casadi") is not None:

@@ -1,5 +1,6 @@
 """Problems with a free horizon: closed forms, consistency with the fixed horizon, certificate, errors."""
 
+import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -9,7 +10,18 @@ import pytest
 import sympy as sp
 from scipy.optimize import brentq, minimize_scalar
 
-from leapnav.experts import ControlAffineSystem, OptimalControlProblem, Trajectory, continuation, solve
+from leapnav.cli import main
+from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
+from leapnav.experts import (
+    ControlAffineSystem,
+    OptimalControlProblem,
+    Trajectory,
+    continuation,
+    find_optimum,
+    minimum_time,
+    shortest_horizon,
+    solve,
+)
 from leapnav.experts.problem.system import unicycle
 from leapnav.experts.solve import METHODS
 
@@ -90,7 +102,7 @@ def swing_up():
     )
 
 
-@pytest.mark.parametrize("problem", [swing_up(), drive((2, 1.5, 1), control_bounds=((-0.8, 0.8), (-1.0, 1.0)))])
+@pytest.mark.parametrize("problem", [swing_up(), drive((2, 1.5, 1), control_bounds=((-0.9, 0.9), (-2.0, 2.0)))])
 def test_the_horizon_minimises_the_cost_of_the_fixed_horizon(problem):
     extremal = solve(problem, "multiple_shooting")
     assert extremal.success
@@ -98,15 +110,19 @@ def test_the_horizon_minimises_the_cost_of_the_fixed_horizon(problem):
     def fixed(horizon):
         return solve(replace(problem, horizon=horizon), "multiple_shooting", guess=extremal)
 
+    def cost(horizon):
+        found = fixed(horizon)
+        return found.cost if found.success else 10 * extremal.cost  # too short for the control bounds
+
     found = minimize_scalar(
-        lambda horizon: fixed(horizon).cost,
+        cost,
         bounds=(0.9 * extremal.horizon, 1.1 * extremal.horizon),
         method="bounded",
         options={"xatol": 1e-6},
     )
     assert extremal.cost == pytest.approx(found.fun, rel=1e-9)
     assert extremal.horizon == pytest.approx(found.x, rel=1e-4)
-    step = 1e-3 * extremal.horizon
+    step = 1e-4 * extremal.horizon
     shorter, same, longer = (fixed(extremal.horizon + change) for change in (-step, 0.0, step))
     # dJ/dT = H, and the derivative of that is the curvature of the certificate.
     assert (longer.cost - shorter.cost) / (2 * step) == pytest.approx(same.hamiltonian.mean(), abs=1e-4)
@@ -160,3 +176,97 @@ def test_a_time_weight_adds_a_constant_to_the_cost_of_a_fixed_horizon():
 def test_invalid_values_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         replace(drive((1, 0, 0)), **changes)
+
+
+def free(scenario, time_weight=TIME_WEIGHT):
+    cost = scenario.cost.model_copy(update={"time_weight": time_weight})
+    return scenario.model_copy(update={"horizon": None, "cost": cost})
+
+
+@pytest.mark.parametrize("family", ["open", "clutter", "polygons", "rooms", "slalom"])
+def test_the_optimum_of_a_scenario_minimises_over_the_horizon(family):
+    for seed in range(4):
+        scenario = free(sample_scenario(family, 31_000 + seed))
+        optimum = find_optimum(scenario)
+        assert optimum.success
+        assert np.abs(optimum.hamiltonian).max() < 1e-8
+        for factor in (0.85, 1.0, 1.15):
+            fixed = find_optimum(scenario.model_copy(update={"horizon": factor * optimum.horizon}))
+            assert not fixed.success or fixed.cost >= optimum.cost * (1 - 1e-9)
+            if factor == 1.0:
+                assert fixed.cost == pytest.approx(optimum.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("robot", ["differential_drive", "car", "dynamic_unicycle"])
+def test_other_robots_have_optima_with_a_free_horizon(robot):
+    for seed in range(3):
+        optimum = find_optimum(free(sample_scenario("clutter", 31_000 + seed, robot=robot)))
+        assert optimum.success
+        assert optimum.certificate.time_curvature > 0
+
+
+def test_a_scenario_with_a_free_horizon_is_read_solved_and_written(tmp_path, capsys):
+    path, out = tmp_path / "free.json", tmp_path / "out.json"
+    scenario = free(sample_scenario("clutter", 31_000))
+    scenario.to_json(path)
+    assert json.loads(path.read_text())["horizon"] is None
+    assert Scenario.from_json(path) == scenario
+    assert main(["solve", str(path), "--json", str(out), "--plot", str(tmp_path / "free.png")]) == 0
+    solution = json.loads(out.read_text())
+    assert f"{solution['horizon']:.6f} s (free)" in capsys.readouterr().out
+    assert solution["horizon"] == pytest.approx(find_optimum(scenario).horizon)
+    assert main(["solve", str(path), "--method", "all"]) == 0
+    assert capsys.readouterr().out.count(f"{solution['cost']:.9g}") >= 3  # single shooting may fail on long paths
+
+
+def test_what_needs_a_fixed_horizon_says_so():
+    scenario = free(sample_scenario("open", 0))
+    with pytest.raises(ScenarioError, match=r"horizon: environments and banks need a number, got None"):
+        NavigateEnv(scenario=scenario).reset(seed=0)
+    with pytest.raises(ScenarioError, match=r"cost\.time_weight: environments and banks need 0, got 0\.5"):
+        NavigateEnv(scenario=scenario.model_copy(update={"horizon": 5.0})).reset(seed=0)
+    with pytest.raises(ScenarioError, match=r"cost\.time_weight: expected a positive number"):
+        free(scenario, 0.0)
+    with pytest.raises(ValueError, match="a free horizon is never too short"):
+        shortest_horizon(scenario)
+
+
+@pytest.mark.parametrize(("distance", "limit"), [(2.0, 1.5), (1.0, 1.0)])
+def test_the_minimum_time_of_the_double_integrator(distance, limit):
+    bounds = ((-limit, limit),)
+    problem = OptimalControlProblem(DOUBLE_INTEGRATOR, (0, 0), (distance, 0), 1.0, (1.0,), control_bounds=bounds)
+    found = minimum_time(problem)
+    shortest = 2 * math.sqrt(distance / limit)
+    assert found.lower_bound <= shortest <= found.horizon * (1 + 1e-9)
+    assert found.horizon == pytest.approx(shortest, rel=1e-5)
+    assert found.switching_times == pytest.approx([shortest / 2], rel=1e-2)
+    assert found.levels.tolist() == [[limit], [-limit]]
+
+
+# Paths of at most four pieces (D. J. Balkcom and M. T. Mason, 2002), found by a search over all words of up to four
+# pieces with full speed ahead or astern, straight or with the full turn rate, for |v| <= 1 and |omega| <= 1.
+@pytest.mark.parametrize(
+    ("goal", "shortest", "pieces"),
+    [
+        ((3, 0, 0), 3.0, 1),
+        ((0, 0, 1.5), 1.5, 1),
+        ((0, 1, 0), 2.636232, 4),
+        ((2, 1, 1), 2.278325, 3),
+        ((-1, 0.5, 3), 3.0, 3),
+        ((1, 0.3, -1), 1.787701, 3),
+    ],
+)
+def test_the_minimum_time_of_a_unicycle(goal, shortest, pieces):
+    problem = replace(drive(goal), control_bounds=((-1, 1), (-1, 1)))
+    found = minimum_time(problem)
+    assert found.horizon == pytest.approx(shortest, rel=1e-4)
+    assert found.lower_bound == pytest.approx(shortest, rel=2e-3)
+    assert found.lower_bound <= found.horizon
+    assert len(found.levels) == pieces == len(found.switching_times) + 1
+
+
+def test_invalid_arguments_of_the_minimum_time_are_named():
+    with pytest.raises(ValueError, match="control_bounds: expected finite numbers, got None"):
+        minimum_time(drive((1, 0, 0)))
+    with pytest.raises(ValueError, match="tol: expected a number below 1, got 2"):
+        minimum_time(replace(drive((1, 0, 0)), control_bounds=((-1, 1), (-1, 1))), tol=2)

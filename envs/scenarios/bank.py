@@ -288,7 +288,7 @@ class ScenarioBank(Sequence[Scenario]):
             cost=float(self.costs[i]),
             second_cost=None if math.isnan(second) else second,
             certificate=(residual, defect, drift, clearance),
-            times=np.linspace(0.0, self[i].horizon, end - start),
+            times=np.linspace(0.0, self[i].fixed_horizon, end - start),
             states=self.states(i),
             controls=self._array("controls")[start:end],
             costates=self._array("costates")[start:end],

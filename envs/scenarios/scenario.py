@@ -169,14 +169,35 @@ class Scenario(Frozen):
         """The state (n,) of the robot at the horizon; None where it is free."""
         return (*self.goal, *(self.robot.goal_motion if self.goal_motion is None else self.goal_motion))
 
+    @property
+    def fixed_horizon(self) -> float:
+        """The horizon (s).
+
+        Raises:
+            ScenarioError: it is free.
+
+        """
+        if self.horizon is None:
+            raise ScenarioError(one_line(self.name, ["horizon: environments and banks need a number, got None"]))
+        return self.horizon
+
     @cached_property
     def task(self) -> np.ndarray:
-        """The packed task, see the constants of this module (read-only)."""
+        """The packed task for the simulation and for banks, see the constants of this module (read-only).
+
+        Raises:
+            ScenarioError: the horizon is free, or the time has a weight.
+
+        """
+        horizon, weight = self.fixed_horizon, self.cost.time_weight
+        if weight:
+            raise ScenarioError(
+                one_line(self.name, [f"cost.time_weight: environments and banks need 0, got {weight:g}"])
+            )
         robot, cost = self.robot, self.cost
         goal = [math.nan if value is None else value for value in self.goal_state]
         controls = (*robot.limits(), *robot.control_weight(cost))
         further = (*self.start_state[3:], *goal[3:], *robot.parameters(cost))
-        horizon = math.inf if self.horizon is None else self.horizon
         task = np.array([*self.start, *goal[:3], horizon, *controls, *further])
         task.flags.writeable = False
         return task
@@ -216,6 +237,8 @@ class Scenario(Frozen):
         fields = self.model_dump(mode="json", exclude_none=True)
         if self.horizon is None:
             fields["horizon"] = None
+        if self.cost.time_weight == 0:
+            del fields["cost"]["time_weight"]
         return fields
 
     @classmethod

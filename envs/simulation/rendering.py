@@ -195,7 +195,7 @@ def _draw_robot(
 
 
 def _draw_status(canvas: pygame.Surface, scene: Scene, top: int) -> None:
-    left = max(scene.scenario.horizon - scene.time, 0.0)
+    left = max(scene.scenario.fixed_horizon - scene.time, 0.0)
     texts = [f"time left {left:.1f} s", f"cost {scene.cost:.2f}"]
     if scene.reference_cost is not None:
         texts.append(f"optimum {scene.reference_cost:.2f}")

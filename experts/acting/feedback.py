@@ -72,7 +72,7 @@ class Feedback:
         problem = problem.with_winding_of(path.states)
         previous, self._arrays = getattr(self, "_arrays", problem.arrays), problem.arrays
         for duration in SEGMENT_DURATIONS:
-            segments = max(1, math.ceil(problem.horizon / duration - 1e-9))
+            segments = max(1, math.ceil(problem.fixed_horizon / duration - 1e-9))
             times, nodes = start_nodes(problem, path, segments)
             found, _, _ = self._newton(times + start_time, nodes, problem.arrays.start, start_time, TOLERANCE)
             if found is not None:
@@ -208,7 +208,7 @@ class Feedback:
     def _remaining_scenario(self, state: np.ndarray, time: float) -> Scenario | None:
         """The rest of the episode as a scenario, None in collision or without time left."""
         x, y, heading, *motion = state.tolist()
-        update: dict[str, Any] = {"start": (x, y, heading), "horizon": float(self.scenario.horizon - time)}
+        update: dict[str, Any] = {"start": (x, y, heading), "horizon": float(self.scenario.fixed_horizon - time)}
         if motion:
             update["start_motion"] = tuple(motion)
         try:

@@ -48,9 +48,9 @@ def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) 
     the period, with which the states that integrate a control have no error. The environment integrates held controls
     exactly, so the error of the resulting path is of second order in the control period.
     """
-    count = max(1, math.ceil(scenario.horizon / control_period - 1e-6))
+    count = max(1, math.ceil(scenario.fixed_horizon / control_period - 1e-6))
     starts = control_period * np.arange(count)
-    ends = np.minimum(starts + control_period, scenario.horizon)
+    ends = np.minimum(starts + control_period, scenario.fixed_horizon)
     middles = (starts + ends) / 2
     controls = extremal.evaluate(middles)[1]
     if scenario.robot.sizes()[0] > 3:  # Simpson's rule
@@ -206,8 +206,8 @@ class ExpertPolicy:
             situations = [replace(s, state=p) for s, p in zip(situations, np.broadcast_to(states, shape), strict=True)]
         times = [s.time for s in situations] if time is None else np.broadcast_to(time, (count,)).tolist()
         for situation, t in zip(situations, times, strict=True):
-            if not 0.0 <= t < situation.scenario.horizon:
-                raise ValueError(f"time: expected a number from 0 to {situation.scenario.horizon:g}, got {t!r}")
+            if not 0.0 <= t < situation.scenario.fixed_horizon:
+                raise ValueError(f"time: expected a number from 0 to {situation.scenario.fixed_horizon:g}, got {t!r}")
 
         def ask(i: int, situation: _Situation) -> tuple[float, np.ndarray]:
             return self._robot(i, situation).feedback.value(situation.state, times[i])
@@ -215,7 +215,7 @@ class ExpertPolicy:
         return self._each(ask, situations)
 
     def _act(self, i: int, situation: _Situation) -> np.ndarray:
-        left = situation.scenario.horizon - situation.time
+        left = situation.scenario.fixed_horizon - situation.time
         if left <= 0.0:  # the episode has ended
             return np.zeros(self._m)
         robot = self._robot(i, situation)

@@ -136,7 +136,9 @@ def draw(number: int, family: str, seed: int, robot: RobotModel | None = None) -
         return {"rejected": np.array(rejection.value)}
     certificate = optimum.certificate
     assert certificate is not None
-    states, controls, costates = (values.astype("<f4") for values in optimum.evaluate(point_times(scenario.horizon)))
+    states, controls, costates = (
+        values.astype("<f4") for values in optimum.evaluate(point_times(scenario.fixed_horizon))
+    )
     return {
         "rejected": np.array(""),
         "scenario": np.frombuffer(scenario.to_json().encode(), dtype="u1"),

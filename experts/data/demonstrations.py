@@ -78,7 +78,7 @@ class Demonstration:
     @property
     def path(self) -> Trajectory:
         """States and costates at the ends of the control periods."""
-        times = np.minimum(CONTROL_PERIOD * np.arange(len(self.states)), self.scenario.horizon)
+        times = np.minimum(CONTROL_PERIOD * np.arange(len(self.states)), self.scenario.fixed_horizon)
         return Trajectory(times, self.states, self.costates)
 
     @property
@@ -93,7 +93,7 @@ def demonstrate(env: gym.Env, scenario: Scenario, extremal: Extremal) -> Demonst
     assert isinstance(inner, NavigateEnv)
     actions = plan_actions(extremal, scenario, inner.control_period)
     driven = _drive(env, scenario, lambda step: (actions[step], actions[step]))
-    times = np.minimum(inner.control_period * np.arange(len(driven["states"])), scenario.horizon)
+    times = np.minimum(inner.control_period * np.arange(len(driven["states"])), scenario.fixed_horizon)
     costates, cost_to_go = extremal.evaluate(times)[2], np.asarray(extremal.cost_to_go(times))
     return Demonstration(scenario=scenario, costates=costates, cost_to_go=cost_to_go, **driven)
 
@@ -128,7 +128,7 @@ def demonstrate_disturbed(
                 cost, costate = feedback.value(state, now)
         costs.append(cost)
         costates.append(costate)
-        ahead = min(inner.control_period, scenario.horizon - inner.time) / 2
+        ahead = min(inner.control_period, scenario.fixed_horizon - inner.time) / 2
         action = np.clip(feedback.control(inner.time + ahead) / limits, -1.0, 1.0).astype(np.float32)
         executed = np.clip(action + noise * rng.standard_normal(len(limits)), -1.0, 1.0).astype(np.float32)
         return action, executed
@@ -181,18 +181,18 @@ def recovery(
         The new scenario and its extremal; None if there is no suitable one.
 
     """
-    time = rng.uniform(0.0, max(scenario.horizon - MIN_RECOVERY_TIME, 0.0))
+    time = rng.uniform(0.0, max(scenario.fixed_horizon - MIN_RECOVERY_TIME, 0.0))
     n = scenario.robot.sizes()[0]
     perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
     state = extremal.evaluate(time)[0] + perturbation
     x, y, heading, *motion = state.tolist()
     if footprint_clearance(x, y, heading, scenario.discs, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
-    update = {"name": name, "start": (x, y, heading), "horizon": float(scenario.horizon - time)}
+    update = {"name": name, "start": (x, y, heading), "horizon": float(scenario.fixed_horizon - time)}
     rest = scenario.model_copy(update={**update, "start_motion": tuple(motion)} if motion else update)
     times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])
     states, _, costates = extremal.evaluate(times + time)
-    times[-1] = rest.horizon
+    times[-1] = rest.fixed_horizon
     states += perturbation * np.exp(-times / PERTURBATION_DECAY)[:, None]
     solution = solve(rest, "multiple_shooting", guess=Trajectory(times, states, costates))
     factor, summand = MAX_RECOVERY_COST

@@ -125,9 +125,10 @@ def evaluate(flow, times, factor, Z, start, end, accuracy, system):
 
 @kernel(float64(FLOW, VECTOR, MATRIX, END_CONDITION, float64))
 def time_curvature(flow, times, Z, end, accuracy):
-    """Return d2J/dT2 for extremals with the same ends, which is the derivative of the Hamiltonian; NaN if undefined.
+    """Return d2J/dT2 for extremals with the same ends, which is the derivative of the Hamiltonian.
 
-    `times` and Z (segments + 1, 2n) are those of an extremal.
+    It is infinite if no extremal with another duration is close, because controls are at their bounds all the time, and
+    NaN if the flow diverged. `times` and Z (segments + 1, 2n) are those of an extremal.
     """
     n = len(end.goal)
     segments = len(times) - 1
@@ -147,7 +148,7 @@ def time_curvature(flow, times, Z, end, accuracy):
         for i in range(2 * n):
             rhs[n + 2 * n * k + i] = -(times[k + 1] - times[k]) / times[segments] * rates[i]
     if not solve_banded(rows, rhs, half):
-        return np.nan
+        return np.inf
     hamiltonian(flow, Z[0], rates)
     curvature = 0.0
     for i in range(n):

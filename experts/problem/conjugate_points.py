@@ -15,7 +15,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.problem.extremal import Extremal
-from leapnav.experts.problem.frames import SENSITIVITY_ACCURACY, carry_back, orthonormalise, pull_back
+from leapnav.experts.problem.frames import MIN_DETERMINANT, SENSITIVITY_ACCURACY, carry_back, orthonormalise, pull_back
 
 # A local minimum of |det| may be a zero of even order if it is below this fraction of the largest value before it ...
 MAX_DIP = 0.3
@@ -85,11 +85,13 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
 def _dips(times: np.ndarray, determinants: np.ndarray, check_parabola: bool) -> list[int]:
     """Return the indices at which |determinant| has a low local minimum.
 
+    A determinant that has only been rounding error so far is that of an extremal whose controls are at their bounds.
     With `check_parabola` the parabola through each minimum and its neighbours must come close to zero as well.
     """
     size = np.abs(determinants)
     before = np.maximum.accumulate(size)[1:-1]
     is_minimum = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < MAX_DIP * before)
+    is_minimum &= before > MIN_DETERMINANT
     found = []
     for i in np.flatnonzero(is_minimum) + 1:
         a, b, c = np.polyfit(times[i - 1 : i + 2] - times[i], size[i - 1 : i + 2], 2)

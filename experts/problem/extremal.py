@@ -273,6 +273,7 @@ class Extremal:
                 "advice": self.status.value,
                 "success": self.success,
                 "cost": self.cost,
+                "horizon": self.horizon,
                 "certificate": self.certificate,
                 "times": self.times.tolist(),
                 "states": self.states.tolist(),

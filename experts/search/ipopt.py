@@ -37,7 +37,8 @@ class Transcription:
         n, m = system.n, system.m
         q, u = casadi.SX.sym("q", n, intervals + 1), casadi.SX.sym("u", m, intervals + 1)
         goal = casadi.SX.sym("goal", n)
-        h = scenario.horizon / intervals
+        horizon = casadi.SX.sym("T") if scenario.horizon is None else casadi.SX(scenario.horizon)
+        h = horizon / intervals
         functions = {name: getattr(casadi, name) for name in FUNCTIONS}
         symbols = (*system.state, *system.parameters)
 
@@ -51,7 +52,7 @@ class Transcription:
                 for i, a in enumerate(system.drift)
             )
         )
-        running = evaluate(sp.sympify(problem.state_cost))
+        running = evaluate(sp.sympify(problem.state_cost)) + problem.time_weight
         for j, weight in enumerate(problem.control_weight):
             running += weight * u[j, :] ** 2 / 2
         for offset, radius in scenario.discs.tolist():
@@ -62,8 +63,9 @@ class Transcription:
         constraints = casadi.vertcat(
             casadi.vec(steps), q[:, 0] - np.array(problem.start), *(q[i, -1] - goal[i] for i in fixed)
         )
+        unknown = [horizon] if scenario.horizon is None else []
         program = {
-            "x": casadi.vertcat(casadi.vec(q), casadi.vec(u)),
+            "x": casadi.vertcat(casadi.vec(q), casadi.vec(u), *unknown),
             "p": goal,
             "f": h * (casadi.sum2(running) - (running[0] + running[-1]) / 2),
             "g": constraints,
@@ -75,7 +77,8 @@ class Transcription:
         self._solver: Any = casadi.nlpsol("solver", "ipopt", program, options)
         self._count = constraints.shape[0]
         limits = scenario.robot.limits()
-        self._limits = np.concatenate([np.full(n * (intervals + 1), np.inf), np.tile(limits, intervals + 1)])
+        upper = np.concatenate([np.full(n * (intervals + 1), np.inf), np.tile(limits, intervals + 1)])
+        self._bounds = np.append(-upper, 0.0 if unknown else []), np.append(upper, np.inf if unknown else [])
 
     def solve(self, problem: OptimalControlProblem, path: Trajectory) -> Trajectory | None:
         """Solve from an initial guess.
@@ -88,16 +91,20 @@ class Transcription:
             A local optimum, None if IPOPT does not converge.
 
         """
-        times = np.linspace(0.0, problem.horizon, self._intervals + 1)
+        horizon = problem.horizon_of(path)
+        times = np.linspace(0.0, horizon, self._intervals + 1)
         states = path.resample(times).states
         controls = follow_controls(problem, states, np.gradient(states, times, axis=0))
-        guess = np.concatenate([states.ravel(), controls.ravel()])
+        guess = np.concatenate([states.ravel(), controls.ravel(), [horizon] if problem.horizon is None else []])
         zero = np.zeros(self._count)
         goal = problem.arrays.goal
-        found = self._solver(x0=guess, p=goal, lbx=-self._limits, ubx=self._limits, lbg=zero, ubg=zero)
+        found = self._solver(x0=guess, p=goal, lbx=self._bounds[0], ubx=self._bounds[1], lbg=zero, ubg=zero)
         if not self._solver.stats()["success"]:
             return None
-        return Trajectory(times, np.array(found["x"]).ravel()[: states.size].reshape(states.shape))
+        values = np.array(found["x"]).ravel()
+        if problem.horizon is None:
+            times *= values[-1] / horizon
+        return Trajectory(times, values[: states.size].reshape(states.shape))
 
 
 def _proximity(scenario: Scenario, x: Any, y: Any, radius: float) -> Any:

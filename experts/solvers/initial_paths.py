@@ -72,24 +72,27 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
     """Estimate the optimal horizon (s) of a problem with a free horizon.
 
     The best local minimum in a fixed time gives the derivative of its cost by the horizon, which is the Hamiltonian.
-    The next horizon minimises a cost of the form a / T + b T with this value and derivative.
+    The next horizon minimises a cost of the form a / T + b T with this value and derivative. If no path to the goal is
+    found, the horizon is too short, because of control bounds.
     """
-    horizon = FIRST_HORIZON
+    horizon, too_short, reachable = FIRST_HORIZON, 0.0, math.inf
     for _ in range(MAX_HORIZON_STEPS):
         minima = local_minima(problem.with_horizon(horizon), starts=HORIZON_STARTS, seed=seed)
         if not minima:
-            horizon /= MIN_HORIZON_FACTOR
+            too_short = horizon
+            horizon = math.sqrt(too_short * reachable) if reachable < math.inf else horizon / MIN_HORIZON_FACTOR
             continue
+        reachable = horizon
         cost, path = min(minima, key=lambda entry: entry[0])
         assert path.costates is not None  # `local_minima` computes them
         z = np.concatenate([path.states[0], path.costates[0]])
         slope = horizon * hamiltonian(problem.arrays.flow, z, np.empty_like(z))
         ratio = (cost - slope) / (cost + slope) if cost > abs(slope) else math.copysign(math.inf, -slope)
         factor = math.sqrt(min(max(ratio, MIN_HORIZON_FACTOR**2), MIN_HORIZON_FACTOR**-2))
-        horizon *= factor
-        if abs(factor - 1.0) < HORIZON_TOLERANCE:
+        horizon = max(factor * horizon, math.sqrt(too_short * reachable))
+        if abs(horizon / reachable - 1.0) < HORIZON_TOLERANCE:
             break
-    return horizon
+    return reachable if reachable < math.inf else horizon
 
 
 def _windings(problem: OptimalControlProblem) -> Iterator[OptimalControlProblem]:

@@ -94,7 +94,12 @@ class Show:
             plot_bank(bank, plot, self.count)
             print(f"wrote {plot}")
         rows = [
-            {"name": scenario.name, "cost": float(cost), "horizon": scenario.horizon, "clearance": float(clearance)}
+            {
+                "name": scenario.name,
+                "cost": float(cost),
+                "horizon": scenario.fixed_horizon,
+                "clearance": float(clearance),
+            }
             for scenario, cost, clearance in zip(bank, bank.costs, bank.certificates[:, 3], strict=True)
         ]
         code = self._verify(bank, rows) if self.verify else 0
@@ -156,7 +161,7 @@ def _print_summary(bank: ScenarioBank) -> None:
     from rich.table import Table
 
     residual, defect, drift, _ = bank.certificates.max(axis=0)
-    horizons = np.array([scenario.horizon for scenario in bank])
+    horizons = np.array([scenario.fixed_horizon for scenario in bank])
     excess = bank.second_costs / bank.costs - 1
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}, seed {bank.seed}, leapnav {bank.software}")
     print("  checksums          verified")

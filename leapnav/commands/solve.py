@@ -53,6 +53,8 @@ class Solve:
         if certificate is not None:
             conjugate = certificate.conjugate_point
             print(f"  cost               {extremal.cost:.9f}")
+            if scenario.horizon is None:
+                print(f"  horizon            {extremal.horizon:.6f} s (free)")
             print(f"  residual           {certificate.residual:.1e}")
             print(f"  defect             {certificate.defect:.1e}")
             print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")

@@ -63,15 +63,17 @@ def replay_actions(scenario: Scenario, actions: Any) -> dict[str, Any]:
     from leapnav.envs.navigation import NavigateEnv
 
     check_horizon(scenario)
-    array = check_actions(actions, math.ceil(scenario.horizon / CONTROL_PERIOD - 1e-9))
+    array = check_actions(actions, math.ceil(scenario.fixed_horizon / CONTROL_PERIOD - 1e-9))
     env = NavigateEnv(scenario=scenario, observation="state", control_period=CONTROL_PERIOD)
     return {"policy": "you", **_play(scenario, env, replay(array))}
 
 
 def check_horizon(scenario: Scenario) -> None:
     """Raise ValueError if the horizon is too long for an episode on the page."""
-    if scenario.horizon > MAX_DRIVE_HORIZON:
-        raise ValueError(f"horizon: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {scenario.horizon:g}")
+    if scenario.fixed_horizon > MAX_DRIVE_HORIZON:
+        raise ValueError(
+            f"horizon: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {scenario.fixed_horizon:g}"
+        )
 
 
 def check_actions(actions: Any, max_count: int) -> np.ndarray:

@@ -277,7 +277,7 @@ class _Episode:
 
 def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> list[Scenario]:
     """Return scenarios for the rest of an episode, each from a takeover, with decreasing horizons."""
-    end, horizon = len(episode.states) * period, episode.scenario.horizon
+    end, horizon = len(episode.states) * period, episode.scenario.fixed_horizon
     if episode.success:
         times = rng.uniform(0.0, end, 1)
     elif episode.collision:

@@ -65,7 +65,7 @@ class JumpStart(VecEnvWrapper):
         bank = self._banks[self._rng.integers(len(self._banks))]
         index = int(self._rng.integers(len(bank)))
         scenario, reference = bank[index], bank.reference(index)
-        latest = max(0.0, 1.0 - MIN_REMAINING_TIME / scenario.horizon)
+        latest = max(0.0, 1.0 - MIN_REMAINING_TIME / scenario.fixed_horizon)
         fraction = min(self._rng.uniform(0.0, self.max_fraction), latest)
         k = int(fraction * (len(reference.times) - 1))
         if k == 0:
@@ -73,7 +73,7 @@ class JumpStart(VecEnvWrapper):
         return scenario.model_copy(
             update={
                 "start": tuple(reference.states[k].astype(float).tolist()),
-                "horizon": float(scenario.horizon - reference.times[k]),
+                "horizon": float(scenario.fixed_horizon - reference.times[k]),
             }
         )
 
