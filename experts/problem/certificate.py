@@ -22,7 +22,7 @@ UNCONVERGED_ACCURACY = 1e-9
 # Initial size of the table of integration steps; it grows by a factor of 4 when it is full.
 MIN_ROWS, ROWS_PER_SEGMENT = 512, 24
 # Nodes between which the derivative of the Hamiltonian by the horizon is computed, and the integrator's tolerance.
-MAX_CURVATURE_NODES, CURVATURE_ACCURACY = 65, 1e-8
+MAX_CURVATURE_NODES, CURVATURE_ACCURACY = 33, 1e-5
 MAX_ROWS = 100_000  # integration steps; an extremal that needs more has diverged
 
 CERTIFICATE_KERNELS = (trace, dense_clearance, propagate, orthonormalise)

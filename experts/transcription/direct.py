@@ -29,6 +29,7 @@ INTERVALS_PER_STEP = 2.0  # intervals per step of a lattice path (0.2 to 0.45 m)
 MIN_INTERVALS, MAX_INTERVALS = 32, 1024
 MAX_ITERATIONS = 40
 MIN_GRAM = 1e-9  # keeps B'B regular where the fields are linearly dependent
+HAMILTONIAN_POINTS = 9  # of a path, along which the Hamiltonian is almost constant
 MIN_TIME_FACTOR = 0.8  # smallest factor by which a free horizon changes at once
 STEP_TOLERANCE = 1e-3  # m and rad, less on short paths; the iteration has converged when a full step is smaller
 
@@ -74,8 +75,9 @@ class DirectPath:
         """
         arrays, rates = problem.arrays, np.empty(2 * problem.system.n)
         z = np.concatenate([self.states, self.costates], axis=1)
-        values = np.array([hamiltonian(arrays.flow, row, rates) for row in z])
-        slope = float(np.trapezoid(values, self.times))
+        at = np.unique(np.linspace(0, len(z) - 1, HAMILTONIAN_POINTS).astype(int))
+        values = np.array([hamiltonian(arrays.flow, row, rates) for row in z[at]])
+        slope = float(np.trapezoid(values, self.times[at]))
         ratio = (self.cost - slope) / (self.cost + slope) if self.cost > abs(slope) else math.copysign(math.inf, -slope)
         factor = math.sqrt(min(max(ratio, MIN_TIME_FACTOR**2), MIN_TIME_FACTOR**-2))
         controls, costates = self.controls / factor, self.costates / factor
