@@ -25,7 +25,7 @@ from leapnav.experts.solvers.initial_paths import initial_paths
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 MAX_PATHS = 4  # local optima that are followed
-METHODS: tuple[Method, ...] = ("multiple_shooting", "leapfrog", "collocation", "single_shooting")  # in this order
+METHODS: tuple[Method, ...] = ("multiple_shooting", "collocation")  # in this order; the others fail where these do
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
 
