@@ -126,7 +126,8 @@ def plot_extremal(
     _draw_over_time(panels, extremal, "time (s)" if scenario is not None else "time")
     if title is None:
         name = "" if scenario is None else f"{scenario.name}: "
-        title = f"{name}J = {extremal.cost:.7g}, {extremal.status.name}"
+        free = "" if extremal.problem.horizon is not None else f"T = {extremal.horizon:.5g} s (free), "
+        title = f"{name}J = {extremal.cost:.7g}, {free}{extremal.status.name}"
     figure.suptitle(title)
     if path is not None:
         figure.savefig(path, dpi=150)
