@@ -101,7 +101,7 @@ def test_an_infeasible_problem_does_not_converge():
     controls, costates = np.full((32, 2), [2.0, 0.0]), np.zeros((33, 3))
     problem = DiscreteProblem(
         h=np.full(32, 1 / 32),
-        end=EndCondition(goal=np.array([5.0, 5.0, 0.0]), free=np.zeros(3, bool)),
+        end=EndCondition(goal=np.array([5.0, 5.0, 0.0]), free=np.zeros(3, bool), free_time=False),
         turn_weight=0.5,
         unit=1.0,
         limits=limits,

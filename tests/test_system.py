@@ -91,7 +91,7 @@ def test_a_wrong_declaration_is_named(arguments, message):
         ({"start": (0,)}, "start: expected 2 numbers, got 1"),
         ({"start": (0, None)}, "start: expected finite"),
         ({"goal": (0, float("nan"))}, "goal: expected finite"),
-        ({"horizon": 0.0}, "horizon: expected a positive number, got 0.0"),
+        ({"horizon": 0.0}, "horizon: expected a positive number, or None for a free horizon, got 0.0"),
         ({"control_weight": (-1,)}, "control_weight: .*-1"),
         ({"control_bounds": ((1, 0),)}, r"control_bounds: .*\(1, 0\)"),
         ({"control_bounds": ()}, "control_bounds: expected 1 pairs"),
