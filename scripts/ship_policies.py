@@ -27,7 +27,7 @@ def ship(name: str, runs: Path) -> None:
     config = DAggerRunConfig.tuned(family, out=run)
     if robot:
         # Their actions are rates of what the unicycle controls directly; the fit needs more weights and epochs.
-        dagger = replace(config.dagger, rounds=10, last_epochs=12)
+        dagger = replace(config.dagger, rounds=12, last_epochs=12)
         config = replace(config, robot=cast(RobotName, robot), hidden=(400, 400, 400), dagger=dagger)
     train_dagger(replace(config, resume=(run / "config.json").exists()), workers=os.cpu_count() or 1)
     shipped = SHIPPED / name
