@@ -1,9 +1,9 @@
 """Minimum time: the limit of small control weights, with bounded controls.
 
-With the time weight 1 and the control weights r / u_max^2 the cost is the time plus at most r m / 2 per second, so that
-the optimum for r takes at most 1 + r m / 2 times the minimum time. The controls are saturated except during transitions
-whose duration decreases with r, and on singular arcs (A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975,
-sections 3.9 and 8.3).
+With the time weight 1 and the control weights r / u_max^2 the cost is the time plus a control cost of at most r m / 2
+per second, so that the optimum for r takes at most 1 + r m / 2 times the minimum time. The controls are saturated
+except during transitions whose duration decreases with r, and on singular arcs (A. E. Bryson and Y.-C. Ho, Applied
+Optimal Control, 1975, sections 3.9 and 8.3).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,10 +37,11 @@ class MinimumTime:
 
     Attributes:
         extremal: the extremal for the smallest control weights.
-        horizon: its duration (s), an upper bound of the minimum time. It exceeds the minimum by more than the tolerance
-            if the continuation stopped early, because no method solved a problem with smaller weights.
-        lower_bound: a lower bound of the minimum time (s), if the extremal is the global optimum for its control
-            weights; NaN with a state cost or obstacles, for which no such bound is known.
+        horizon: its duration (s), an upper bound of the minimum time.
+        tolerance: the duration exceeds the minimum by at most this fraction, if the extremal is the global optimum for
+            its control weights. It is larger than the requested one if no method solved a problem with smaller weights.
+        lower_bound: a lower bound of the minimum time (s) under the same condition; NaN with a state cost or obstacles,
+            for which no such bound is known.
         switching_times: (S,), times (s) at which a control changes between its lower bound, 0 and its upper bound.
         levels: (S + 1, m), the controls between these times: the bound that is closest, or 0.
 
@@ -47,6 +49,7 @@ class MinimumTime:
 
     extremal: Extremal
     horizon: float
+    tolerance: float
     lower_bound: float
     switching_times: np.ndarray
     levels: np.ndarray
@@ -60,7 +63,8 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
 
     Args:
         task: a problem with control bounds, or a scenario.
-        tol: the duration exceeds the minimum time by at most this fraction, in (0, 1).
+        tol: the control weights decrease until the duration exceeds the minimum time by at most this fraction, in
+            (0, 1). `MinimumTime.tolerance` is the fraction that was reached.
 
     Returns:
         The path, and when its controls switch.
@@ -80,15 +84,27 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
         raise ValueError(f"control_bounds: expected finite numbers, got {problem.control_bounds!r}")
     weights = list(_weights(tol, len(bounds)))
     problems = [_with_weight(problem, bounds, weight) for weight in weights]
-    starts = _first(task, problems[0])
-    found = [_follow(problems, start) for start in starts if start.success]
-    ends = [(path[-1], weights[len(path) - 1]) for path in found if path]
+    followed = [_follow(start, problems) for start in _first(task, problems[0])]
+    ends = [end for end in followed if end.solved]
     if not ends:
-        raise SolveError(starts[0], task.name if isinstance(task, Scenario) else "")
-    best, weight = min(ends, key=lambda end: end[0].cost)
+        raise SolveError(followed[0].extremal, task.name if isinstance(task, Scenario) else "")
     has_state_cost = problem.field is not None or problem.state_cost != 0
-    lower_bound = np.nan if has_state_cost else best.cost / (1.0 + 0.5 * len(bounds) * weight)
-    return MinimumTime(best, best.horizon, lower_bound, *switching_structure(best, bounds))
+    if has_state_cost:  # the durations alone do not rank the paths, and costs need the same weights
+        solved = max(end.solved for end in ends)
+        best = min((end for end in ends if end.solved == solved), key=lambda end: end.extremal.cost)
+    else:
+        best = min(ends, key=lambda end: end.extremal.horizon)
+    tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
+    lower_bound = np.nan if has_state_cost else best.extremal.cost / (1.0 + tolerance)
+    structure = switching_structure(best.extremal, bounds)
+    return MinimumTime(best.extremal, best.extremal.horizon, tolerance, lower_bound, *structure)
+
+
+class _End(NamedTuple):
+    """The end of a continuation: the extremal of the last of the `solved` problems, or the failure of the first."""
+
+    extremal: Extremal
+    solved: int
 
 
 def _weights(tol: float, m: int) -> Iterator[float]:
@@ -107,7 +123,7 @@ def _with_weight(problem: OptimalControlProblem, bounds: np.ndarray, weight: flo
 
 
 def _first(task: OptimalControlProblem | Scenario, problem: OptimalControlProblem) -> Sequence[Extremal]:
-    """Return the extremals of the first problem that are followed; a failure if there are none."""
+    """Return the extremals from which the continuations start, or a failure; those of a scenario have its weights."""
     if not isinstance(task, Scenario):
         starts = islice(initial_paths(problem), MAX_PATHS)
         found = [solve(wound, "multiple_shooting", guess=path) for wound, path in starts]
@@ -117,17 +133,22 @@ def _first(task: OptimalControlProblem | Scenario, problem: OptimalControlProble
     return [optimum, *optimum.alternatives][:MAX_PATHS]
 
 
-def _follow(problems: Sequence[OptimalControlProblem], start: Extremal) -> list[Extremal]:
-    """Return the extremals of the problems up to the first failure of all methods, with the winding of the first."""
+def _follow(start: Extremal, problems: Sequence[OptimalControlProblem]) -> _End:
+    """Solve the problems one after the other, up to the first that no method solves, with the winding of the start."""
+    if not start.success:
+        return _End(start, 0)
     remaining = [replace(problem, goal=start.problem.goal) for problem in problems]
-    path: list[Extremal] = []
+    extremal, failed = start, start
     for method in METHODS:
-        solved = continuation(remaining, method, guess=path[-1] if path else start)
-        path += [extremal for extremal in solved if extremal.success]
-        remaining = remaining[sum(extremal.success for extremal in solved) :]
+        # The problem of the guess is the first of the sequence, so that the step control applies to the second.
+        _, *found = continuation([extremal.problem, *remaining], method, guess=extremal)
+        solved = [one for one in found if one.success]
+        extremal, failed = (solved or [extremal])[-1], (found or [start])[-1]
+        remaining = remaining[len(solved) :]
         if not remaining:
             break
-    return path
+    count = len(problems) - len(remaining)
+    return _End(extremal if count else failed, count)
 
 
 def switching_structure(extremal: Extremal, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,10 +163,14 @@ def switching_structure(extremal: Extremal, bounds: np.ndarray) -> tuple[np.ndar
     controls = extremal.evaluate(times)[1]
     levels = np.stack([bounds[:, 0], np.clip(0.0, bounds[:, 0], bounds[:, 1]), bounds[:, 1]], axis=1)
     nearest = np.abs(controls[:, :, None] - levels[None]).argmin(axis=2)
-    starts = np.append(0, np.flatnonzero((np.diff(nearest, axis=0) != 0).any(axis=1)) + 1)
-    lengths = np.diff(np.append(starts, POINTS))
-    starts = starts[lengths >= MIN_PIECE * POINTS]
-    kept = nearest[starts + np.minimum(lengths[lengths >= MIN_PIECE * POINTS] // 2, POINTS - 1 - starts)]
-    changed = np.append(True, (np.diff(kept, axis=0) != 0).any(axis=1))
-    starts, kept = starts[changed], kept[changed]
-    return times[starts[1:]], np.take_along_axis(levels[None], kept[:, :, None], axis=2)[:, :, 0]
+    first = np.append(0, np.flatnonzero((np.diff(nearest, axis=0) != 0).any(axis=1)) + 1)
+    last = np.append(first[1:], POINTS) - 1
+    lengths = last - first + 1
+    long = lengths >= min(MIN_PIECE * POINTS, lengths.max())
+    first, last = first[long], last[long]
+    # Pieces on both sides of a transition may be the same.
+    starts = np.append(True, (nearest[first[1:]] != nearest[first[:-1]]).any(axis=1))
+    ends = np.append(starts[1:], True)
+    switching_times = 0.5 * (times[last[ends][:-1]] + times[first[starts][1:]])
+    chosen = nearest[first[starts]]
+    return switching_times, np.take_along_axis(levels[None], chosen[:, :, None], axis=2)[:, :, 0]

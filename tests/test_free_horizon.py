@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 from dataclasses import replace
 from itertools import pairwise
 
@@ -23,6 +24,7 @@ from leapnav.experts import (
     solve,
 )
 from leapnav.experts.problem.system import unicycle
+from leapnav.experts.second_opinion import second_opinion
 from leapnav.experts.solve import METHODS
 
 TIME_WEIGHT, SPEED_WEIGHT, TURN_WEIGHT = 0.5, 1.0, 0.3
@@ -77,7 +79,8 @@ def test_cost_and_horizon_are_those_of_the_closed_form(name, method):
     assert extremal.cost == pytest.approx(cost, rel=1e-10)
     assert extremal.horizon == pytest.approx(horizon, rel=1e-8)
     assert np.abs(extremal.hamiltonian).max() < 1e-8
-    assert extremal.certificate.time_curvature > 0
+    if name == "double integrator":
+        assert extremal.certificate.time_curvature == pytest.approx(72 * 0.7 * 2.0**2 / horizon**5, rel=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -168,7 +171,10 @@ def test_a_time_weight_adds_a_constant_to_the_cost_of_a_fixed_horizon():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"time_weight": 0.0}, "time_weight: expected a positive number with a free horizon, got 0"),
+        (
+            {"time_weight": 0.0},
+            "time_weight: expected a positive number, since the horizon is free and there is no state cost, got 0",
+        ),
         ({"time_weight": -1.0}, "time_weight: expected a number of at least 0, got -1.0"),
         ({"horizon": math.nan}, "horizon: expected a positive number, or None for a free horizon, got nan"),
     ],
@@ -197,12 +203,52 @@ def test_the_optimum_of_a_scenario_minimises_over_the_horizon(family):
                 assert fixed.cost == pytest.approx(optimum.cost, rel=1e-6)
 
 
-@pytest.mark.parametrize("robot", ["differential_drive", "car", "dynamic_unicycle"])
-def test_other_robots_have_optima_with_a_free_horizon(robot):
-    for seed in range(3):
-        optimum = find_optimum(free(sample_scenario("clutter", 31_000 + seed, robot=robot)))
+# With the large time weights the robots drive at their speed limits most of the time.
+@pytest.mark.parametrize(
+    ("robot", "time_weight"),
+    [("unicycle", 5.0), ("differential_drive", 0.5), ("car", 0.5), ("car", 3.0), ("dynamic_unicycle", 5.0)],
+)
+def test_no_fixed_horizon_close_to_the_optimum_costs_less(robot, time_weight):
+    for seed in (41_007, 41_009):
+        scenario = free(sample_scenario("clutter", seed, robot=robot), time_weight)
+        optimum = find_optimum(scenario)
         assert optimum.success
-        assert optimum.certificate.time_curvature > 0
+        for factor in (0.95, 1.0, 1.05):
+            fixed = find_optimum(scenario.model_copy(update={"horizon": factor * optimum.horizon}))
+            assert not fixed.success or fixed.cost >= optimum.cost * (1 - 1e-6)
+
+
+def test_a_second_opinion_finds_nothing_cheaper():
+    assert second_opinion(free(sample_scenario("clutter", 31_001))).improvement < 1e-6
+
+
+def test_a_horizon_that_hardly_matters_is_not_certified():
+    # x' = u with Phi = x^2 / 2 from 1 to 0: J = coth(T) / 2 decreases for ever.
+    integrator = ControlAffineSystem((X,), (0,), ((1,),))
+    problem = OptimalControlProblem(integrator, (1,), (0,), None, (1.0,), state_cost=X**2 / 2)
+    extremal = solve(problem, "multiple_shooting", guess=solve(replace(problem, horizon=14.0)))
+    assert not extremal.success
+    assert extremal.certificate is None or extremal.certificate.horizon_error > 1e-4
+
+
+def test_controls_at_their_bounds_all_the_time_leave_no_other_duration_close_by():
+    extremal = solve(drive((3, 0, 0), control_bounds=((-0.5, 0.5), (-1, 1))))
+    assert extremal.success
+    assert extremal.certificate.time_curvature == math.inf
+    assert extremal.horizon == pytest.approx(6.0, rel=1e-9)
+
+
+def test_a_problem_with_a_free_horizon_survives_pickling():
+    problem = drive((2, 1, 1))
+    problem.arrays  # noqa: B018 (compiled functions are not pickled)
+    assert solve(pickle.loads(pickle.dumps(problem))).cost == solve(problem).cost
+
+
+def test_continuation_introduces_a_time_weight():
+    plain = replace(drive((2, 1, 1), 3.0), time_weight=0.0)
+    extremals = continuation([plain, drive((2, 1, 1), 3.0)])
+    assert [extremal.success for extremal in extremals] == [True, True]
+    assert extremals[1].cost == pytest.approx(extremals[0].cost + 3.0 * TIME_WEIGHT, rel=1e-9)
 
 
 def test_a_scenario_with_a_free_horizon_is_read_solved_and_written(tmp_path, capsys):
@@ -219,7 +265,7 @@ def test_a_scenario_with_a_free_horizon_is_read_solved_and_written(tmp_path, cap
     assert capsys.readouterr().out.count(f"{solution['cost']:.9g}") >= 3  # single shooting may fail on long paths
 
 
-def test_what_needs_a_fixed_horizon_says_so():
+def test_what_needs_a_fixed_horizon_says_so(tmp_path, capsys):
     scenario = free(sample_scenario("open", 0))
     with pytest.raises(ScenarioError, match=r"horizon: environments and banks need a number, got None"):
         NavigateEnv(scenario=scenario).reset(seed=0)
@@ -229,6 +275,10 @@ def test_what_needs_a_fixed_horizon_says_so():
         free(scenario, 0.0)
     with pytest.raises(ValueError, match="a free horizon is never too short"):
         shortest_horizon(scenario)
+    path = tmp_path / "free.json"
+    scenario.to_json(path)
+    assert main(["play", "--scenario", str(path), "--no-browser"]) != 0
+    assert "horizon: environments and banks need a number, got None" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("distance", "limit"), [(2.0, 1.5), (1.0, 1.0)])
@@ -263,6 +313,31 @@ def test_the_minimum_time_of_a_unicycle(goal, shortest, pieces):
     assert found.lower_bound == pytest.approx(shortest, rel=2e-3)
     assert found.lower_bound <= found.horizon
     assert len(found.levels) == pieces == len(found.switching_times) + 1
+
+
+@pytest.mark.parametrize("scenario", [sample_scenario("open", 5), sample_scenario("open", 3, robot="car")])
+def test_the_minimum_time_of_a_scenario(scenario):
+    found = minimum_time(scenario)
+    assert found.extremal.success
+    assert found.tolerance <= 2e-2
+    assert math.isnan(found.lower_bound)
+    assert find_optimum(free(scenario)).horizon > found.horizon
+    controls = np.abs(found.extremal.evaluate(np.linspace(0, found.horizon, 101))[1])
+    assert np.median(controls.max(axis=0) - np.array(scenario.robot.limits())) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_weights_of_a_scenario_do_not_matter_to_its_minimum_time():
+    heavy = sample_scenario("open", 5)
+    heavy = heavy.model_copy(update={"cost": heavy.cost.model_copy(update={"speed_weight": 100, "turn_weight": 50})})
+    assert minimum_time(heavy).horizon == pytest.approx(minimum_time(sample_scenario("open", 5)).horizon, rel=1e-2)
+
+
+def test_a_tolerance_that_is_not_reached_is_stated():
+    jerk = sp.symbols("a")
+    system = ControlAffineSystem((X, V, jerk), (V, jerk, 0), ((0, 0, 1),))
+    found = minimum_time(OptimalControlProblem(system, (0, 0, 0), (1, 0, 0), 1.0, (1.0,), control_bounds=((-1, 1),)))
+    shortest = 32 ** (1 / 3)
+    assert found.lower_bound <= shortest <= found.horizon <= shortest * (1 + found.tolerance)
 
 
 def test_invalid_arguments_of_the_minimum_time_are_named():

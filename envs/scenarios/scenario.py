@@ -169,6 +169,19 @@ class Scenario(Frozen):
         """The state (n,) of the robot at the horizon; None where it is free."""
         return (*self.goal, *(self.robot.goal_motion if self.goal_motion is None else self.goal_motion))
 
+    def check_horizon(self) -> None:
+        """Check that environments and banks support the horizon.
+
+        Raises:
+            ScenarioError: it is free, or the time has a weight.
+
+        """
+        weight = self.cost.time_weight
+        if self.fixed_horizon and weight:
+            raise ScenarioError(
+                one_line(self.name, [f"cost.time_weight: environments and banks need 0, got {weight:g}"])
+            )
+
     @property
     def fixed_horizon(self) -> float:
         """The horizon (s).
@@ -189,16 +202,12 @@ class Scenario(Frozen):
             ScenarioError: the horizon is free, or the time has a weight.
 
         """
-        horizon, weight = self.fixed_horizon, self.cost.time_weight
-        if weight:
-            raise ScenarioError(
-                one_line(self.name, [f"cost.time_weight: environments and banks need 0, got {weight:g}"])
-            )
+        self.check_horizon()
         robot, cost = self.robot, self.cost
         goal = [math.nan if value is None else value for value in self.goal_state]
         controls = (*robot.limits(), *robot.control_weight(cost))
         further = (*self.start_state[3:], *goal[3:], *robot.parameters(cost))
-        task = np.array([*self.start, *goal[:3], horizon, *controls, *further])
+        task = np.array([*self.start, *goal[:3], self.fixed_horizon, *controls, *further])
         task.flags.writeable = False
         return task
 
@@ -286,7 +295,7 @@ class Scenario(Frozen):
         *,
         start: tuple[float, float, float],
         goal: tuple[float, float, float | None],
-        horizon: float,
+        horizon: float | None,
         arena: tuple[float, float, float, float] | None = None,
         **fields: Any,
     ) -> Scenario:
@@ -315,7 +324,7 @@ class Scenario(Frozen):
         *,
         start: tuple[float, float, float],
         goal: tuple[float, float, float | None],
-        horizon: float,
+        horizon: float | None,
         cell_size: float = 1.0,
         **fields: Any,
     ) -> Scenario:

@@ -54,7 +54,7 @@ SYSTEM = record_type(NewtonSystem, rows=MATRIX, rhs=VECTOR, costs=VECTOR, hints=
 
 
 @kernel(tuple_of(float64, float64, int64)(FLOW, VECTOR, float64, MATRIX, VECTOR, END_CONDITION, float64, SYSTEM))
-def evaluate(flow, times, factor, Z, start, end, accuracy, system):
+def linearise(flow, times, factor, Z, start, end, accuracy, system):
     """Evaluate the Newton system at Z; return (norm^2, largest residual, evaluations), infinite if the flow diverged.
 
     All times are multiplied by `factor`. The rows are n start conditions, 2n continuity conditions per segment, and n
@@ -137,7 +137,7 @@ def time_curvature(flow, times, Z, end, accuracy):
     rows, rhs = np.empty((unknowns, 3 * half + 1)), np.empty(unknowns)
     system = NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
     fixed = EndCondition(end.goal, end.free, False)
-    norm, _, _ = evaluate(flow, times, 1.0, Z, Z[0, :n].copy(), fixed, accuracy, system)
+    norm, _, _ = linearise(flow, times, 1.0, Z, Z[0, :n].copy(), fixed, accuracy, system)
     if norm == np.inf:
         return np.nan
     rates = np.empty(2 * n)

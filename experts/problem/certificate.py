@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -96,11 +97,13 @@ def certify(
         places = np.array([*map(system.state.index, problem.system.position), heading])
         clearance = float(dense_clearance(problem.field, problem.discs, places, extremal.times, z, terms))
     residual = float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max()))
-    curvature = None
+    curvature, horizon_error = None, None
     if problem.horizon is None:
-        residual = max(residual, float(np.abs(hamiltonian).max()))
+        largest = float(np.abs(hamiltonian).max())
+        residual = max(residual, largest)
         at = np.unique(np.linspace(0, n_rows - 1, min(n_rows, MAX_CURVATURE_NODES)).astype(int))
         curvature = time_curvature(arrays.flow, extremal.times[at], z[at], arrays.end, CURVATURE_ACCURACY)
+        horizon_error = largest / (curvature * extremal.horizon) if curvature > 0 else math.inf
     certificate = Certificate(
         residual=residual,
         defect=float(defect),
@@ -108,6 +111,7 @@ def certify(
         conjugate_point=conjugate_point,
         clearance=clearance,
         time_curvature=curvature,
+        horizon_error=horizon_error,
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     return replace(extremal, certificate=certificate, status=status)

@@ -60,8 +60,8 @@ class Certificate:
     """Evidence that a path is a local minimum, from re-integration that is independent of the solver.
 
     Attributes:
-        residual: largest violation of the boundary conditions, transversality conditions included; with a free horizon
-            these are completed by H = 0.
+        residual: largest violation of the boundary conditions, transversality conditions included, and with a free
+            horizon also H = 0.
         defect: largest difference between a node and the extremal flow from the node before it, integrated at 1e-12.
         hamiltonian_drift: largest minus smallest Hamiltonian. The Hamiltonian is constant along an extremal.
         conjugate_point: time (s) of a conjugate point before the horizon, at which dq(t)/dlambda(0) loses rank; with
@@ -69,7 +69,10 @@ class Certificate:
         clearance: smallest clearance (m) to an obstacle or a wall along the interpolated path; None without obstacles.
         time_curvature: with a free horizon, d2J/dT2 for extremals with the same ends, positive at a minimum over T;
             None with a fixed horizon.
+        horizon_error: with a free horizon, |H| / (T d2J/dT2), the relative error of the horizon to first order; None
+            with a fixed horizon.
         TOLERANCE: largest residual and defect of a certified extremal.
+        HORIZON_TOLERANCE: largest horizon error of a certified extremal; it is larger if the cost hardly depends on T.
 
     """
 
@@ -79,9 +82,11 @@ class Certificate:
     conjugate_point: float | None
     clearance: float | None
     time_curvature: float | None = None
+    horizon_error: float | None = None
 
     # Rounding errors leave about this much of a Newton solution at tolerance 1e-9 over a long horizon.
     TOLERANCE: ClassVar[float] = 1e-8
+    HORIZON_TOLERANCE: ClassVar[float] = 1e-4
 
     def status(self) -> Status:
         """Return the status that the certificate proves."""
@@ -91,7 +96,11 @@ class Certificate:
             return Status.COLLISION
         if self.conjugate_point is not None:
             return Status.CONJUGATE_POINT
-        return Status.SUCCESS if self.time_curvature is None or self.time_curvature > 0 else Status.TIME_NOT_MINIMAL
+        if self.time_curvature is None or self.horizon_error is None:
+            return Status.SUCCESS
+        if not self.time_curvature > 0:
+            return Status.TIME_NOT_MINIMAL
+        return Status.SUCCESS if self.horizon_error <= self.HORIZON_TOLERANCE else Status.NOT_CERTIFIED
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,8 +75,8 @@ class OptimalControlProblem:
         time_weight: c >= 0, cost per second.
 
     Raises:
-        ValueError: an argument has a wrong length or an invalid value, or the horizon is free and nothing in the
-            running cost depends on time: both `time_weight` and `state_cost` are 0.
+        ValueError: an argument has a wrong length or an invalid value, or the horizon is free and there is neither a
+            time weight nor a state cost nor an obstacle field.
 
     """
 
@@ -129,7 +129,9 @@ class OptimalControlProblem:
             object.__setattr__(self, "control_bounds", bounds)
         state_cost = as_expression("state_cost", self.state_cost)
         if self.horizon is None and self.time_weight == 0 and state_cost == 0 and self.field is None:
-            raise ValueError("time_weight: expected a positive number with a free horizon, got 0: no path is the best")
+            raise ValueError(
+                "time_weight: expected a positive number, since the horizon is free and there is no state cost, got 0"
+            )
         unknown = state_cost.free_symbols - {*self.system.state, *self.system.parameters}
         if unknown:
             raise ValueError(
@@ -187,7 +189,7 @@ class OptimalControlProblem:
 
     @property
     def _compiled(self) -> tuple[ControlAffineSystem, sp.Expr]:
-        """System and state cost in the form that is compiled: with a time weight, this is a parameter more."""
+        """System and state cost in the form that is compiled: a time weight is an additional parameter."""
         state_cost = as_expression("state_cost", self.state_cost)
         if self.time_weight == 0.0:
             return self.system, state_cost

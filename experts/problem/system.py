@@ -128,10 +128,10 @@ class ControlAffineSystem:
 
 @cache
 def time_weight_symbol() -> sp.Symbol:
-    """Return the symbol of the cost per second, which no user's symbol equals."""
+    """Return the symbol of the cost per second; its name is not one that users choose."""
     import sympy as sp
 
-    return sp.Symbol("time_weight", nonnegative=True, finite=True)
+    return sp.Symbol("_leapnav_time_weight", nonnegative=True)
 
 
 def as_expression(where: str, value: Any) -> sp.Expr:

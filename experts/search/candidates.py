@@ -143,10 +143,9 @@ class CandidateSearch:
         """Return whether further candidates are unlikely to lead to a cheaper extremal.
 
         For any E, a path of length D in the metric has J >= D - (E - c) T with the time weight c, and equality for an
-        extremal of that E. Lattice
-        paths are slightly longer than the extremals close to them, at most by the factor LATTICE_ERROR in hundreds of
-        scenarios, and rarely shorter. So no more candidates are needed if the first one is about as short as the best
-        extremal, or if the last one is too long to be close to a cheaper extremal.
+        extremal of that E. Lattice paths are slightly longer than the extremals close to them, at most by the factor
+        LATTICE_ERROR in hundreds of scenarios, and rarely shorter. So no more candidates are needed if the first one is
+        about as short as the best extremal, or if the last one is too long to be close to a cheaper extremal.
 
         Args:
             cost: J of the best extremal.

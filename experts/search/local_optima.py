@@ -24,7 +24,8 @@ from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.nodes import SolverOptions
 from leapnav.experts.transcription.direct import MAX_ITERATIONS, DirectPath, discretise, optimise
 
-TOLERANCE, COARSE_TOLERANCE = 1e-9, 1e-5
+TOLERANCE = 1e-9
+COARSE_TOLERANCE = 1e-5  # of the fixed-horizon stage, whose result is the guess of the free-horizon stage
 # Newton iterations of the last attempt, and of the attempts before it, after which the path is refined.
 NEWTON_ITERATIONS, FIRST_ITERATIONS, EXPENSIVE_ITERATIONS = 25, 14, 10
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
@@ -39,7 +40,10 @@ SHORT_DISTANCE = 4.0  # m from start to goal; below it, the distance of duplicat
 # cost of their extremal by more; these were different extremals from the closest ones.
 DIRECT_ERROR, REFINED_ERROR = 0.01, 0.002
 UNCONVERGED_ERROR = 0.02  # the same for a path whose iteration has not converged
-FAILURE_WEIGHT = 4  # of the evaluations for an expensive path that leads to no extremal, in the budget for these
+FAILURE_WEIGHT = 4  # evaluations for an expensive path without an extremal count this many times in the budget
+# Free horizon: factor and largest number of lengthenings of a path that the limits make infeasible, largest number of
+# changes of the horizon, and the change after which there is no other.
+LENGTHENING, MAX_LENGTHENED, MAX_RESCALED, SMALL_CHANGE = 1.25, 3, 4, 0.1
 # Depth in an obstacle (robot radii) up to which a collision-free path of similar cost may exist close to an extremal.
 MAX_SLIGHT_DEPTH = TOLERATED_DEPTH
 # A path repeats a failure if it reaches this fraction of the failed path's depth, within this distance (robot radii).
@@ -117,9 +121,31 @@ class LocalOptima:
             self.add_direct(problem, direct)
 
     def _optimise(self, problem: OptimalControlProblem, guess: DirectPath) -> DirectPath:
+        """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
         is_expensive = math.isfinite(guess.cost) and self._is_expensive(guess, DIRECT_ERROR)
         iterations = EXPENSIVE_ITERATIONS if is_expensive else MAX_ITERATIONS
-        return optimise(problem, guess, self.scenario.cost.speed_weight, iterations)
+        weight = self.scenario.cost.speed_weight
+        path = optimise(problem, guess, weight, iterations)
+        if problem.horizon is None:
+            for _ in range(MAX_LENGTHENED):
+                if path.converged and path.violation < MAX_VIOLATION:
+                    break
+                guess = guess.scaled(LENGTHENING)
+                path = optimise(problem, guess, weight, iterations)
+        return path
+
+    def _refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
+        """Return the optimum on halved intervals; a free horizon is changed until the cost is almost stationary."""
+        refined = direct.refined()
+        if problem.horizon is not None or not direct.converged:
+            return self._optimise(problem, refined)
+        for _ in range(MAX_RESCALED):
+            factor = direct.time_factor(problem)
+            refined = self._optimise(problem, refined.scaled(factor))
+            if not refined.converged or abs(factor - 1.0) < SMALL_CHANGE:
+                break
+            direct = refined
+        return refined
 
     def add_direct(self, problem: OptimalControlProblem, direct: DirectPath) -> None:
         """Compute the extremal of a direct path, unless the path is a duplicate or unlikely to lead to a useful one."""
@@ -129,10 +155,7 @@ class LocalOptima:
         if self._is_discarded(problem, direct, direct, DIRECT_ERROR):
             return
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
-        finer = direct.refined()
-        if problem.horizon is None and direct.converged:
-            finer = finer.rescaled(problem)
-        refined = self._optimise(problem, finer)
+        refined = self._refine(problem, direct)
         is_duplicate = self._is_seen(refined)
         self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
         if is_duplicate:
@@ -295,10 +318,11 @@ def _polish(
     problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, iterations: int
 ) -> tuple[Status, tuple[Iteration, ...], int]:
     """Apply Newton's method, with a free horizon if necessary in two stages, of which the first keeps the times."""
-    first = nodes.copy()
+    first_times, first = times.copy(), nodes.copy()
     status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, iterations)
     if status is Status.SUCCESS or problem.horizon is not None:
         return status, rows, evaluations
+    times[:] = first_times
     fixed = problem.with_horizon(float(times[-1]))
     status, more, count = polish(fixed, times, first, COARSE_TOLERANCE, iterations)
     rows, evaluations = rows + more, evaluations + count

@@ -15,6 +15,7 @@ import numpy as np
 from leapnav.experts.numerics.flow import NewtonOptions
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
+from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.extremal import Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.solvers.initial_paths import local_minima
@@ -169,8 +170,7 @@ class FeasiblePath:
         values = np.array([hamiltonian(arrays.flow, node, rates) for node in self.nodes[:-1]])
         slope, before = float(values @ np.diff(self.times)), self.cost
         self.evaluations += len(values)
-        ratio = (before - slope) / (before + slope) if before > abs(slope) else math.copysign(math.inf, -slope)
-        factor = math.sqrt(min(max(ratio, MIN_FACTOR**2), MIN_FACTOR**-2))
+        factor = time_factor(before, slope, MIN_FACTOR)
         times, nodes, costs = self.times, self.nodes, self.costs
         for _ in range(MAX_HALVINGS):
             self.times, self.nodes = factor * times, nodes.copy()

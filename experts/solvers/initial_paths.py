@@ -18,6 +18,7 @@ import numpy as np
 
 from leapnav.experts.numerics.linear import solve_positive
 from leapnav.experts.numerics.shooting import hamiltonian
+from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.condensing import ControlRollout, condense, roll_out
 
@@ -79,7 +80,8 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
     for _ in range(MAX_HORIZON_STEPS):
         minima = local_minima(problem.with_horizon(horizon), starts=HORIZON_STARTS, seed=seed)
         if not minima:
-            too_short = horizon
+            if horizon < reachable:
+                too_short = horizon
             horizon = math.sqrt(too_short * reachable) if reachable < math.inf else horizon / MIN_HORIZON_FACTOR
             continue
         reachable = horizon
@@ -87,8 +89,7 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
         assert path.costates is not None  # `local_minima` computes them
         z = np.concatenate([path.states[0], path.costates[0]])
         slope = horizon * hamiltonian(problem.arrays.flow, z, np.empty_like(z))
-        ratio = (cost - slope) / (cost + slope) if cost > abs(slope) else math.copysign(math.inf, -slope)
-        factor = math.sqrt(min(max(ratio, MIN_HORIZON_FACTOR**2), MIN_HORIZON_FACTOR**-2))
+        factor = time_factor(cost, slope, MIN_HORIZON_FACTOR)
         horizon = max(factor * horizon, math.sqrt(too_short * reachable))
         if abs(horizon / reachable - 1.0) < HORIZON_TOLERANCE:
             break

@@ -64,8 +64,9 @@ def _sweep_and_polish(iterate: FeasiblePath, options: SolverOptions) -> Extremal
         if status is Status.SUCCESS and rows[-1].cost <= iterate.cost + COST_TOLERANCE * (1 + abs(iterate.cost)):
             history = (*iterate.history, *rows)
             extremal = confirm(iterate.problem, times, nodes, status, history, iterate.evaluations, options)
-            # An extremal with a conjugate point is a saddle, and further sweeps reduce the cost.
-            if extremal.status is not Status.CONJUGATE_POINT or sweeps == SWEEPS_BEFORE_NEWTON[-1]:
+            # Such an extremal is a saddle, and further sweeps reduce the cost.
+            is_saddle = extremal.status in (Status.CONJUGATE_POINT, Status.TIME_NOT_MINIMAL)
+            if not is_saddle or sweeps == SWEEPS_BEFORE_NEWTON[-1]:
                 return extremal
     # Newton's method did not converge, so the problem is solved by sweeps alone.
     iterate.accuracy = LONG_ARC_ACCURACY

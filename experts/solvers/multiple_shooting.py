@@ -8,7 +8,7 @@ from leapnav.experts.numerics.flow import NewtonOptions
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.solvers.newton import CONVERGED, MARGIN, segment_growth, solve_nodes
+from leapnav.experts.solvers.newton import MARGIN, segment_growth, solve_nodes
 from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
 from leapnav.experts.solvers.outcome import KERNEL_STATUS
 
@@ -27,15 +27,16 @@ def multiple_shooting(problem: OptimalControlProblem, path: Trajectory, options:
     Newton's method starts again from the same path.
     """
     times, nodes = start_nodes(problem, path, options.segments or default_segments(path))
+    mesh = times.copy()
     status, history, evaluations = polish(problem, times, nodes, options.tol, options.max_iterations)
     for _ in range(MAX_REFINEMENTS):
         if status is Status.SUCCESS or options.segments is not None:
             break
-        times, count = _refine(problem, path, times)
+        mesh, count = _refine(problem, path, mesh)
         evaluations += count
-        if len(times) > MAX_SEGMENTS:
+        if len(mesh) > MAX_SEGMENTS:
             break
-        times, nodes = start_nodes(problem, path, times)
+        times, nodes = start_nodes(problem, path, mesh.copy())
         status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations)
         history += rows
         evaluations += count
@@ -71,7 +72,7 @@ def polish(
 
     Args:
         problem: the problem.
-        times: (segments + 1,), s; changed in place if the horizon is free and Newton's method converges.
+        times: (segments + 1,), s; changed in place if the horizon is free.
         nodes: (segments + 1, 2n), changed in place.
         tol: largest residual.
         max_iterations: largest number of Newton steps.
@@ -86,12 +87,9 @@ def polish(
     costs = np.empty(len(times) - 1)
     log = np.zeros((max_iterations + 1, 3))
     newton = NewtonOptions(MARGIN * tol, MARGIN * tol * ACCURACY, max_iterations, predict)
-    moved = times.copy()
     code, iterations, _, evaluations = solve_nodes(
-        arrays.flow, moved, nodes, arrays.start, arrays.end, newton, costs, log
+        arrays.flow, times, nodes, arrays.start, arrays.end, newton, costs, log
     )
-    if problem.horizon is None and code == CONVERGED:
-        times[:] = moved
     rows = tuple(Iteration("newton", len(costs), row[1], row[0]) for row in log[: iterations + 1].tolist())
     return KERNEL_STATUS[code], rows, evaluations
 

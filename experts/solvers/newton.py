@@ -18,13 +18,13 @@ from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import END_CONDITION, FLOW, NEWTON_OPTIONS
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.linear import solve_banded, solve_dense
-from leapnav.experts.numerics.shooting import NewtonSystem, evaluate, hamiltonian, set_identity
+from leapnav.experts.numerics.shooting import NewtonSystem, hamiltonian, linearise, set_identity
 
 # Exit codes of the Newton kernels.
 CONVERGED, STALLED, DIVERGED, SINGULAR, MAX_ITERATIONS = 0, 1, 2, 3, 4
 
 MIN_DAMPING = 1.0 / 64.0
-MIN_TIME_FACTOR = 0.25  # a step may not reduce a free final time to less than this fraction
+MIN_STEP_FACTOR = 0.25  # a step may not reduce a free final time to less than this fraction
 COARSE_ACCURACY = 1e-4  # tolerance of the integrator far from the solution
 # The tolerance in the options is this fraction of the residual that the caller accepts. A residual up to that level is
 # accepted if no step decreases it.
@@ -63,7 +63,7 @@ def is_sufficient_decrease(norm_squared, previous_squared, reduction, slack):
 @kernel(float64(float64, float64, float64))
 def time_damping(step, duration, damping):
     """Return the damping that limits the reduction of a free final time by a step."""
-    return damping if step >= 0.0 else min(damping, (1.0 - MIN_TIME_FACTOR) * duration / -step)
+    return damping if step >= 0.0 else min(damping, (1.0 - MIN_STEP_FACTOR) * duration / -step)
 
 
 @kernel(
@@ -208,7 +208,7 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
     tried = NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
     trial = np.empty((segments + 1, 2 * n))
     current = max(accuracy, COARSE_ACCURACY)
-    norm, residual, evaluations = evaluate(flow, times, 1.0, Z, start, end, current, system)
+    norm, residual, evaluations = linearise(flow, times, 1.0, Z, start, end, current, system)
     if norm == np.inf:
         return DIVERGED, 0, np.inf, evaluations
     damping, previous = 1.0, 0.0
@@ -216,7 +216,7 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
         if residual <= tolerance and current > accuracy:
             # A guess that is a solution is evaluated again, without a step: the matrix may be singular.
             current = accuracy
-            norm, residual, count = evaluate(flow, times, 1.0, Z, start, end, current, system)
+            norm, residual, count = linearise(flow, times, 1.0, Z, start, end, current, system)
             evaluations += count
         log[iteration, 0] = residual
         log[iteration, 1] = costs.sum()
@@ -246,7 +246,7 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
                 factor = 1.0 + damping * step[2 * n]
             for k in range(segments):
                 tried.hints[k] = system.hints[k]
-            trial_norm, trial_residual, count = evaluate(flow, times, factor, trial, start, end, required, tried)
+            trial_norm, trial_residual, count = linearise(flow, times, factor, trial, start, end, required, tried)
             evaluations += count
             slack = accuracy_slack(current, required, unknowns)
             if is_sufficient_decrease(trial_norm, norm, damping / 4.0, slack):

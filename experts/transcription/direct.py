@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from leapnav.experts.numerics.shooting import hamiltonian
+from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.problem.system import differential_drive, unicycle
 from leapnav.experts.transcription import arcs, arcs_descent, descent, midpoint
@@ -67,21 +68,18 @@ class DirectPath:
         controls = np.repeat(self.controls, 2, axis=0)
         return DirectPath(times, states, controls, costates, self.cost, self.violation, False)
 
-    def rescaled(self, problem: OptimalControlProblem) -> DirectPath:
-        """Return the path with all times scaled by a factor that reduces its cost, for a problem with a free horizon.
+    def scaled(self, factor: float) -> DirectPath:
+        """Return the path with all times multiplied by a factor, which keeps the cost of the path."""
+        controls, costates = self.controls / factor, self.costates / factor
+        return replace(self, times=factor * self.times, controls=controls, costates=costates)
 
-        The derivative of the cost by the factor s is the integral of the Hamiltonian. The cost is of the form
-        E / s + P s for systems without drift.
-        """
+    def time_factor(self, problem: OptimalControlProblem) -> float:
+        """Return the factor of all times that reduces the cost, for a problem with a free horizon."""
         arrays, rates = problem.arrays, np.empty(2 * problem.system.n)
         z = np.concatenate([self.states, self.costates], axis=1)
         at = np.unique(np.linspace(0, len(z) - 1, HAMILTONIAN_POINTS).astype(int))
         values = np.array([hamiltonian(arrays.flow, row, rates) for row in z[at]])
-        slope = float(np.trapezoid(values, self.times[at]))
-        ratio = (self.cost - slope) / (self.cost + slope) if self.cost > abs(slope) else math.copysign(math.inf, -slope)
-        factor = math.sqrt(min(max(ratio, MIN_TIME_FACTOR**2), MIN_TIME_FACTOR**-2))
-        controls, costates = self.controls / factor, self.costates / factor
-        return replace(self, times=factor * self.times, controls=controls, costates=costates)
+        return time_factor(self.cost, float(np.trapezoid(values, self.times[at])), MIN_TIME_FACTOR)
 
 
 def discretise(problem: OptimalControlProblem, path: Trajectory) -> DirectPath:

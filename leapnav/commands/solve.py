@@ -55,6 +55,7 @@ class Solve:
             print(f"  cost               {extremal.cost:.9f}")
             if scenario.horizon is None:
                 print(f"  horizon            {extremal.horizon:.6f} s (free)")
+                print(f"  d2J/dT2            {certificate.time_curvature:.3g}")
             print(f"  residual           {certificate.residual:.1e}")
             print(f"  defect             {certificate.defect:.1e}")
             print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")
@@ -120,7 +121,7 @@ def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, f
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("method", no_wrap=True)
     table.add_column("status", overflow="fold")
-    for column in ("cost", "residual", "itera-\ntions", "evalu-\nations", "time\nms"):
+    for column in ("cost", "horizon\ns", "residual", "itera-\ntions", "evalu-\nations", "time\nms"):
         table.add_column(column, justify="right", no_wrap=True)
     for method, extremal in extremals.items():
         certificate = extremal.certificate
@@ -128,6 +129,7 @@ def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, f
             method,
             extremal.status.name,
             "-" if certificate is None else f"{extremal.cost:.9g}",
+            "-" if certificate is None else f"{extremal.horizon:.6g}",
             "-" if certificate is None else f"{max(certificate.residual, certificate.defect):.1e}",
             str(len(extremal.history)),
             str(extremal.n_evaluations),
