@@ -121,7 +121,15 @@ def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, f
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("method", no_wrap=True)
     table.add_column("status", overflow="fold")
-    for column in ("cost", "horizon\ns", "residual", "itera-\ntions", "evalu-\nations", "time\nms"):
+    is_free = any(extremal.problem.horizon is None for extremal in extremals.values())
+    for column in (
+        "cost",
+        *(("horizon\ns",) if is_free else ()),
+        "residual",
+        "itera-\ntions",
+        "evalu-\nations",
+        "time\nms",
+    ):
         table.add_column(column, justify="right", no_wrap=True)
     for method, extremal in extremals.items():
         certificate = extremal.certificate
@@ -129,7 +137,7 @@ def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, f
             method,
             extremal.status.name,
             "-" if certificate is None else f"{extremal.cost:.9g}",
-            "-" if certificate is None else f"{extremal.horizon:.6g}",
+            *((f"{extremal.horizon:.6g}",) if is_free else ()),
             "-" if certificate is None else f"{max(certificate.residual, certificate.defect):.1e}",
             str(len(extremal.history)),
             str(extremal.n_evaluations),
