@@ -24,7 +24,7 @@ MAX_LATTICE_CELL = 0.25  # minimum turning radii: larger cells would make the la
 def mean_sine(sine, cosine, x):
     """Return the mean of sin(s + y) for y from 0 to x, from sin(s) and cos(s)."""
     square = x * x
-    if square > 0.04:
+    if square > MAX_PANEL_TURN**2:
         along, across = math.sin(x) / x, (1.0 - math.cos(x)) / x
     else:  # series with errors below 1e-11
         along = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))

@@ -176,11 +176,13 @@ class Scenario(Frozen):
             ScenarioError: it is free, or the time has a weight.
 
         """
-        weight = self.cost.time_weight
-        if self.fixed_horizon and weight:
-            raise ScenarioError(
-                one_line(self.name, [f"cost.time_weight: environments and banks need 0, got {weight:g}"])
-            )
+        faults = []
+        if self.horizon is None:
+            faults.append("horizon: environments and banks need a number, got None")
+        if self.cost.time_weight:
+            faults.append(f"cost.time_weight: environments and banks need 0, got {self.cost.time_weight:g}")
+        if faults:
+            raise ScenarioError(one_line(self.name, faults))
 
     @property
     def fixed_horizon(self) -> float:
