@@ -58,7 +58,7 @@ class OptimalControlProblem:
     """An optimal control problem with a fixed or a free horizon, for a control-affine system.
 
     Minimise the integral of c + 1/2 u'Ru + Phi(q) over [0, T], subject to q' = a(q) + sum_j u_j b_j(q), q(0) = start
-    and q(T) = goal. If the horizon is free, T > 0 is minimised over as well, and the Hamiltonian of an extremal is 0.
+    and q(T) = goal. If the horizon is free, J is minimised over T > 0 too, and the Hamiltonian of an extremal is 0.
 
     Args:
         system: the dynamics, with n states and m controls.
