@@ -5,9 +5,11 @@ from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
+from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
+from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.obstacle import Obstacle
-from leapnav.envs.scenarios.scenario import Cost, Scenario, ScenarioError
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import Disturbance, Motor
 from leapnav.envs.shapes import Capsule, Circle, Polygon, Shape
 from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv

@@ -62,8 +62,9 @@ class GoalConditioned:
                 "(HerReplayBuffer passes it on with copy_info_dict=True)"
             )
         parts = info["reward_parts"]
-        running = parts["effort"] + parts["proximity"] + parts["collision"]
-        missed = info["terminated"] and not (info["at_horizon"] and reached)
+        running = parts["effort"] + parts["proximity"] + parts["collision"] + parts.get("time", 0.0)
+        arrived = reached and (info["at_horizon"] or self.settings.free_horizon)
+        missed = info["terminated"] and not arrived
         return running - (self.settings.miss_penalty if missed else 0.0)
 
 

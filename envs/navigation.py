@@ -26,13 +26,16 @@ NOISE_STREAM = 1  # of the environment's seed; the stream of the scenarios is th
 
 
 class NavigateEnv(gym.Env[Any, np.ndarray]):
-    r"""A wheeled robot drives to a goal pose among obstacles, in a fixed time and at minimum cost.
+    r"""A wheeled robot drives to a goal pose among obstacles, in a fixed or a free time and at minimum cost.
 
     ## Description
     The robot has a fixed time, the horizon, to reach the goal pose without a collision. The reward is minus the running
     cost of an optimal control problem, with penalties for a collision and for missing the goal. The return of an
     optimal policy is therefore `-J*`, up to terms of second order in the control period, where `J*` is the minimum cost
     of the scenario. `leapnav.experts.find_optimum` computes the best known value of `J*`, and scenario banks store it.
+
+    With `horizon="free"`, the time is part of the cost, with the time weight of the scenario, and an episode ends when
+    the robot reaches the goal pose.
 
     The argument `robot` selects the model of the robot: `"unicycle"`, `"differential_drive"`, `"car"`,
     `"dynamic_unicycle"` or one's own, see `leapnav.envs.RobotModel`. The tables of this page describe the unicycle; for
@@ -65,7 +68,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     |---|---|---|---|---|
     | `goal` | 0, 1 | goal position in the robot's frame: ahead, to the left | m | -1000 to 1000 |
     | | 2, 3 | cosine and sine of the goal heading relative to the robot's heading; 0, 0 if the goal heading is free | 1 | -1 to 1 |
-    | | 4 | time left | s | 0 to 10000 |
+    | `goal` (fixed horizon only) | 4 | time left | s | 0 to 10000 |
     | | 5, 6 | goal position divided by the time left: ahead, to the left | m/s | -20 to 20 |
     | | 7 | distance to the goal divided by the time left | m/s | 0 to 20 |
     | | 8 | angle to the goal heading divided by the time left; 0 if the goal heading is free | rad/s | -20 to 20 |
@@ -91,8 +94,9 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     |---|---|---|
     | `effort` | minus the integral of the running cost without the proximity cost over the step, for the unicycle 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
     | `proximity` | minus the integral of the proximity cost Phi over the step | always |
+    | `time` | minus the time weight times the duration of the step | free horizon |
     | `collision` | `-collision_penalty` | at the first collision of the episode |
-    | `miss` | `-miss_penalty` | if the episode ends without reaching the goal, at the horizon or by a collision |
+    | `miss` | `-miss_penalty` | if the episode terminates without reaching the goal, at the horizon or by a collision |
     | `shaping` (`reward="shaped"` only) | `discount` times the potential after the step, minus the potential before it | always |
 
     v and omega are the actual speed and turn rate, which differ from the commanded ones with motors, in contact and
@@ -101,7 +105,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     `reward="shaped"` adds potential-based shaping. It leaves the optimal policy unchanged if `discount` is the
     learner's discount factor (Ng, Harada and Russell, 1999). The potential is minus the cost of following the reference
     path at constant speed, or a straight line to the goal if there is no reference. It is at least `-miss_penalty`, and
-    0 after the end of the episode.
+    0 after the termination of the episode.
 
     ## Starting state
     The start of the scenario; at rest with `"motor"`. The scenario of an episode is the first of these that is given:
@@ -118,6 +122,12 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     obstacle, as simulated by pymunk, until the horizon. The episode is a success if, at the horizon, the robot is
     within `position_tolerance` and `heading_tolerance` of the goal and has not collided. Further states of the robot
     with a goal, such as the speed of the dynamic unicycle, must be within `motion_tolerance` of it.
+
+    With `horizon="free"`, the episode is `terminated` at the end of the first step after which the robot is within the
+    tolerances of the goal, or at a collision. It is `truncated` at the time limit of the scenario, which is not
+    observed: 3 times the duration of the optimum in a bank, 3 times an estimate of it in a fresh scenario of a family,
+    see `Scenario.time_limit` for others. A truncated episode has no penalty. The task is not discounted, so a learner
+    needs a discount factor close to 1: with 0.99 per step of 0.05 s, standing still costs less than driving.
 
     ## Info
     | Key | Content |
@@ -140,6 +150,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `scenario` | None | the scenario of all episodes |
     | `split` | `"train"` | the family's included bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
+    | `horizon` | None | `"fixed"` or `"free"`; None for that of the scenario or the bank, otherwise `"fixed"` |
     | `robot` | None | name of the robot's model, a dict of its fields with `model`, or a `RobotModel`; None for that of the scenario or the bank, otherwise the unicycle. Without an included bank for the robot, scenarios are fresh |
     | `observation` | `"lidar"` | `"lidar"`, `"state"` or `"map"` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |
@@ -179,6 +190,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
         robot: RobotModel | Mapping[str, Any] | str | None = None,
+        horizon: str | None = None,
         observation: str = "lidar",
         reward: str = "cost",
         actuation: str = "velocity",
@@ -199,9 +211,10 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         map_vertices: int = 8,
         render_mode: str | None = None,
     ) -> None:
-        self._source = ScenarioSource(family, scenario, split, bank, robot)
+        self._source = ScenarioSource(family, scenario, split, bank, robot, horizon)
         self.settings = EnvironmentSettings(
             robot=self._source.robot.model,
+            horizon=self._source.horizon,
             observation=observation,
             reward=reward,
             actuation=actuation,
@@ -291,11 +304,11 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
             self._trail.append(self.pose)
         row = self._simulator.state[0].tolist()
         observation, info = self._observe(), self._info(row)
-        terminated = row[columns.TERMINATED] != 0.0
-        self._playing[0] = not terminated
+        terminated, truncated = row[columns.TERMINATED] != 0.0, row[columns.TRUNCATED] != 0.0
+        self._playing[0] = not (terminated or truncated)
         if self.render_mode == "human":
             self.render()
-        return observation, row[columns.REWARD], terminated, False, info
+        return observation, row[columns.REWARD], terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Render the scene.
@@ -396,7 +409,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
 
     def _info(self, row: list[float]) -> dict[str, Any]:
         """Return the info of a step, from the robot's row of the state."""
-        parts = {name: -row[column] for name, column in columns.PARTS.items()}
+        parts = {name: -row[column] for name, column in columns.parts(self.settings.free_horizon).items()}
         if self.settings.reward == "shaped":
             parts["shaping"] = row[columns.SHAPING]
         info: dict[str, Any] = {name: row[column] for name, column in columns.INFOS.items()}

@@ -11,6 +11,7 @@ import numpy as np
 from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.robots.base import MODELS
+from leapnav.envs.scenarios.scenario import HORIZONS
 from leapnav.envs.utils.validation import (
     check_at_least,
     check_choice,
@@ -58,8 +59,9 @@ MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
     MOTION_TOLERANCE,
     N_MOTION,
     N_CONTROLS,
+    FREE_HORIZON,
     PACKED,
-) = range(28)
+) = range(29)
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,7 @@ class EnvironmentSettings:
     """
 
     robot: str = "unicycle"
+    horizon: str = "fixed"
     observation: str = "lidar"
     reward: str = "cost"
     actuation: str = "velocity"
@@ -148,6 +151,7 @@ class EnvironmentSettings:
 
     def __post_init__(self) -> None:
         check_choice("robot", self.robot, MODELS)
+        check_choice("horizon", self.horizon, HORIZONS)
         check_choice("observation", self.observation, OBSERVATIONS)
         check_choice("reward", self.reward, GOAL_REWARDS if self.goal_conditioned else REWARDS)
         check_choice("actuation", self.actuation, ACTUATIONS)
@@ -168,6 +172,15 @@ class EnvironmentSettings:
                 f"robot: the goal of a goal-conditioned environment is a pose, but {self.robot!r} has goals for its "
                 "other states; use leapnav/Navigate-v0"
             )
+        if (
+            self.goal_conditioned
+            and self.free_horizon
+            and self.observation == "state"
+            and not self.model.sizes()[0] > 3
+        ):
+            raise ValueError(
+                "observation: with a free horizon, a goal-conditioned environment needs 'lidar' or 'map', got 'state'"
+            )
         object.__setattr__(self, "disturbance", _as_disturbance(self.disturbance))
         object.__setattr__(self, "motor", _as_dataclass("motor", Motor, self.motor))
 
@@ -175,6 +188,11 @@ class EnvironmentSettings:
     def model(self) -> type[RobotModel]:
         """The class of the robot's model."""
         return MODELS[self.robot]
+
+    @property
+    def free_horizon(self) -> bool:
+        """Whether an episode ends when the robot reaches the goal, instead of after a fixed time."""
+        return self.horizon == "free"
 
     @property
     def disturbed(self) -> bool:
@@ -204,6 +222,7 @@ class EnvironmentSettings:
         values[MOTION_TOLERANCE] = self.motion_tolerance
         n, m = self.model.sizes()
         values[N_MOTION], values[N_CONTROLS] = n - 3, m
+        values[FREE_HORIZON] = self.free_horizon
         return values
 
 

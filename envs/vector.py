@@ -47,7 +47,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     Args:
         num_envs: number of robots.
-        family, scenario, split, bank, robot: see `NavigateEnv`.
+        family, scenario, split, bank, robot, horizon: see `NavigateEnv`.
         autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
             next one. "SameStep": the last step starts the next episode, and `infos["final_obs"]` and
             `infos["final_info"]` describe the end. "Disabled": `reset(options={"reset_mask": mask})` starts it.
@@ -72,6 +72,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         split: str | None = None,
         bank: Any = None,
         robot: Any = None,
+        horizon: Any = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         **settings: Any,
@@ -80,9 +81,12 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         for name in settings:
             if name not in SETTING_NAMES:
                 raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
-        self._source = ScenarioSource(family, scenario, split, bank, robot)
+        self._source = ScenarioSource(family, scenario, split, bank, robot, horizon)
         self.settings = EnvironmentSettings(
-            robot=self._source.robot.model, **settings, goal_conditioned=self._goal_conditioned
+            robot=self._source.robot.model,
+            horizon=self._source.horizon,
+            **settings,
+            goal_conditioned=self._goal_conditioned,
         )
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -99,6 +103,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._simulator.check(self._source.scenario, self.bank)
+        self._truncates = self.settings.free_horizon
         self._choices: list[Scenario | int | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
@@ -214,7 +219,9 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._start(np.flatnonzero(restarting))
         else:
             restarting = self._no_robots
-        ended = state[:, columns.TERMINATED] > 0
+        terminated = state[:, columns.TERMINATED] > 0
+        truncated = state[:, columns.TRUNCATED] > 0 if self._truncates else self._no_robots.copy()
+        ended = terminated | truncated if self._truncates else terminated
         flat = self._flat_observations()
         rewards = self._rewards(flat, ended, restarting)
         infos: dict[str, Any] = {}
@@ -230,8 +237,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             restarting = ended
         self._ended = (self._no_robots if self.autoreset_mode is AutoresetMode.SAME_STEP else ended).copy()
         infos.update(self._infos(self._all_robots, restarting if restarting is not self._no_robots else None))
-        truncated = np.zeros(self.num_envs, dtype=bool)
-        return simulator.layout.divide(flat), rewards, ended, truncated, infos
+        return simulator.layout.divide(flat), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a frame of each robot, see `NavigateEnv.render`."""
@@ -316,7 +322,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         values["pose"] = self._simulator.poses.copy()
         if self._simulator.motion.shape[1]:
             values["motion"] = self._simulator.motion.copy()
-        parts = {name: -state[:, column] for name, column in columns.PARTS.items()}
+        parts = {name: -state[:, column] for name, column in columns.parts(self._truncates).items()}
         if self.settings.reward == "shaped":
             parts["shaping"] = state[:, columns.SHAPING].copy()
         values["reward_parts"] = _add_masks(parts, mask)
@@ -376,7 +382,11 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
 
 
 # Arguments that are passed on to the settings.
-SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) - {"goal_conditioned", "robot"}
+SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) - {
+    "goal_conditioned",
+    "robot",
+    "horizon",
+}
 
 
 def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

@@ -295,7 +295,7 @@ def plot_bank(bank: ScenarioBank, path: str | os.PathLike[str], count: int = 24,
         reference = bank.reference(index)
         draw_scenario(axes, bank[index])
         axes.plot(*reference.states[:, :2].T, color=OPTIMUM, linewidth=1.4)
-        axes.set_title(f"{index}: J* = {reference.cost:.3g}, {bank[index].horizon:g} s", fontsize=8)
+        axes.set_title(f"{index}: J* = {reference.cost:.3g}, {bank.horizons[index]:.3g} s", fontsize=8)
     for axes in grid[len(chosen) :]:
         axes.set_visible(False)
     figure.savefig(path, dpi=130)

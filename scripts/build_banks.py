@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 
 from leapnav.envs import FAMILIES
+from leapnav.envs.scenarios.families import collection_name
 from leapnav.experts import build_bank
 
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
@@ -25,10 +26,12 @@ def build(directory: Path, workers: int) -> None:
     for family in FAMILIES:
         for split, (count, seed) in SPLITS.items():
             build_bank(family, count, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
+            path = directory / f"{collection_name(family, horizon='free')}-{split}.bank"
+            build_bank(family, count, path, horizon="free", seed=seed, workers=workers)
     for robot in ROBOTS:
         for family in ROBOT_FAMILIES:
             for split, (_, seed) in SPLITS.items():
-                path = directory / f"{robot}-{family}-{split}.bank"
+                path = directory / f"{collection_name(family, robot)}-{split}.bank"
                 build_bank(family, ROBOT_COUNT, path, robot=robot, seed=seed, workers=workers)
 
 

@@ -25,7 +25,7 @@ from leapnav.envs import (
 )
 from leapnav.envs.robots import register
 from leapnav.envs.robots.base import MODELS
-from leapnav.envs.scenarios.scenario import Cost
+from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts import ExpertPolicy, OptimalControlProblem, find_optimum
 from leapnav.experts.acting.policy import plan_actions

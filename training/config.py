@@ -11,8 +11,8 @@ from typing import Any, Literal, Self, cast
 
 from leapnav.deprecated import renamed_fields
 
-# Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start; a sub-table
-# with the name of a family contains the changes for this family.
+# Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start, "-free" those
+# for a free horizon; a sub-table with the name of a family contains the changes for this family.
 _DEFAULTS: dict[str, Any] = tomllib.loads(
     files("leapnav.training").joinpath("defaults.toml").read_text(encoding="utf-8")
 )
@@ -112,6 +112,8 @@ class RunConfig:
     """Family of the scenarios."""
     robot: RobotName = "unicycle"
     """Model of the robot."""
+    horizon: Literal["fixed", "free"] = "fixed"
+    """Fixed horizon, or free: the episode ends at the goal, and the time is part of the cost."""
     seed: int = 0
     """Random seed."""
     resume: bool = False
@@ -128,11 +130,12 @@ class RunConfig:
     def environment(self) -> dict[str, Any]:
         """Arguments of the environment that determine the observation."""
         robot = {} if self.robot == "unicycle" else {"robot": self.robot}
-        return {"lidar_beams": self.lidar_beams, **robot}
+        horizon = {} if self.horizon == "fixed" else {"horizon": self.horizon}
+        return {"lidar_beams": self.lidar_beams, **robot, **horizon}
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, **changes: Any) -> Self:
-        """Return the settings tuned for a family (file `defaults.toml`), with changes.
+        """Return the settings tuned for a family and a horizon (file `defaults.toml`), with changes.
 
         Args:
             family: one of the families, or "all".
@@ -150,7 +153,10 @@ class RunConfig:
         if warm is None:
             warm = bool(changes.get("warm_start"))
         config = cls(out=Path(), family=cast(FamilyName, family))
-        for section in ("RunConfig", cls.__name__, f"{cls.__name__}-warm")[: 3 if warm else 2]:
+        sections = ["RunConfig", cls.__name__, *([f"{cls.__name__}-warm"] if warm else [])]
+        if changes.get("horizon") == "free":
+            sections.append(f"{cls.__name__}-free")
+        for section in sections:
             table = _DEFAULTS.get(section, {})
             names = {setting.name for setting in fields(config)}
             common = {name: value for name, value in table.items() if name in names}  # the other keys are families

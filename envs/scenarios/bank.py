@@ -2,13 +2,14 @@
 
 A bank is an HDF5 file with contiguous, uncompressed, little-endian datasets. Any HDF5 reader can open it; this one maps
 it into memory. All scenarios of a bank have the same robot model, with n_q states and n_u controls. With n scenarios and
-N_i points of the i-th optimum, evenly spaced in time from 0 to the horizon:
+N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 
 | Dataset | Shape, type | Content |
 |---|---|---|
 | `scenarios` | (bytes,) uint8 | the scenarios as JSON text, concatenated |
 | `scenario_ends` | (n,) int64 | the end of each text |
-| `tasks` | (n, K) float64 | the packed tasks: start (3), goal (3), horizon, limits (n_u), weights (n_u), further states at the start and the goal (n_q - 3 each), parameters; NaN where the goal is free |
+| `tasks` | (n, K) float64 | the packed tasks: start (3), goal (3), horizon, limits (n_u), weights (n_u), further states at the start and the goal (n_q - 3 each), parameters; NaN where the goal is free. If the horizon is free: the time limit instead of the horizon, and the time weight in a last column |
+| `horizons` | (n,) float64 | durations of the optima (s); only if the horizon is free |
 | `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field` |
 | `field_ends` | (n,) int64 | the end of each field |
 | `draws` | (n,) int64 | index of the random draw that produced the scenario |
@@ -41,7 +42,8 @@ from typing import Any, overload
 import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.families import collection_name
+from leapnav.envs.scenarios.scenario import HORIZON, Scenario
 from leapnav.envs.shapes.field import check_field
 from leapnav.envs.utils.validation import check_choice, is_integer
 
@@ -54,6 +56,7 @@ TYPES = {
     "scenarios": "u1",
     "scenario_ends": "<i8",
     "tasks": "<f8",
+    "horizons": "<f8",
     "fields": "<f8",
     "field_ends": "<i8",
     "draws": "<i8",
@@ -66,6 +69,7 @@ TYPES = {
     "costates": "<f4",
 }
 
+OPTIONAL = "horizons"  # the dataset that banks with a fixed horizon do not have
 _TABLES = ("tasks", "certificates", "states", "controls", "costates")  # datasets with columns
 
 
@@ -81,7 +85,7 @@ class Reference:
         cost: J*.
         second_cost: J of the second-best local optimum found, None if there is none.
         certificate: boundary residual, defect, drift of H, clearance (m).
-        times (N,): times of the points (s), from 0 to the horizon.
+        times (N,): times of the points (s), from 0 to the duration of the optimum.
         states (N, n): x, y (m), heading (rad, unwrapped) and further states, float32.
         controls (N, m): the robot's controls, float32.
         costates (N, n): gradient of the cost-to-go, float32.
@@ -114,6 +118,8 @@ class ScenarioBank(Sequence[Scenario]):
         certificates (n, 4): boundary residual, defect, drift of H, clearance (m).
         draws (n,): indices of the random draws that produced the scenarios.
         tasks (n, K): see `leapnav.envs.scenarios.scenario`.
+        horizon: kind of the horizon of all scenarios, "fixed" or "free".
+        horizons (n,): durations of the optima (s).
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -132,6 +138,8 @@ class ScenarioBank(Sequence[Scenario]):
     certificates: np.ndarray
     draws: np.ndarray
     tasks: np.ndarray
+    horizon: str
+    horizons: np.ndarray
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).absolute()  # independent of the working directory, which differs between processes
@@ -152,7 +160,7 @@ class ScenarioBank(Sequence[Scenario]):
                         f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads "
                         f"{VERSION}; build the bank again with `leapnav bank build`"
                     )
-                locations = {name: _locate(file[name], name) for name in TYPES}
+                locations = {name: _locate(file[name], name) for name in TYPES if name in file or name != OPTIONAL}
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
             self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
             self.rejected = dict(json.loads(attributes["rejected"]))
@@ -176,6 +184,8 @@ class ScenarioBank(Sequence[Scenario]):
         self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
         self.tasks = arrays["tasks"]
+        self.horizon = "free" if OPTIONAL in arrays else "fixed"
+        self.horizons = arrays[OPTIONAL] if OPTIONAL in arrays else self.tasks[:, HORIZON]
         self._scenarios: dict[int, Scenario] = {}
         self._check_widths()
 
@@ -186,6 +196,10 @@ class ScenarioBank(Sequence[Scenario]):
 
     def _check_widths(self) -> None:
         """Raise BankError unless the numbers of columns are those of the robot."""
+        if len(self) and self[0].horizon_kind != self.horizon:
+            raise BankError(
+                f"{self.path}: not a scenario bank, or damaged: {OPTIONAL}: expected if the horizon is free"
+            )
         n, m = self.robot.sizes()
         columns = len(self[0].task) if len(self) else self.tasks.shape[1]
         expected = {"tasks": columns, "certificates": 4, "states": n, "controls": m, "costates": n}
@@ -224,10 +238,10 @@ class ScenarioBank(Sequence[Scenario]):
             self._array(name)
 
     @classmethod
-    def shipped_families(cls, robot: str = "unicycle") -> list[str]:
-        """Return the families of which banks for a robot model are included in the package."""
+    def shipped_families(cls, robot: str = "unicycle", horizon: str = "fixed") -> list[str]:
+        """Return the families of which banks for a robot model and a kind of horizon are included in the package."""
         found = (path.name.removesuffix("-test.bank") for path in BANK_DIRECTORY.glob("*-test.bank"))
-        prefix = "" if robot == "unicycle" else f"{robot}-"
+        prefix = collection_name("", robot, horizon)
         return sorted(
             name.removeprefix(prefix)
             for name in found
@@ -235,21 +249,22 @@ class ScenarioBank(Sequence[Scenario]):
         )
 
     @classmethod
-    def shipped(cls, family: str, split: str, robot: str = "unicycle") -> ScenarioBank:
+    def shipped(cls, family: str, split: str, robot: str = "unicycle", horizon: str = "fixed") -> ScenarioBank:
         """Return a bank included in the package; repeated calls return the same object.
 
         Args:
             family: one of `leapnav.envs.FAMILIES`.
             split: "train" or "test".
             robot: model of the robot.
+            horizon: "fixed" or "free".
 
         Raises:
             ValueError: there is no such bank.
 
         """
-        check_choice("family", family, cls.shipped_families(robot))
+        check_choice("family", family, cls.shipped_families(robot, horizon))
         check_choice("split", split, SPLITS)
-        return _shipped(family if robot == "unicycle" else f"{robot}-{family}", split)
+        return _shipped(collection_name(family, robot, horizon), split)
 
     def __len__(self) -> int:
         return len(self.costs)
@@ -288,7 +303,7 @@ class ScenarioBank(Sequence[Scenario]):
             cost=float(self.costs[i]),
             second_cost=None if math.isnan(second) else second,
             certificate=(residual, defect, drift, clearance),
-            times=np.linspace(0.0, self[i].fixed_horizon, end - start),
+            times=np.linspace(0.0, float(self.horizons[i]), end - start),
             states=self.states(i),
             controls=self._array("controls")[start:end],
             costates=self._array("costates")[start:end],
@@ -372,8 +387,17 @@ def _locate(dataset: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
 
 def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
     count = len(arrays["costs"])
-    for name in ("scenario_ends", "tasks", "field_ends", "draws", "second_costs", "certificates", "path_ends"):
-        if len(arrays[name]) != count:
+    for name in (
+        "scenario_ends",
+        "tasks",
+        OPTIONAL,
+        "field_ends",
+        "draws",
+        "second_costs",
+        "certificates",
+        "path_ends",
+    ):
+        if name in arrays and len(arrays[name]) != count:
             raise ValueError(f"{name}: {len(arrays[name])} entries for {count} scenarios")
     paths = ("states", "controls", "costates")
     for ends, contents in (("scenario_ends", ("scenarios",)), ("field_ends", ("fields",)), ("path_ends", paths)):

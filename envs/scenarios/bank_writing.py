@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import Unicycle
-from leapnav.envs.scenarios.bank import FORMAT, TYPES, VERSION, attribute_bytes, digest
+from leapnav.envs.scenarios.bank import FORMAT, OPTIONAL, TYPES, VERSION, attribute_bytes, digest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import atomic_path
 
@@ -27,6 +27,7 @@ class BankEntry:
         scenario: the scenario as JSON text.
         draw: index of the random draw that produced it.
         cost, second_cost, certificate, states, controls, costates: see `Reference`.
+        horizon: duration of the optimum (s) if the horizon is free, otherwise None.
 
     """
 
@@ -38,6 +39,7 @@ class BankEntry:
     states: np.ndarray
     controls: np.ndarray
     costates: np.ndarray
+    horizon: float | None = None
 
 
 def point_times(horizon: float) -> np.ndarray:
@@ -63,7 +65,7 @@ def write_bank(
         family, seed, drawn, rejected, software: see `ScenarioBank`.
 
     Raises:
-        ValueError: the scenarios have different robot models.
+        ValueError: the scenarios have different robot models or kinds of horizon.
 
     """
     import h5py
@@ -73,6 +75,9 @@ def write_bank(
     models = sorted({scenario.robot.model for scenario in scenarios})
     if len(models) > 1:
         raise ValueError(f"entries: expected one robot model for all scenarios, got {', '.join(models)}")
+    kinds = sorted({scenario.horizon_kind for scenario in scenarios})
+    if len(kinds) > 1:
+        raise ValueError(f"entries: expected one kind of horizon for all scenarios, got {', '.join(kinds)}")
     n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
     columns: dict[str, Any] = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
@@ -89,6 +94,8 @@ def write_bank(
         "controls": np.concatenate([np.empty((0, m)), *(entry.controls for entry in entries)]),
         "costates": np.concatenate([np.empty((0, n)), *(entry.costates for entry in entries)]),
     }
+    if kinds == ["free"]:
+        columns[OPTIONAL] = [entry.horizon for entry in entries]
     arrays = {name: np.asarray(values, dtype=TYPES[name]) for name, values in columns.items()}
     attributes = {
         "format": FORMAT,

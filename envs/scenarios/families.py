@@ -13,16 +13,21 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
+from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.obstacle import Obstacle
-from leapnav.envs.scenarios.scenario import Cost, Scenario, check_robot
+from leapnav.envs.scenarios.scenario import HORIZONS, TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.clearance import clearances, footprint_clearances
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.validation import suggestion
+from leapnav.envs.utils.validation import check_choice, suggestion
 
 ARENA = (0.0, 0.0, 10.0, 10.0)
 REFERENCE_SPEED = 0.8  # m/s: the horizon is the length of the shortest path divided by this speed
 MAX_HORIZON = 40.0  # s
+TIME_WEIGHT = 0.5  # cost per second if the horizon is free
+# Duration of an optimum with a free horizon, relative to the shortest path at the cruise speed: the median of the
+# families is 1.07 to 1.15, because it also turns.
+RELATIVE_DURATION = 1.1
 MIN_DISTANCE = 4.0  # m between start and goal
 MIN_POSE_CLEARANCE = 0.25  # m at the start and the goal
 PASSAGE_MARGIN = 0.1  # m on either side of the robot, in the narrowest passage that a scenario may require
@@ -137,31 +142,42 @@ def check_family(family: object) -> None:
         raise ValueError(f"family: expected one of {', '.join(FAMILIES)} or {ALL}, got {family!r}{hint}")
 
 
+def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
+    """Return the name of the scenarios of a family for a robot model and a kind of horizon, such as "car-clutter"."""
+    return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), family])
+
+
 def sample_scenario(
-    family: str, seed: int | np.random.Generator, robot: RobotModel | Mapping[str, Any] | str = "unicycle"
+    family: str,
+    seed: int | np.random.Generator,
+    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
+    horizon: str = "fixed",
 ) -> Scenario:
     """Sample a random scenario; the same family and seed give the same scenario.
 
     Start and goal are at least 4 m apart and connected by a path with a margin of 0.1 m on either side of the robot.
-    The horizon is the length of the shortest such path divided by 0.8 m/s, and at most 40 s.
+    The horizon is the length of the shortest such path divided by 0.8 m/s, and at most 40 s; or it is free with the
+    time weight 0.5, and the time limit is 3 times an estimate of the duration of the optimum.
 
     Args:
         family: one of `FAMILIES`, or "all" to sample the family, too.
         seed: an integer, or a random generator.
         robot: name of a robot model, a dict of its fields with `model`, or a robot. Robots with the same footprint
             get the same obstacles and poses.
+        horizon: "fixed" or "free"; both have the same obstacles and poses.
 
     Raises:
-        ValueError: the family or the robot is invalid.
+        ValueError: an argument is invalid.
 
     """
     check_family(family)
+    check_choice("horizon", horizon, HORIZONS)
     body = check_robot(robot)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
     if family == ALL:
         family = list(FAMILIES)[rng.integers(len(FAMILIES))]
     name = family if isinstance(seed, np.random.Generator) else f"{family}-{seed}"
-    discs, cost = body.discs(), Cost()
+    discs, cost = body.discs(), Cost() if horizon == "fixed" else Cost(time_weight=TIME_WEIGHT)
     while True:  # rejection sampling: the draws are independent, so it ends
         layout = FAMILIES[family](rng)
         areas = np.array([layout.start, layout.goal])
@@ -181,13 +197,17 @@ def sample_scenario(
         if length is not None:
             break
     start, goal = ((*_point(pose), _rounded(pose[2])) for pose in poses)
+    times: dict[str, float | None] = {"horizon": round(min(length / REFERENCE_SPEED, MAX_HORIZON), 1)}
+    if horizon == "free":
+        limit = TIME_LIMIT_FACTOR * RELATIVE_DURATION * length / cruise_speed(body, cost)
+        times = {"horizon": None, "time_limit": round(limit, 1)}
     return Scenario(
         name=name,
         arena=ARENA,
         robot=body,
         start=start,
         goal=goal,
-        horizon=round(min(length / REFERENCE_SPEED, MAX_HORIZON), 1),
+        **times,
         obstacles=tuple(layout.obstacles),
         cost=cost,
     )

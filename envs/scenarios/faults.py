@@ -1,8 +1,10 @@
-"""Messages of the faults of a scenario: one line with field, expectation and value."""
+"""Faults of a scenario: the error, and its message in one line with field, expectation and value."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic_core import ErrorDetails
@@ -25,6 +27,10 @@ EXPECTED = {
     "model_type": "expected an object",
     "model_attributes_type": "expected an object",
 }
+
+
+class ScenarioError(ValueError):
+    """A scenario is invalid. The message is one line with the scenario and, for each fault, the field and the value."""
 
 
 def shorten(value: Any) -> str:
@@ -64,3 +70,32 @@ def fault(details: ErrorDetails, known: Callable[[Sequence[Any]], Iterable[str]]
         message = EXPECTED.get(kind, details["msg"]).format(**context)
     # The messages of whole-scenario checks contain field and value.
     return f"{path}: {message}, got {shorten(details['input'])}" if path else message
+
+
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the fields of a JSON object.
+
+    Raises:
+        ScenarioError: a key appears more than once.
+
+    """
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        repeated = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
+        raise ScenarioError(f"scenario: {repeated}: the key appears more than once")
+    return fields
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        OSError: the file cannot be read.
+
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected a scenario file (JSON), got a directory")
+    if not path.exists():
+        others = os.listdir(path.parent) if path.parent.is_dir() else []
+        raise FileNotFoundError(f"{path}: no such file{suggestion(path.name, others)}")
+    return path.read_text(encoding="utf-8-sig")

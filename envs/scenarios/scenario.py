@@ -20,37 +20,24 @@ from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator
 from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
-from leapnav.envs.scenarios.faults import fault, one_line, shorten
+from leapnav.envs.scenarios.cost import Cost, cruise_speed
+from leapnav.envs.scenarios.faults import ScenarioError, fault, one_line, read_text, shorten, unique_keys
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.records import Finite, Frozen, NotNegative, Positive, as_tuples
-from leapnav.envs.utils.validation import check_positive, suggestion
+from leapnav.envs.utils.records import Finite, Frozen, Positive, as_tuples
+from leapnav.envs.utils.validation import check_positive
 
 # Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
 # goal heading NaN if free), the horizon, the limits (m) and weights (m) of the controls, the further states (n - 3) at
-# the start and at the goal (NaN if free), and the parameters (k).
+# the start and at the goal (NaN if free), and the parameters (k). If the horizon is free, its column contains the time
+# limit, and a last column the time weight.
 START, GOAL, HORIZON, LIMITS = 0, 3, 6, 7
-
-
-class ScenarioError(ValueError):
-    """A scenario is invalid. The message is one line with the scenario and, for each fault, the field and the value."""
-
-
-class Cost(Frozen):
-    """Weights of the running cost c + 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(q), see the robot's model.
-
-    The time weight c is the cost per second.
-    """
-
-    speed_weight: Positive = 1.0
-    turn_weight: Positive = 0.5
-    proximity_weight: NotNegative = 1.0
-    proximity_scale: Positive = 0.1
-    time_weight: NotNegative = 0.0
+HORIZONS = ("fixed", "free")
+TIME_LIMIT_FACTOR = 3.0  # time limit of an episode, as a multiple of the duration of the optimum
 
 
 class Scenario(Frozen):
@@ -63,6 +50,8 @@ class Scenario(Frozen):
         start: pose (x, y, heading) at time 0.
         goal: pose (x, y, heading) at the horizon; a heading of None is free.
         horizon: duration of the task (s); None if it is free, with a positive time weight.
+        time_limit: time after which an environment truncates an episode if the horizon is free (s). None for 3 times
+            the time in which the robot drives the sum of the arena's side lengths at `cruise_speed`.
         obstacles: the obstacles, which may overlap; each has one shape, see `Obstacle`.
         cost: weights of the running cost.
         start_motion: further states of the robot at time 0, such as speed and turn rate; None for zeros.
@@ -79,6 +68,7 @@ class Scenario(Frozen):
     start: tuple[Finite, Finite, Finite]
     goal: tuple[Finite, Finite, Finite | None]
     horizon: Positive | None
+    time_limit: Positive | None = None
     obstacles: tuple[Obstacle, ...] = ()
     cost: Cost = Cost()
     start_motion: tuple[Finite, ...] | None = None
@@ -122,6 +112,8 @@ class Scenario(Frozen):
     def _check_horizon(self) -> Self:
         if self.horizon is None and self.cost.time_weight == 0:
             raise ValueError("cost.time_weight: expected a positive number, since the horizon is free, got 0")
+        if self.horizon is not None and self.time_limit is not None:
+            raise ValueError(f"time_limit: expected None, since the horizon is fixed, got {self.time_limit:g}")
         return self
 
     @model_validator(mode="after")
@@ -169,20 +161,10 @@ class Scenario(Frozen):
         """The state (n,) of the robot at the horizon; None where it is free."""
         return (*self.goal, *(self.robot.goal_motion if self.goal_motion is None else self.goal_motion))
 
-    def check_horizon(self) -> None:
-        """Check that environments and banks support the horizon.
-
-        Raises:
-            ScenarioError: it is free, or the time has a weight.
-
-        """
-        faults = []
-        if self.horizon is None:
-            faults.append("horizon: environments and banks need a number, got None")
-        if self.cost.time_weight:
-            faults.append(f"cost.time_weight: environments and banks need 0, got {self.cost.time_weight:g}")
-        if faults:
-            raise ScenarioError(one_line(self.name, faults))
+    @property
+    def horizon_kind(self) -> str:
+        """Whether the horizon is "fixed" or "free"."""
+        return "free" if self.horizon is None else "fixed"
 
     @property
     def fixed_horizon(self) -> float:
@@ -193,23 +175,41 @@ class Scenario(Frozen):
 
         """
         if self.horizon is None:
-            raise ScenarioError(one_line(self.name, ["horizon: environments and banks need a number, got None"]))
+            raise ScenarioError(one_line(self.name, ["horizon: expected a number, got None"]))
         return self.horizon
+
+    @property
+    def cruise_speed(self) -> float:
+        """Speed (m/s) of an optimum with a free horizon on a straight line without obstacles, at most the limit."""
+        return cruise_speed(self.robot, self.cost)
+
+    @property
+    def episode_limit(self) -> float:
+        """Time after which an episode ends (s): the horizon, or the time limit if the horizon is free."""
+        if self.horizon is not None:
+            return self.horizon
+        if self.time_limit is not None:
+            return self.time_limit
+        x_min, y_min, x_max, y_max = self.arena
+        return TIME_LIMIT_FACTOR * (x_max - x_min + y_max - y_min) / self.cruise_speed
 
     @cached_property
     def task(self) -> np.ndarray:
         """The packed task for the simulation and for banks, see the constants of this module (read-only).
 
         Raises:
-            ScenarioError: the horizon is free, or the time has a weight.
+            ScenarioError: the horizon is fixed, and the time has a weight.
 
         """
-        self.check_horizon()
         robot, cost = self.robot, self.cost
+        if self.horizon is not None and cost.time_weight:
+            message = f"cost.time_weight: environments and banks with a fixed horizon need 0, got {cost.time_weight:g}"
+            raise ScenarioError(one_line(self.name, [message]))
         goal = [math.nan if value is None else value for value in self.goal_state]
         controls = (*robot.limits(), *robot.control_weight(cost))
         further = (*self.start_state[3:], *goal[3:], *robot.parameters(cost))
-        task = np.array([*self.start, *goal[:3], self.fixed_horizon, *controls, *further])
+        time_weight = () if self.horizon is not None else (cost.time_weight,)
+        task = np.array([*self.start, *goal[:3], self.episode_limit, *controls, *further, *time_weight])
         task.flags.writeable = False
         return task
 
@@ -279,8 +279,8 @@ class Scenario(Frozen):
         is_text = isinstance(path_or_text, str) and path_or_text.lstrip().startswith("{")
         source, text = ("text", str(path_or_text)) if is_text else (str(path_or_text), None)
         try:
-            text = _read(Path(path_or_text)) if text is None else text
-            fields = json.loads(text, object_pairs_hook=_unique_keys)
+            text = read_text(Path(path_or_text)) if text is None else text
+            fields = json.loads(text, object_pairs_hook=unique_keys)
         except ScenarioError:
             raise
         except (ValueError, RecursionError) as error:  # syntax, encoding, numbers with too many digits, nesting
@@ -401,24 +401,6 @@ def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
             fault(details, partial(_known_fields, robot=model), ("robot",))
             for details in error.errors(include_url=False)
         ]
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if len(fields) < len(pairs):
-        repeated = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
-        raise ScenarioError(f"scenario: {repeated}: the key appears more than once")
-    return fields
-
-
-def _read(path: Path) -> str:
-    """Return the text of a file."""
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: expected a scenario file (JSON), got a directory")
-    if not path.exists():
-        others = os.listdir(path.parent) if path.parent.is_dir() else []
-        raise FileNotFoundError(f"{path}: no such file{suggestion(path.name, others)}")
-    return path.read_text(encoding="utf-8-sig")
 
 
 def check_headings(scenario: Scenario) -> None:

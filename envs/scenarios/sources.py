@@ -11,7 +11,8 @@ import numpy as np
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, check_family, sample_scenario
-from leapnav.envs.scenarios.scenario import Scenario, ScenarioError, check_robot
+from leapnav.envs.scenarios.faults import ScenarioError
+from leapnav.envs.scenarios.scenario import HORIZONS, Scenario, check_robot
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 SPLITS = ("train", "test", "fresh")
@@ -22,10 +23,11 @@ class ScenarioSource:
     """The source of an environment's scenarios: a fixed scenario, a bank, or a family.
 
     Args:
-        family, scenario, split, bank, robot: see `NavigateEnv`.
+        family, scenario, split, bank, robot, horizon: see `NavigateEnv`.
 
     Attributes:
-        robot: the robot of new scenarios; that of the bank or of the fixed scenario if one is given.
+        robot, horizon: the robot and the kind of horizon of new scenarios; those of the bank or of the fixed scenario
+            if one is given.
         family: name of the family; that of the bank if a bank is given.
         scenario: the fixed scenario, or None.
         bank: the scenario bank, or None.
@@ -44,6 +46,7 @@ class ScenarioSource:
         split: str | None = None,
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
         robot: RobotModel | Mapping[str, Any] | str | None = None,
+        horizon: str | None = None,
     ) -> None:
         if family is not None:
             check_family(family)
@@ -67,17 +70,23 @@ class ScenarioSource:
             if len(self.bank) == 0:
                 raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
         chosen = Unicycle() if robot is None else check_robot(robot)
+        if horizon is not None:
+            check_choice("horizon", horizon, HORIZONS)
         if self.bank is None and scenario is None and split != "fresh" and family != ALL:
-            self.bank = _shipped_bank(family, split, chosen)
+            self.bank = _shipped_bank(family, split, chosen, horizon or "fixed")
         given_by = (
             self.scenario.robot if self.scenario is not None else self.bank.robot if self.bank is not None else None
         )
+        place = "scenario" if self.scenario is not None else "bank"
         # A name selects the model only.
         agrees = given_by is None or (given_by.model == robot if isinstance(robot, str) else given_by == chosen)
         if robot is not None and not agrees:
-            place = "scenario" if self.scenario is not None else "bank"
             raise ValueError(f"robot: expected that of the {place}, {given_by!r}, got {chosen!r}")
         self.robot: RobotModel = given_by or chosen
+        known = self.scenario.horizon_kind if self.scenario is not None else self.bank.horizon if self.bank else None
+        if horizon is not None and known not in (None, horizon):
+            raise ValueError(f"horizon: expected that of the {place}, {known!r}, got {horizon!r}")
+        self.horizon: str = known or horizon or "fixed"
 
     def select(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:
         """Return the scenario that the options of a reset select, or its index in the bank; None without a selection.
@@ -102,22 +111,24 @@ class ScenarioSource:
         """Sample the scenario of an episode, or its index in the bank."""
         if self.bank is not None:
             return int(rng.integers(len(self.bank)))
-        return sample_scenario(self.family, rng, self.robot) if self.scenario is None else self.scenario
+        return sample_scenario(self.family, rng, self.robot, self.horizon) if self.scenario is None else self.scenario
 
 
-def _shipped_bank(family: str, split: str | None, robot: RobotModel) -> ScenarioBank | None:
-    """Return the included bank of a family for a robot, or None to sample fresh scenarios.
+def _shipped_bank(family: str, split: str | None, robot: RobotModel, horizon: str) -> ScenarioBank | None:
+    """Return the included bank of a family for a robot and a kind of horizon, or None to sample fresh scenarios.
 
     Raises:
-        ValueError: a split is given, and there is no included bank for the robot.
+        ValueError: a split is given, and there is no included bank.
 
     """
-    names = ScenarioBank.shipped_families(robot.model)
+    names = ScenarioBank.shipped_families(robot.model, horizon)
     if family in names and robot == type(robot)():
-        return ScenarioBank.shipped(family, split or "train", robot.model)
+        return ScenarioBank.shipped(family, split or "train", robot.model, horizon)
     if split is not None:
         reason = f"for {', '.join(names)}" if names else "for no family"
         which = f"{robot.model!r}" if robot == type(robot)() else f"{robot.model!r} with these parameters"
+        if horizon != "fixed":
+            which += f" with a {horizon} horizon"
         if robot != type(robot)():
             reason = "for the default parameters only"
         raise ValueError(f"split: the robot {which} has included banks {reason}, got {split!r} of {family!r}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.observations import ObservationLayout
+from leapnav.envs.simulation.observations import ObservationLayout, goal_entries
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def observation_entries(settings: EnvironmentSettings) -> list[Entry]:
     """
     if settings.dict_observation or settings.goal_conditioned:
         raise ValueError("environment: expected flat observations, got dict_observation or a goal-conditioned one")
-    names = list(_GOAL)
+    names = list(_GOAL[: goal_entries(settings)])
     if settings.motors:
         names += _MOTION
     if settings.observation == "lidar":

@@ -14,6 +14,7 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
 from leapnav.envs.scenarios.scenario import GOAL, HORIZON
 from leapnav.envs.settings import (
+    FREE_HORIZON,
     GOAL_CONDITIONED,
     LIDAR_RANGE,
     MOTORS,
@@ -30,9 +31,10 @@ from leapnav.envs.simulation.sensing import WALL_ENTRIES, map_surroundings, scan
 from leapnav.envs.simulation.state import PACKED_STATE, SPIN, TIME, VX, VY, SimulationState
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 
-# Number of entries of the parts, which are documented in `NavigateEnv`.
-GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 3, 4
-TIME_LEFT = 4  # index in the goal part
+# Number of entries of the parts, which are documented in `NavigateEnv`. If the horizon is free, the goal part has no
+# time left and nothing that depends on it.
+GOAL_ENTRIES, FREE_GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 4, 3, 4
+TIME_LEFT = 4  # index in the goal part of a fixed horizon
 # Bounds of the observation spaces (m, s, m/s or rad/s), which scenarios of realistic size do not reach.
 MAX_DISTANCE, MAX_TIME, MAX_RATE = 1000.0, 10_000.0, 20.0
 LIDAR, MAP = OBSERVATIONS.index("lidar"), OBSERVATIONS.index("map")
@@ -52,10 +54,14 @@ def _parts(settings: EnvironmentSettings) -> list[Part]:
     if settings.goal_conditioned:
         # Absolute positions must not be clipped, or distant poses would equal distant goals.
         pose = (-MAX_MAGNITUDE, -MAX_MAGNITUDE, -1.0, -1.0), (MAX_MAGNITUDE, MAX_MAGNITUDE, 1.0, 1.0)
-        parts += [Part("achieved_goal", *pose), Part("desired_goal", *pose), Part("time", (0.0,), (MAX_TIME,))]
+        parts += [Part("achieved_goal", *pose), Part("desired_goal", *pose)]
+        if not settings.free_horizon:
+            parts.append(Part("time", (0.0,), (MAX_TIME,)))
     else:
         low = (-MAX_DISTANCE, -MAX_DISTANCE, -1.0, -1.0, 0.0, -MAX_RATE, -MAX_RATE, 0.0, -MAX_RATE)
-        parts.append(Part("goal", low, (MAX_DISTANCE, MAX_DISTANCE, 1.0, 1.0, MAX_TIME, *[MAX_RATE] * 4)))
+        high = (MAX_DISTANCE, MAX_DISTANCE, 1.0, 1.0, MAX_TIME, *[MAX_RATE] * 4)
+        count = goal_entries(settings)
+        parts.append(Part("goal", low[:count], high[:count]))
     entries = motion_entries(settings)
     if entries:
         parts.append(Part("motion", (-MAX_RATE,) * entries, (MAX_RATE,) * entries))
@@ -69,6 +75,16 @@ def _parts(settings: EnvironmentSettings) -> list[Part]:
         low, high = (0.0, 0.0) + (-MAX_DISTANCE,) * vertices, (1.0, MAX_DISTANCE) + (MAX_DISTANCE,) * vertices
         parts.append(Part("obstacles", low * count, high * count))
     return [part for part in parts if part.low]
+
+
+def goal_entries(settings: EnvironmentSettings) -> int:
+    """Return the number of entries of the part `goal`."""
+    return FREE_GOAL_ENTRIES if settings.free_horizon else GOAL_ENTRIES
+
+
+def has_time_left(high: np.ndarray) -> bool:
+    """Return whether flat observations with the upper bounds `high` contain the time left, at the index TIME_LEFT."""
+    return len(high) >= GOAL_ENTRIES and float(high[TIME_LEFT]) == MAX_TIME
 
 
 def motion_entries(settings: EnvironmentSettings) -> int:
@@ -204,6 +220,7 @@ def observe_robots(robots, packed, packed_buffers, out):
     )
     deviation = settings[SENSING_NOISE]
     goal_conditioned, motors = settings[GOAL_CONDITIONED] != 0.0, settings[MOTORS] != 0.0
+    free_horizon = settings[FREE_HORIZON] != 0.0
     has_lidar, has_map = settings[OBSERVATION] == LIDAR, settings[OBSERVATION] == MAP
     count = beams.shape[1]
     sensing = 2 * int(settings[N_CONTROLS])  # first column of the sensing noise, after that of the actuation
@@ -227,21 +244,25 @@ def observe_robots(robots, packed, packed_buffers, out):
             row[4], row[5] = goal_x, goal_y
             row[6] = 0.0 if free else math.cos(goal_heading)
             row[7] = 0.0 if free else math.sin(goal_heading)
-            row[8] = time_left
-            at = 2 * POSE_ENTRIES + 1
+            at = 2 * POSE_ENTRIES
+            if not free_horizon:
+                row[at] = time_left
+                at += 1
         else:
             dx, dy = goal_x - x, goal_y - y
             ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
             turn = 0.0 if free else (goal_heading - heading + math.pi) % (2 * math.pi) - math.pi
-            time = max(time_left, settings[PERIOD])
             row[0], row[1] = ahead, left
             row[2] = 0.0 if free else math.cos(turn)
             row[3] = 0.0 if free else math.sin(turn)
-            row[4] = time_left
-            row[5], row[6] = ahead / time, left / time
-            row[7] = math.sqrt(dx * dx + dy * dy) / time
-            row[8] = turn / time
-            at = GOAL_ENTRIES
+            at = FREE_GOAL_ENTRIES
+            if not free_horizon:
+                time = max(time_left, settings[PERIOD])
+                row[4] = time_left
+                row[5], row[6] = ahead / time, left / time
+                row[7] = math.sqrt(dx * dx + dy * dy) / time
+                row[8] = turn / time
+                at = GOAL_ENTRIES
         if motors:
             row[at] = cos * state[i, VX] + sin * state[i, VY]
             row[at + 1] = cos * state[i, VY] - sin * state[i, VX]

@@ -195,8 +195,9 @@ def _draw_robot(
 
 
 def _draw_status(canvas: pygame.Surface, scene: Scene, top: int) -> None:
-    left = max(scene.scenario.fixed_horizon - scene.time, 0.0)
-    texts = [f"time left {left:.1f} s", f"cost {scene.cost:.2f}"]
+    horizon = scene.scenario.horizon
+    time = f"time {scene.time:.1f} s" if horizon is None else f"time left {max(horizon - scene.time, 0.0):.1f} s"
+    texts = [time, f"cost {scene.cost:.2f}"]
     if scene.reference_cost is not None:
         texts.append(f"optimum {scene.reference_cost:.2f}")
     size = max(10, min(20, canvas.get_width() // 28))

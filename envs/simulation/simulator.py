@@ -69,7 +69,7 @@ class BatchSimulator:
         self.state = np.zeros((count, COLUMNS))
         n, m = settings.model.sizes()
         self._n_motion, self._n_controls = n - 3, m
-        self._robots = np.zeros((count, n - 3 + m + 2 + 2))
+        self._robots = np.zeros((count, n - 3 + m + 3 + 2))
         self.tasks = np.zeros((count, LIMITS + 2 * m + 2 * (n - 3)))
         self._footprints: list[np.ndarray | None] = [None] * count
         self._known_bank: tuple[ScenarioBank, np.ndarray] | None = None
@@ -78,6 +78,7 @@ class BatchSimulator:
         self.fields = np.zeros((count, 0))
         self._packed = settings.packed()
         self._record: tuple[np.ndarray, ...] | None = None
+        self._free_horizon = settings.free_horizon
         self._disturbed, self._motors = settings.disturbed, settings.motors
         self._maps = settings.observation == "map"
         self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
@@ -103,7 +104,7 @@ class BatchSimulator:
     @property
     def _first_disc(self) -> int:
         """Column of the first disc in the array of the robots."""
-        return self._n_motion + self._n_controls + 2
+        return self._n_motion + self._n_controls + 3
 
     @property
     def _arrays(self) -> tuple[np.ndarray, ...]:
@@ -169,12 +170,14 @@ class BatchSimulator:
                 self._footprints[i] = discs
                 row[first:] = 0.0
                 row[first : first + discs.size] = discs.ravel()
+            if self._free_horizon:
+                row[first - 1] = task[-1]
             if self.settings.reward == "shaped":
                 if self._drive == ARCS:
-                    row[first - 2 : first] = task[LIMITS + m : LIMITS + 2 * m]
+                    row[first - 3 : first - 1] = task[LIMITS + m : LIMITS + 2 * m]
                 else:
                     scenario = get_scenario(choice, bank)
-                    row[first - 2 : first] = scenario.robot.metric(scenario.cost)
+                    row[first - 3 : first - 1] = scenario.robot.metric(scenario.cost)
                 self._guides[i] = self._guide(choice, bank, self.tasks[i])
             self._contacts.pop(i, None)
         stepping.start_episodes(indices, self._arrays)
@@ -187,7 +190,7 @@ class BatchSimulator:
         """Return the packed task of a scenario.
 
         Raises:
-            ValueError: the scenario has another robot than the environment.
+            ValueError: the scenario has another robot or another kind of horizon than the environment.
 
         """
         if not isinstance(choice, Scenario) and self._known_bank is not None and bank is self._known_bank[0]:
@@ -198,6 +201,13 @@ class BatchSimulator:
             raise ValueError(
                 f"robot: this environment is for {self.settings.robot!r}, but {name} has the robot {robot.model!r}; "
                 f"make the environment with robot={robot.model!r}"
+            )
+        horizon = choice.horizon_kind if isinstance(choice, Scenario) else _require(bank).horizon
+        if horizon != self.settings.horizon:
+            name = f"scenario {choice.name!r}" if isinstance(choice, Scenario) else f"bank {_require(bank).path.name}"
+            raise ValueError(
+                f"horizon: this environment is for a {self.settings.horizon} horizon, but that of {name} is {horizon}; "
+                f"make the environment with horizon={horizon!r}"
             )
         return choice.task if isinstance(choice, Scenario) else _require(bank).tasks[choice]
 
@@ -219,7 +229,8 @@ class BatchSimulator:
             bank: the bank, or None.
 
         Raises:
-            ValueError: an obstacle has more vertices than the map, or the scenario has another robot.
+            ValueError: an obstacle has more vertices than the map, or the scenario has another robot or another kind of
+                horizon.
 
         """
         if choice is not None:

@@ -23,6 +23,7 @@ from leapnav.envs.kernels.types import CUBE, INTEGERS, MATRIX, VECTOR
     REMAINING,  # time of the period after the first contact, s
     SUCCESS,
     TERMINATED,
+    TRUNCATED,
     SPEED,  # commanded speed (m/s) and turn rate (rad/s) of a robot that follows arcs, with actuation noise
     TURN_RATE,
     DURATION,  # of the period, s
@@ -31,20 +32,28 @@ from leapnav.envs.kernels.types import CUBE, INTEGERS, MATRIX, VECTOR
     SPIN,
     EFFORT,  # parts of the reward of the period, as costs
     PROXIMITY,
+    TIME_COST,
     COLLISION,
     MISS,
     SHAPING,
     REWARD,
     POTENTIAL,  # of the current state, for the shaped reward
+    TIME_WEIGHT,  # cost per second, if the horizon is free
     COLUMNS,
-) = range(25)
+) = range(28)
 
 # What the infos contain: numbers, flags, and the parts of the reward (as costs).
 INFOS = {"cost": COST, "clearance": CLEARANCE, "time": TIME}
 FLAGS = {"collision": COLLIDED, "is_success": SUCCESS}
 PARTS = {"effort": EFFORT, "proximity": PROXIMITY, "collision": COLLISION, "miss": MISS}
+_TIMED_PARTS = {**PARTS, "time": TIME_COST}
 
 N_GUIDE_POINTS = 17  # points along the reference path, for the potential
+
+
+def parts(free_horizon: bool) -> dict[str, int]:
+    """Return the columns of the parts of the reward."""
+    return _TIMED_PARTS if free_horizon else PARTS
 
 
 class SimulationState(NamedTuple):
@@ -52,9 +61,9 @@ class SimulationState(NamedTuple):
 
     Attributes:
         bodies (count, 6 or 9): see `FreeBodies`.
-        robots (count, n - 3 + m + 2 + 2 D): further states of the robot; controls of the period, with actuation noise;
-            weights of squared speed and turn rate in the potential; footprint of at most D discs, each with its offset
-            along the heading and its radius (m), which is not positive if the disc is unused.
+        robots (count, n - 3 + m + 3 + 2 D): further states of the robot; controls of the period, with actuation noise;
+            weights of squared speed and turn rate in the potential; the time weight; footprint of at most D discs, each
+            with its offset along the heading and its radius (m), which is not positive if the disc is unused.
         state (count, COLUMNS): see the constants of this module.
         tasks (count, K): see `leapnav.envs.scenarios.scenario`.
         fields (count, L): packed obstacle fields; the end of a row is unused.

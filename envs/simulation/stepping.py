@@ -21,6 +21,7 @@ from leapnav.envs.settings import (
     COLLISION_PENALTY,
     DISCOUNT,
     DRIVE,
+    FREE_HORIZON,
     GRIP,
     HEADING_TOLERANCE,
     MASS,
@@ -73,6 +74,9 @@ from leapnav.envs.simulation.state import (
     SUCCESS,
     TERMINATED,
     TIME,
+    TIME_COST,
+    TIME_WEIGHT,
+    TRUNCATED,
     TURN_RATE,
     VX,
     VY,
@@ -102,8 +106,9 @@ def control_effort(tasks, controls, i):
 def potential(i, sim):
     """Return minus an estimate of the cost-to-go of robot i: following the reference path at constant speed.
 
-    The estimate is at most the miss penalty. Any function of the state leaves the optimal policy unchanged (Ng, Harada
-    and Russell, 1999); a good estimate makes it easier to learn.
+    If the horizon is free, the speed is the one with the lowest cost. The estimate is at most the miss penalty. Any
+    function of the state leaves the optimal policy unchanged (Ng, Harada and Russell, 1999); a good estimate makes it
+    easier to learn.
     """
     bodies, tasks, guides = sim.bodies, sim.tasks, sim.guides
     length = np.inf
@@ -115,7 +120,10 @@ def potential(i, sim):
     time = max(tasks[i, HORIZON] - sim.state[i, TIME], sim.settings[PERIOD])
     weights = int(sim.settings[N_MOTION] + sim.settings[N_CONTROLS])
     square = sim.robots[i, weights] * (length * length) + sim.robots[i, weights + 1] * (turn * turn)
-    estimate = 0.5 * square / time
+    if sim.settings[FREE_HORIZON] != 0.0:
+        estimate = math.sqrt(2.0 * sim.state[i, TIME_WEIGHT] * square)
+    else:
+        estimate = 0.5 * square / time
     return -min(estimate, sim.settings[MISS_PENALTY])
 
 
@@ -125,7 +133,7 @@ def start_episodes(robots, packed):
     sim = SimulationState(*packed)
     bodies, state, tasks, settings = sim.bodies, sim.state, sim.tasks, sim.settings
     n_motion, n_controls = int(settings[N_MOTION]), int(settings[N_CONTROLS])
-    further, first_disc = LIMITS + 2 * n_controls, n_motion + n_controls + 2
+    further, first_disc = LIMITS + 2 * n_controls, n_motion + n_controls + 3
     for i in robots:
         for column in range(bodies.shape[1]):
             bodies[i, column] = tasks[i, START + column] if column < 3 else 0.0
@@ -139,6 +147,8 @@ def start_episodes(robots, packed):
             bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.robots[i, first_disc:].reshape((-1, 2)), sim.fields[i]
         )[0]
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
+        if settings[FREE_HORIZON] != 0.0:
+            state[i, TIME_WEIGHT] = sim.robots[i, first_disc - 1]
         if settings[SHAPED] != 0.0:
             state[i, POTENTIAL] = potential(i, sim)
 
@@ -165,7 +175,7 @@ def command(actions, active, packed):
     for i in range(len(state)):
         for column in (IN_CONTACT, REMAINING, SPEED, TURN_RATE, DURATION):
             state[i, column] = 0.0
-        for column in (EFFORT, PROXIMITY, COLLISION, MISS, SHAPING, REWARD):
+        for column in (EFFORT, PROXIMITY, TIME_COST, COLLISION, MISS, SHAPING, REWARD):
             state[i, column] = 0.0
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
         if not active[i]:
@@ -220,7 +230,7 @@ def drive_paths(packed, motion):
         if general:
             bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
         robot, field, duration = sim.robots[i], sim.fields[i], state[i, DURATION]
-        discs = robot[n - 1 + m :].reshape((-1, 2))
+        discs = robot[n + m :].reshape((-1, 2))
         if duration == 0.0 or (not general and is_one_disc(discs)):
             continue
         parameters, u = sim.tasks[i, first:], robot[n - 3 : n - 3 + m]
@@ -266,13 +276,13 @@ def drive_arcs(actions, active, packed):
     """
     sim = SimulationState(*packed)
     bodies, state = sim.bodies, sim.state
-    wheels, all_discs = sim.settings[DRIVE] == WHEELS, sim.robots.shape[1] == 6
+    wheels, all_discs = sim.settings[DRIVE] == WHEELS, sim.robots.shape[1] == 7
     invalid = command(actions, active, packed)
     if invalid >= 0:
         return invalid
     for i in range(len(state)):
         bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        if state[i, DURATION] == 0.0 or not (all_discs or is_one_disc(sim.robots[i, 4:].reshape((-1, 2)))):
+        if state[i, DURATION] == 0.0 or not (all_discs or is_one_disc(sim.robots[i, 5:].reshape((-1, 2)))):
             continue
         x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.fields[i]
         distance, turn = state[i, SPEED] * state[i, DURATION], state[i, TURN_RATE] * state[i, DURATION]
@@ -385,23 +395,30 @@ def end_periods(active, packed):
     """Complete a period: update time, cost and reward, and determine whether the episode has ended."""
     sim = SimulationState(*packed)
     state, settings = sim.state, sim.settings
+    free = settings[FREE_HORIZON] != 0.0
     for i in range(len(state)):
         if not active[i]:
             continue
         state[i, STEPS] += 1.0
         state[i, TIME] = min(state[i, STEPS] * settings[PERIOD], sim.tasks[i, HORIZON])
         state[i, COST] += state[i, EFFORT] + state[i, PROXIMITY]
+        if free:
+            state[i, TIME_COST] = state[i, TIME_WEIGHT] * state[i, DURATION]
+            state[i, COST] += state[i, TIME_COST]
         if state[i, IN_CONTACT] != 0.0 and state[i, COLLIDED] == 0.0:
             state[i, COLLISION] = settings[COLLISION_PENALTY]
             state[i, COLLIDED] = 1.0
         last = state[i, STEPS] >= state[i, LAST_STEP]
-        reached = last and at_goal(i, sim)
+        reached = (free or last) and at_goal(i, sim)
         state[i, SUCCESS] = 1.0 if reached and state[i, COLLIDED] == 0.0 else 0.0
-        ended = last or (state[i, COLLIDED] != 0.0 and settings[TERMINATE_ON_COLLISION] != 0.0)
+        ended = (reached if free else last) or (state[i, COLLIDED] != 0.0 and settings[TERMINATE_ON_COLLISION] != 0.0)
         state[i, TERMINATED] = 1.0 if ended else 0.0
+        state[i, TRUNCATED] = 1.0 if free and last and not ended else 0.0
         if ended and not reached:
             state[i, MISS] = settings[MISS_PENALTY]
         reward = -state[i, EFFORT] - state[i, PROXIMITY] - state[i, COLLISION] - state[i, MISS]
+        if free:
+            reward -= state[i, TIME_COST]
         if settings[SHAPED] != 0.0:
             after = 0.0 if ended else potential(i, sim)
             state[i, SHAPING] = settings[DISCOUNT] * after - state[i, POTENTIAL]

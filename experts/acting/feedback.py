@@ -7,11 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
+from leapnav.envs.scenarios.faults import ScenarioError
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.experts.acting.gains import Gains
 from leapnav.experts.acting.tracking import FLOW_ACCURACY, advance, control_at, follow, follow_all
 from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -26,6 +28,7 @@ SEARCH_PAUSE = 0.5  # s after an unsuccessful search before the next one
 MIN_STEP = 1 / 16  # smallest step of the continuation in the state, as a fraction of the distance
 LARGE_DEVIATION = 0.05  # m or rad; after a larger deviation the clearance of the new path is checked
 CLEARANCE_SAMPLING = 0.05  # s between the points of this check
+MIN_FREE_TIME = 0.02  # s; with less time left until the goal, a free horizon is searched again
 GAIN_SAMPLING = 0.05  # s between the points of the gains
 GAIN_HOLD = 0.25  # s before the horizon from which the gains are constant, because they grow without bound
 
@@ -72,7 +75,7 @@ class Feedback:
         problem = problem.with_winding_of(path.states)
         previous, self._arrays = getattr(self, "_arrays", problem.arrays), problem.arrays
         for duration in SEGMENT_DURATIONS:
-            segments = max(1, math.ceil(problem.fixed_horizon / duration - 1e-9))
+            segments = max(1, math.ceil(problem.horizon_of(path) / duration - 1e-9))
             times, nodes = start_nodes(problem, path, segments)
             found, _, _ = self._newton(times + start_time, nodes, problem.arrays.start, start_time, TOLERANCE)
             if found is not None:
@@ -145,24 +148,36 @@ class Feedback:
             transition[:] = np.eye(2 * n)
             duration = times[k + 1] - times[k]
             propagate(arrays.flow, extremal[k].copy(), transition, duration, FLOW_ACCURACY, 0.0, False)
-        slopes = np.zeros((len(times), n, n))
-        free = arrays.free
+        slopes, shifts = np.zeros((len(times), n, n)), np.zeros((len(times), n))
+        free, rates = arrays.free, np.empty_like(extremal)
+        for z, rate in zip(extremal, rates, strict=True):
+            hamiltonian(arrays.flow, z, rate)
         for k in range(len(times) - 2, -1, -1):
             A, B = transitions[k, :n, :n], transitions[k, :n, n:]
             C, D = transitions[k, n:, :n], transitions[k, n:, n:]
             if k == len(times) - 2:  # the final condition of each component: on the state, or on the costate if free
                 left, right = np.where(free[:, None], D, B), np.where(free[:, None], C, A)
                 slopes[k] = -np.linalg.solve(left, right)
+                shifts[k] = -np.linalg.solve(left, np.where(free, rates[-1, n:], rates[-1, :n]))
             else:
-                slopes[k] = np.linalg.solve(D - slopes[k + 1] @ B, slopes[k + 1] @ A - C)
+                left = D - slopes[k + 1] @ B
+                slopes[k] = np.linalg.solve(left, slopes[k + 1] @ A - C)
+                shifts[k] = np.linalg.solve(left, shifts[k + 1])
+        if self.scenario.horizon is None:  # the deviation changes the final time, so that the Hamiltonian remains 0
+            for k in range(len(times) - 1):
+                along = slopes[k].T @ rates[k, :n] - rates[k, n:]
+                slopes[k] -= np.outer(shifts[k], along) / (rates[k, :n] @ shifts[k])
         last = max(0, int(np.searchsorted(times, end - GAIN_HOLD, side="right")) - 1)
         slopes[last:] = slopes[last]
         return Gains(times, extremal, slopes, arrays.control, arrays.data, self._m)
 
     def _resolve(self, state: np.ndarray, time: float, tol: float) -> _Solution | None:
         """The solution from a state and time, None without one."""
-        if self._stored.times[-1] - time <= 0.0:
+        left = self._stored.times[-1] - time
+        if left <= 0.0 and self.scenario.horizon is not None:
             return None
+        if left <= MIN_FREE_TIME and self.scenario.horizon is None:  # the robot has missed the goal
+            return self._stored if self._search(state, time) else None
         found, times, nodes = self._newton(*self._stored[:2], state, time, tol)
         check_clearance = np.abs(state[:3] - nodes[0, :3]).max() > LARGE_DEVIATION
         if found is None:
@@ -188,14 +203,12 @@ class Feedback:
         """Solve by continuation in the state, with steps that are halved when they fail."""
         start = nodes[0, : self._n]
 
-        def advance_to(fraction: float, previous: np.ndarray) -> np.ndarray | None:
-            nonlocal found
-            found, _, _ = self._newton(times, previous, start + fraction * (state - start), times[0], tol)
-            return None if found is None else found.nodes
+        def advance_to(fraction: float, previous: _Solution) -> _Solution | None:
+            target = start + fraction * (state - start)
+            return self._newton(previous.times, previous.nodes, target, times[0], tol)[0]
 
-        found: _Solution | None = None
-        reached = step_halving(advance_to, nodes, first_step=0.5, min_step=MIN_STEP)
-        return None if reached is None else found
+        guess = _Solution(times, nodes, np.zeros(len(times) - 1))
+        return step_halving(advance_to, guess, first_step=0.5, min_step=MIN_STEP)
 
     def _clearance(self, solution: _Solution) -> float:
         """Smallest clearance (m) of states of a solution that are evenly spaced in time."""
@@ -208,7 +221,9 @@ class Feedback:
     def _remaining_scenario(self, state: np.ndarray, time: float) -> Scenario | None:
         """The rest of the episode as a scenario, None in collision or without time left."""
         x, y, heading, *motion = state.tolist()
-        update: dict[str, Any] = {"start": (x, y, heading), "horizon": float(self.scenario.fixed_horizon - time)}
+        update: dict[str, Any] = {"start": (x, y, heading)}
+        if self.scenario.horizon is not None:
+            update["horizon"] = float(self.scenario.horizon - time)
         if motion:
             update["start_motion"] = tuple(motion)
         try:

@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+# Interval (s) around the last closest point in which the next one is searched; a path may return to the same pose.
+SEARCHED_BEFORE, SEARCHED_AFTER = 0.5, 1.0
+
 
 class Gains:
     """Feedback law: the minimising control for the costate lambda = lambda*(t) + P(t) (q - q*(t)).
@@ -58,6 +61,16 @@ class Gains:
         control = np.empty(self._n_controls)
         self._control(z, self._data, control)
         return control
+
+    def closest(self, state: np.ndarray, time: float) -> float:
+        """Return the time (s) of the point of the extremal that is closest to a state (n,), close to a given time.
+
+        With a free horizon, the control depends on the state alone, and the extremal is followed by this time.
+        """
+        near = (self.times >= time - SEARCHED_BEFORE) & (self.times <= time + SEARCHED_AFTER)
+        n = self.slopes.shape[1]
+        distances = np.linalg.norm(self.extremal[near, :n] - np.asarray(state, dtype=float), axis=1)
+        return float(self.times[near][distances.argmin()])
 
     def _locate(self, time: float) -> tuple[int, float]:
         """Index of the interval that contains a time, and the fraction of the interval before that time."""

@@ -46,11 +46,13 @@ def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) 
 
     Each action is the optimal control in the middle of its period; for a robot with further states it is the mean over
     the period, with which the states that integrate a control have no error. The environment integrates held controls
-    exactly, so the error of the resulting path is of second order in the control period.
+    exactly, so the error of the resulting path is of second order in the control period. If the horizon is free, the
+    episode usually ends before the last actions, within the tolerances of the goal.
     """
-    count = max(1, math.ceil(scenario.fixed_horizon / control_period - 1e-6))
+    horizon = extremal.horizon if scenario.horizon is None else scenario.horizon
+    count = max(1, math.ceil(horizon / control_period - 1e-6))
     starts = control_period * np.arange(count)
-    ends = np.minimum(starts + control_period, scenario.fixed_horizon)
+    ends = np.minimum(starts + control_period, horizon)
     middles = (starts + ends) / 2
     controls = extremal.evaluate(middles)[1]
     if scenario.robot.sizes()[0] > 3:  # Simpson's rule
@@ -72,7 +74,12 @@ class _Situation:
 
 @dataclass
 class _Robot:
-    """The solution of one robot's episode."""
+    """The solution of one robot's episode.
+
+    Attributes:
+        progress: time (s) of the point of the extremal to which the gains apply.
+
+    """
 
     scenario: Scenario
     time: float
@@ -80,6 +87,7 @@ class _Robot:
     feedback: Feedback
     gains: Gains | None
     label: tuple[float, np.ndarray]  # cost-to-go and costate of the last action
+    progress: float = 0.0
 
 
 class ExpertPolicy:
@@ -164,7 +172,8 @@ class ExpertPolicy:
 
         Args:
             state: states of the robots, shape (n,), or (N, n) for several robots; None: the current states.
-            time: s since the start of the episode, a number or (N,); None: the current times.
+            time: s since the start of the episode, a number or (N,); None: the current times. If the horizon is free,
+                the value depends on the state alone.
 
         Returns:
             A float, or shape (N,) for several robots.
@@ -206,8 +215,9 @@ class ExpertPolicy:
             situations = [replace(s, state=p) for s, p in zip(situations, np.broadcast_to(states, shape), strict=True)]
         times = [s.time for s in situations] if time is None else np.broadcast_to(time, (count,)).tolist()
         for situation, t in zip(situations, times, strict=True):
-            if not 0.0 <= t < situation.scenario.fixed_horizon:
-                raise ValueError(f"time: expected a number from 0 to {situation.scenario.fixed_horizon:g}, got {t!r}")
+            end = math.inf if situation.scenario.horizon is None else situation.scenario.horizon
+            if not 0.0 <= t < end:
+                raise ValueError(f"time: expected a number from 0 to {end:g}, got {t!r}")
 
         def ask(i: int, situation: _Situation) -> tuple[float, np.ndarray]:
             return self._robot(i, situation).feedback.value(situation.state, times[i])
@@ -215,13 +225,15 @@ class ExpertPolicy:
         return self._each(ask, situations)
 
     def _act(self, i: int, situation: _Situation) -> np.ndarray:
-        left = situation.scenario.fixed_horizon - situation.time
+        left = situation.scenario.episode_limit - situation.time
         if left <= 0.0:  # the episode has ended
             return np.zeros(self._m)
         robot = self._robot(i, situation)
         ahead = min(situation.period, left) / 2
         if robot.gains is not None:
-            control = robot.gains.control(situation.state, situation.time, ahead)
+            is_free = situation.scenario.horizon is None
+            robot.progress = robot.gains.closest(situation.state, robot.progress) if is_free else situation.time
+            control = robot.gains.control(situation.state, robot.progress, ahead)
         else:
             if self._feedback == "resolve":
                 solved = robot.feedback.update(situation.state, situation.time)

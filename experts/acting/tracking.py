@@ -9,7 +9,7 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import MATRIX, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, END_CONDITION, FLOW, NewtonOptions
 from leapnav.experts.numerics.integrator import propagate
-from leapnav.experts.solvers.newton import solve_nodes
+from leapnav.experts.solvers.newton import CONVERGED, solve_nodes
 
 FLOW_ACCURACY = 1e-8  # error tolerance of the integration between nodes
 MIN_SEGMENT = 0.02  # s; a shorter first segment is merged with the next one
@@ -70,4 +70,7 @@ def advance(flow, times, nodes, state, time, end, tolerance):
     costs, log = np.empty(count - 1), np.empty((MAX_ITERATIONS + 1, 3))
     options = NewtonOptions(tolerance, 0.1 * tolerance, MAX_ITERATIONS, True)
     code, _, _, _ = solve_nodes(flow, remaining, new_nodes, state, end, options, costs, log)
+    if end.free_time and code == CONVERGED:  # the times left have been solved for, too
+        for row in range(count):
+            new_times[row] = time + remaining[row]
     return code, new_times, new_nodes, costs, before

@@ -18,8 +18,8 @@ import leapnav
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
-from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
-from leapnav.envs.scenarios.scenario import check_robot
+from leapnav.envs.scenarios.families import FAMILIES, collection_name, sample_scenario
+from leapnav.envs.scenarios.scenario import HORIZONS, TIME_LIMIT_FACTOR, check_robot
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.store import Arrays, ResumableStore, discard
@@ -59,6 +59,7 @@ def build_bank(
     out: str | os.PathLike[str],
     *,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
+    horizon: str = "fixed",
     seed: int = 0,
     workers: int = 1,
     progress: bool = True,
@@ -74,6 +75,8 @@ def build_bank(
         count: number of scenarios in the bank.
         out: file of the bank. A complete bank is returned unchanged.
         robot: name of a robot model, a dict of its fields with `model`, or a robot.
+        horizon: "fixed" or "free", see `sample_scenario`. The time limit of a scenario with a free horizon is 3 times
+            the duration of its optimum.
         seed: seed of the bank; draw k uses a generator with the seed (seed, k).
         workers: number of processes.
         progress: show a progress bar.
@@ -86,6 +89,7 @@ def build_bank(
     """
     check_choice("family", family, FAMILIES)
     body = check_robot(robot)
+    check_choice("horizon", horizon, HORIZONS)
     check_at_least("count", count, 1)
     check_at_least("workers", workers, 1)
     check_at_least("seed", seed, 0)
@@ -93,15 +97,18 @@ def build_bank(
     if target.is_dir():
         raise IsADirectoryError(f"{target}: is a directory")
     if target.exists():
-        return _complete(target, family, count, seed, body)
+        return _complete(target, family, count, seed, body, horizon)
     if not target.absolute().parent.is_dir():
         raise FileNotFoundError(f"{target.parent}: no such directory")
     settings = {"version": VERSION, "software": leapnav.__version__, "family": family, "seed": seed}
     if body != Unicycle():  # as before there were other robots
         settings["robot"] = body.model_dump(mode="json", exclude_none=True)
+    if horizon != "fixed":
+        settings["horizon"] = horizon
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="4 * n_jobs")
     with ResumableStore(_build_directory(target), "bank", settings, BankError) as store:
-        reasons = _solve(store, pool, partial(draw, family=family, seed=seed, robot=body), count, progress)
+        compute = partial(draw, family=family, seed=seed, robot=body, horizon=horizon)
+        reasons = _solve(store, pool, compute, count, progress)
         entries = [_entry(number, store.read(number)) for number, reason in reasons.items() if not reason]
         write_bank(
             target,
@@ -116,7 +123,7 @@ def build_bank(
     return ScenarioBank(target)
 
 
-def draw(number: int, family: str, seed: int, robot: RobotModel | None = None) -> Arrays:
+def draw(number: int, family: str, seed: int, robot: RobotModel | None = None, horizon: str = "fixed") -> Arrays:
     """One random scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
 
     Args:
@@ -124,24 +131,27 @@ def draw(number: int, family: str, seed: int, robot: RobotModel | None = None) -
         family: family of the scenario.
         seed: seed of the bank.
         robot: the robot; None for the unicycle.
+        horizon: "fixed" or "free".
 
     """
     body = robot or Unicycle()
-    scenario = sample_scenario(family, np.random.default_rng([seed, number]), body)
-    prefix = "" if body.model == "unicycle" else f"{body.model}-"
-    scenario = scenario.model_copy(update={"name": f"{prefix}{family}-{seed}-{number}"})
+    scenario = sample_scenario(family, np.random.default_rng([seed, number]), body, horizon)
+    name = collection_name(family, body.model, horizon)
+    scenario = scenario.model_copy(update={"name": f"{name}-{seed}-{number}"})
     optimum = find_optimum(scenario)
     rejection = judge(optimum)
     if rejection is not None:
         return {"rejected": np.array(rejection.value)}
     certificate = optimum.certificate
     assert certificate is not None
-    states, controls, costates = (
-        values.astype("<f4") for values in optimum.evaluate(point_times(scenario.fixed_horizon))
-    )
+    duration = optimum.horizon
+    if scenario.horizon is None:
+        scenario = scenario.model_copy(update={"time_limit": round(TIME_LIMIT_FACTOR * duration, 1)})
+    states, controls, costates = (values.astype("<f4") for values in optimum.evaluate(point_times(duration)))
     return {
         "rejected": np.array(""),
         "scenario": np.frombuffer(scenario.to_json().encode(), dtype="u1"),
+        **({"horizon": np.array(duration)} if scenario.horizon is None else {}),
         "cost": np.array(optimum.cost),
         "second_cost": np.array(optimum.alternatives[0].cost if optimum.alternatives else math.nan),
         "certificate": np.array(
@@ -182,15 +192,17 @@ def _entry(number: int, arrays: Arrays) -> BankEntry:
         states=arrays["states"],
         controls=arrays["controls"],
         costates=arrays["costates"],
+        horizon=float(arrays["horizon"]) if "horizon" in arrays else None,
     )
 
 
-def _complete(target: Path, family: str, count: int, seed: int, robot: RobotModel) -> ScenarioBank:
+def _complete(target: Path, family: str, count: int, seed: int, robot: RobotModel, horizon: str) -> ScenarioBank:
     """The bank at `target`, if it is the requested one."""
     bank = ScenarioBank(target)
     expected: dict[str, Any] = {"family": family, "seed": seed, "count": count, "software": leapnav.__version__}
     found: dict[str, Any] = {"family": bank.family, "seed": bank.seed, "count": len(bank), "software": bank.software}
     expected["robot"], found["robot"] = robot, bank.robot
+    expected["horizon"], found["horizon"] = horizon, bank.horizon
     for name, value in expected.items():
         if found[name] != value:
             raise BankError(f"{target}: exists, with {name} {found[name]!r} instead of {value!r}; choose another name")

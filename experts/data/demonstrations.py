@@ -19,8 +19,8 @@ import leapnav
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import MAX_HORIZON
-from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.families import MAX_HORIZON, collection_name
+from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions
@@ -40,7 +40,10 @@ MIN_RECOVERY_CLEARANCE = 0.02  # m
 # another local optimum and is dropped.
 MAX_RECOVERY_COST = (2.0, 1.0)
 # Step limit of a dataset's environment. No episode reaches it, but d3rlpy requires a limit.
-MAX_STEPS = math.ceil(MAX_HORIZON / CONTROL_PERIOD) + 1
+MAX_STEPS = {
+    "fixed": math.ceil(MAX_HORIZON / CONTROL_PERIOD) + 1,
+    "free": math.ceil(TIME_LIMIT_FACTOR * MAX_HORIZON / CONTROL_PERIOD) + 1,
+}
 N_SCORED = 100  # scenarios from which the score of random actions is computed
 
 
@@ -78,7 +81,7 @@ class Demonstration:
     @property
     def path(self) -> Trajectory:
         """States and costates at the ends of the control periods."""
-        times = np.minimum(CONTROL_PERIOD * np.arange(len(self.states)), self.scenario.fixed_horizon)
+        times = np.minimum(CONTROL_PERIOD * np.arange(len(self.states)), self.scenario.episode_limit)
         return Trajectory(times, self.states, self.costates)
 
     @property
@@ -92,8 +95,8 @@ def demonstrate(env: gym.Env, scenario: Scenario, extremal: Extremal) -> Demonst
     inner = env.unwrapped
     assert isinstance(inner, NavigateEnv)
     actions = plan_actions(extremal, scenario, inner.control_period)
-    driven = _drive(env, scenario, lambda step: (actions[step], actions[step]))
-    times = np.minimum(inner.control_period * np.arange(len(driven["states"])), scenario.fixed_horizon)
+    driven = _drive(env, scenario, lambda step: (actions[step], actions[step]) if step < len(actions) else None)
+    times = np.minimum(inner.control_period * np.arange(len(driven["states"])), extremal.horizon)
     costates, cost_to_go = extremal.evaluate(times)[2], np.asarray(extremal.cost_to_go(times))
     return Demonstration(scenario=scenario, costates=costates, cost_to_go=cost_to_go, **driven)
 
@@ -120,7 +123,7 @@ def demonstrate_disturbed(
     limits = scenario.robot.limits()
     costates, costs = [], []
 
-    def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
+    def label() -> None:
         state, now = inner.state, inner.time
         cost, costate = np.nan, np.full(len(state), np.nan)
         if feedback.update(state, now):
@@ -128,23 +131,34 @@ def demonstrate_disturbed(
                 cost, costate = feedback.value(state, now)
         costs.append(cost)
         costates.append(costate)
-        ahead = min(inner.control_period, scenario.fixed_horizon - inner.time) / 2
+
+    def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
+        label()
+        ahead = min(inner.control_period, scenario.episode_limit - inner.time) / 2
         action = np.clip(feedback.control(inner.time + ahead) / limits, -1.0, 1.0).astype(np.float32)
         executed = np.clip(action + noise * rng.standard_normal(len(limits)), -1.0, 1.0).astype(np.float32)
         return action, executed
 
     driven = _drive(env, scenario, decide)
-    costs.append(0.0)
-    costates.append(feedback.final_costate)
+    if scenario.horizon is None:  # the episode ends within the tolerances of the goal
+        label()
+    else:
+        costs.append(0.0)
+        costates.append(feedback.final_costate)
     return Demonstration(scenario=scenario, costates=np.array(costates), cost_to_go=np.array(costs), **driven)
 
 
-def _drive(env: gym.Env, scenario: Scenario, decide: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
-    """Play one episode; `decide(step)` returns the action to record and the action to execute."""
+def _drive(
+    env: gym.Env, scenario: Scenario, decide: Callable[[int], tuple[np.ndarray, np.ndarray] | None]
+) -> dict[str, Any]:
+    """Play one episode; `decide(step)` returns the action to record and the action to execute, or None to stop."""
     actions: list[np.ndarray] = []
 
-    def act(observation: Any, info: dict[str, Any]) -> np.ndarray:
-        action, executed = decide(len(actions))
+    def act(observation: Any, info: dict[str, Any]) -> np.ndarray | None:
+        decided = decide(len(actions))
+        if decided is None:
+            return None
+        action, executed = decided
         actions.append(action)
         return executed
 
@@ -181,18 +195,20 @@ def recovery(
         The new scenario and its extremal; None if there is no suitable one.
 
     """
-    time = rng.uniform(0.0, max(scenario.fixed_horizon - MIN_RECOVERY_TIME, 0.0))
+    time = rng.uniform(0.0, max(extremal.horizon - MIN_RECOVERY_TIME, 0.0))
     n = scenario.robot.sizes()[0]
     perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
     state = extremal.evaluate(time)[0] + perturbation
     x, y, heading, *motion = state.tolist()
     if footprint_clearance(x, y, heading, scenario.discs, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
-    update = {"name": name, "start": (x, y, heading), "horizon": float(scenario.fixed_horizon - time)}
+    update: dict[str, Any] = {"name": name, "start": (x, y, heading)}
+    if scenario.horizon is not None:
+        update["horizon"] = float(scenario.horizon - time)
     rest = scenario.model_copy(update={**update, "start_motion": tuple(motion)} if motion else update)
     times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])
     states, _, costates = extremal.evaluate(times + time)
-    times[-1] = rest.fixed_horizon
+    times[-1] = extremal.horizon - time
     states += perturbation * np.exp(-times / PERTURBATION_DECAY)[:, None]
     solution = solve(rest, "multiple_shooting", guess=Trajectory(times, states, costates))
     factor, summand = MAX_RECOVERY_COST
@@ -201,7 +217,9 @@ def recovery(
     return rest, solution
 
 
-def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: str, robot: RobotModel) -> None:
+def write_dataset(
+    demonstrations: Iterable[Demonstration], root: Path, family: str, robot: RobotModel, horizon: str = "fixed"
+) -> None:
     """Write a Minari dataset with state, costate and cost-to-go of every step.
 
     The scenario of an episode is its `options["scenario"]`, so `env.reset(options=...)` with the options that Minari
@@ -212,13 +230,14 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: s
         root: root directory of Minari datasets.
         family: family of the scenarios.
         robot: the robot.
+        horizon: "fixed" or "free".
 
     """
-    arguments: dict[str, Any] = {}
+    arguments: dict[str, Any] = {} if horizon == "fixed" else {"horizon": horizon, "split": "fresh"}
     if robot != Unicycle():
         fields = robot.model_dump(mode="json", exclude_none=True)
-        arguments = {"robot": robot.model if robot == type(robot)() else fields, "split": "fresh"}
-    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=MAX_STEPS, **arguments)
+        arguments |= {"robot": robot.model if robot == type(robot)() else fields, "split": "fresh"}
+    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=MAX_STEPS[horizon], **arguments)
     scenarios: list[Scenario] = []
     returns: list[float] = []
 
@@ -231,7 +250,7 @@ def write_dataset(demonstrations: Iterable[Demonstration], root: Path, family: s
 
     with _minari_root(str(root)):
         dataset = minari.create_dataset_from_buffers(
-            dataset_id(family, robot.model),
+            dataset_id(family, robot.model, horizon),
             cast(list[EpisodeBuffer], episodes()),  # Minari declares a list, but any iterable works
             env=env,
             eval_env=env,
@@ -291,9 +310,9 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
     )
 
 
-def dataset_id(family: str, robot: str = "unicycle") -> str:
-    """The Minari dataset id of the demonstrations of a family and a robot model."""
-    return f"leapnav/{family}/expert-v0" if robot == "unicycle" else f"leapnav/{robot}-{family}/expert-v0"
+def dataset_id(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
+    """The Minari dataset id of the demonstrations of a family, a robot model and a kind of horizon."""
+    return f"leapnav/{collection_name(family, robot, horizon)}/expert-v0"
 
 
 @contextmanager

@@ -21,11 +21,11 @@ from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.families import check_family, sample_scenario
-from leapnav.envs.scenarios.scenario import Scenario, check_robot
+from leapnav.envs.scenarios.scenario import HORIZONS, Scenario, check_robot
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
-from leapnav.envs.utils.validation import check_at_least
+from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.demonstrations import (
     Demonstration,
     demonstrate,
@@ -84,6 +84,7 @@ def rollout(
     out: str | os.PathLike[str],
     *,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
+    horizon: str = "fixed",
     seed: int = 1000,
     recoveries: int = 0,
     noise: float = 0.0,
@@ -103,8 +104,9 @@ def rollout(
             replaced by following ones. Seeds 0 and 1 are refused: their scenarios are in the included banks, one of
             them in the test split.
         out: directory, a root of Minari datasets. Read it with `load_demonstrations(out)`; if the environment variable
-            MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family, robot))`.
+            MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family, robot, horizon))`.
         robot: name of a robot model, a dict of its fields with `model`, or a robot.
+        horizon: "fixed" or "free", see `sample_scenario`.
         recoveries: number of additional demonstrations per scenario that start from perturbed states of the optimum.
         noise: standard deviation of the noise that is added to the executed actions, which are in [-1, 1]. The expert
             then acts in closed loop and the dataset contains its own actions, which show how to recover.
@@ -123,6 +125,7 @@ def rollout(
 
     """
     check_family(family)
+    check_choice("horizon", horizon, HORIZONS)
     check_at_least("count", count, 1)
     check_at_least("recoveries", recoveries, 0)
     check_at_least("workers", workers, 1)
@@ -140,16 +143,20 @@ def rollout(
     body = check_robot(robot)
     if body != Unicycle():  # as before there were other robots
         settings["robot"] = body.model_dump(mode="json", exclude_none=True)
+    if horizon != "fixed":
+        settings["horizon"] = horizon
     finished = None if force else _finished(directory, {**settings, "count": count})
     if finished is not None:
         return finished
     _prepare(directory, force)
     # The settings of the store exclude `count`: a longer rollout continues a shorter one.
     with ResumableStore(directory / WORK, "rollout", settings) as store:
-        compute = partial(_shard, family=family, seed=seed, recoveries=recoveries, noise=float(noise), robot=body)
+        compute = partial(
+            _shard, family=family, seed=seed, recoveries=recoveries, noise=float(noise), robot=body, horizon=horizon
+        )
         with _backend(workers, dask) as pool:
             n_shards = _solve(store, pool, compute, family, count, progress)
-        summary = _write(store, n_shards, directory, family, count, body)
+        summary = _write(store, n_shards, directory, family, count, body, horizon)
         record = {**settings, "count": count, "summary": asdict(summary)}
         write_text(directory / RECORD, encode(record, indent=1) + "\n")
     discard(store.directory)
@@ -192,7 +199,8 @@ def check_dataset(folder: str | os.PathLike[str], *, progress: bool = True) -> R
     largest, worst, episodes = np.zeros(3), None, 0
     with progress_bar(total=total, label="Replaying", unit="episodes", show=progress) as bar:
         for number, demonstration in enumerate(iterate_demonstrations(folder)):
-            env = env or NavigateEnv(split="fresh", robot=demonstration.scenario.robot)
+            scenario = demonstration.scenario
+            env = env or NavigateEnv(split="fresh", robot=scenario.robot, horizon=scenario.horizon_kind)
             deviations = _replay(env, demonstration)
             if worst is None or deviations.max() > largest.max():
                 worst = number
@@ -287,7 +295,7 @@ def _solve(
 
 
 def _write(
-    store: ResumableStore, n_shards: int, directory: Path, family: str, count: int, robot: RobotModel
+    store: ResumableStore, n_shards: int, directory: Path, family: str, count: int, robot: RobotModel, horizon: str
 ) -> RolloutSummary:
     """Write the dataset of the first `count` solved scenarios in the work directory, then move it to its place."""
     totals = {"demonstrations": 0, "unsolved": 0, "failed": 0, "steps": 0}
@@ -311,20 +319,22 @@ def _write(
 
     root = directory / WORK / "root"
     shutil.rmtree(root, ignore_errors=True)  # left by a run that was interrupted here
-    write_dataset(demonstrations(), root, family, robot)
+    write_dataset(demonstrations(), root, family, robot, horizon)
     shutil.rmtree(directory / "leapnav", ignore_errors=True)  # an earlier copy of the same dataset, see `_prepare`
     (root / "leapnav").replace(directory / "leapnav")
     return RolloutSummary(totals["demonstrations"], totals["unsolved"], totals["failed"], totals["steps"])
 
 
-def _shard(number: int, family: str, seed: int, recoveries: int, noise: float, robot: RobotModel) -> Arrays:
+def _shard(number: int, seed: int, **arguments: Any) -> Arrays:
     first = seed + number * SHARD_SIZE
-    return _pack([_demonstrations(family, s, recoveries, noise, robot) for s in range(first, first + SHARD_SIZE)])
+    return _pack([_demonstrations(seed=s, **arguments) for s in range(first, first + SHARD_SIZE)])
 
 
-def _demonstrations(family: str, seed: int, recoveries: int, noise: float, robot: RobotModel) -> list[Demonstration]:
+def _demonstrations(
+    family: str, seed: int, recoveries: int, noise: float, robot: RobotModel, horizon: str
+) -> list[Demonstration]:
     """The demonstrations of one scenario, its optimum first; empty without a certified optimum."""
-    scenario = sample_scenario(family, seed, robot)
+    scenario = sample_scenario(family, seed, robot, horizon)
     optimum = find_optimum(scenario)
     if not optimum.success:
         return []
@@ -335,7 +345,7 @@ def _demonstrations(family: str, seed: int, recoveries: int, noise: float, robot
         recovered = recovery(scenario, optimum, rng, f"{scenario.name}-recovery-{number}")
         if recovered is not None:
             episodes.append(recovered)
-    env = NavigateEnv(family, split="fresh", robot=robot)
+    env = NavigateEnv(family, split="fresh", robot=robot, horizon=horizon)
     noise_rng = np.random.default_rng([seed, 2])
     found = []
     for episode in episodes:

@@ -44,6 +44,8 @@ FAILURE_WEIGHT = 4  # evaluations for an expensive path without an extremal coun
 # Free horizon: factor and largest number of lengthenings of a path that the limits make infeasible, largest number of
 # changes of the horizon, and the change after which there is no other.
 LENGTHENING, MAX_LENGTHENED, MAX_RESCALED, SMALL_CHANGE = 1.25, 3, 4, 0.1
+# A control is at its limit within this relative tolerance; a path is limited if more than this fraction of it is.
+LIMIT_TOLERANCE, MAX_LIMITED_FRACTION = 1e-3, 0.1
 # Depth in an obstacle (robot radii) up to which a collision-free path of similar cost may exist close to an extremal.
 MAX_SLIGHT_DEPTH = TOLERATED_DEPTH
 # A path repeats a failure if it reaches this fraction of the failed path's depth, within this distance (robot radii).
@@ -82,6 +84,7 @@ class LocalOptima:
         radius = float(scenario.discs[:, 1].min())
         self._slight_depth = MAX_SLIGHT_DEPTH * radius
         self._lift = Lifting(scenario, problem)
+        self._limits = np.array(scenario.robot.limits())
         self._duplicate_distance = DUPLICATE_DISTANCE * min(
             1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE
         )
@@ -128,11 +131,17 @@ class LocalOptima:
         path = optimise(problem, guess, weight, iterations)
         if problem.horizon is None:
             for _ in range(MAX_LENGTHENED):
-                if path.converged and path.violation < MAX_VIOLATION:
+                # Otherwise more time would not help: the path is feasible, or the descent is slow.
+                if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):
                     break
                 guess = guess.scaled(LENGTHENING)
                 path = optimise(problem, guess, weight, iterations)
         return path
+
+    def _is_limited(self, path: DirectPath) -> bool:
+        """Return whether controls are at their limits for a large fraction of a path."""
+        at_limit = np.abs(path.controls) > (1.0 - LIMIT_TOLERANCE) * self._limits
+        return float(at_limit.any(axis=1).mean()) > MAX_LIMITED_FRACTION
 
     def _refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
         """Return the optimum on halved intervals; a free horizon is changed until the cost is almost stationary."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from leapnav.commands.options import Family, Robot
+from leapnav.commands.options import Family, Horizon, Robot
 from leapnav.durations import SECONDS_PER_SECOND_OPINION, announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -33,6 +33,8 @@ class Build:
     """Family of the scenarios."""
     robot: Robot = "unicycle"
     """Model of the robot."""
+    horizon: Horizon = "fixed"
+    """Fixed or free horizon."""
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
@@ -48,7 +50,8 @@ class Build:
         from leapnav.experts.data.banks import build_bank
 
         announce(of_scenarios(self.family, self.count, self.workers), "finding the optima")
-        bank = build_bank(self.family, self.count, self.out, robot=self.robot, seed=self.seed, workers=self.workers)
+        task = {"robot": self.robot, "horizon": self.horizon, "seed": self.seed}
+        bank = build_bank(self.family, self.count, self.out, **task, workers=self.workers)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         print(f"wrote {self.out}: {len(bank)} of {bank.drawn} sampled scenarios{f' ({rejected})' if rejected else ''}")
         summary = {"scenarios": len(bank), "drawn": bank.drawn, "rejected": dict(bank.rejected)}
@@ -97,10 +100,12 @@ class Show:
             {
                 "name": scenario.name,
                 "cost": float(cost),
-                "horizon": scenario.fixed_horizon,
+                "horizon": float(horizon),
                 "clearance": float(clearance),
             }
-            for scenario, cost, clearance in zip(bank, bank.costs, bank.certificates[:, 3], strict=True)
+            for scenario, cost, horizon, clearance in zip(
+                bank, bank.costs, bank.horizons, bank.certificates[:, 3], strict=True
+            )
         ]
         code = self._verify(bank, rows) if self.verify else 0
         write_json(rows, self.json)
@@ -161,7 +166,6 @@ def _print_summary(bank: ScenarioBank) -> None:
     from rich.table import Table
 
     residual, defect, drift, _ = bank.certificates.max(axis=0)
-    horizons = np.array([scenario.fixed_horizon for scenario in bank])
     excess = bank.second_costs / bank.costs - 1
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}, seed {bank.seed}, leapnav {bank.software}")
     print("  checksums          verified")
@@ -177,7 +181,7 @@ def _print_summary(bank: ScenarioBank) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     for name, values, scale in (
         ("J*", bank.costs, 1),
-        ("horizon (s)", horizons, 1),
+        ("horizon (s)", bank.horizons, 1),
         ("clearance (m)", bank.certificates[:, 3], 1),
         ("excess cost of the second best (%)", excess[np.isfinite(excess)], 100),
     ):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.commands.options import EnvironmentOption, FamilyOrAll, Robot, parse_environment
+from leapnav.commands.options import EnvironmentOption, FamilyOrAll, Horizon, Robot, parse_environment
 from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
@@ -31,6 +31,8 @@ class Evaluate:
     """Family of the scenarios."""
     robot: Robot | None = None
     """Model of the robot of the included banks; by default that of the policies."""
+    horizon: Horizon | None = None
+    """Fixed or free horizon of the included banks; by default that of the policies."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None
@@ -93,4 +95,4 @@ class Evaluate:
         if self.bank is not None:
             return [ScenarioBank(self.bank)]
         families = tuple(FAMILIES) if self.family == ALL else (self.family,)
-        return included_banks(specs, families, self.split, self.robot)
+        return included_banks(specs, families, self.split, self.robot, self.horizon)

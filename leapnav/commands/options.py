@@ -12,6 +12,7 @@ from leapnav.training.config import FamilyName, RobotName
 Family = Literal["open", "clutter", "polygons", "rooms", "slalom"]
 FamilyOrAll = FamilyName
 Robot = RobotName
+Horizon = Literal["fixed", "free"]
 PolicyName = (
     Literal[
         "expert",

@@ -46,7 +46,6 @@ class Play:
 
         check_integer("port", self.port, 0, 65535)
         scenario = bank_scenario(*INITIAL_SCENARIO) if self.scenario is None else Scenario.from_json(self.scenario)
-        scenario.check_horizon()
         for policy in self.policies:
             load_policy_spec(policy)
         names = tuple(dict.fromkeys((*self.policies, *shipped_policies(), *BASELINES)))

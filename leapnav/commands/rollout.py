@@ -6,7 +6,7 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from leapnav.commands.options import FamilyOrAll, Robot
+from leapnav.commands.options import FamilyOrAll, Horizon, Robot
 from leapnav.durations import announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -27,6 +27,8 @@ class Rollout:
     """Family of the scenarios."""
     robot: Robot = "unicycle"
     """Model of the robot."""
+    horizon: Horizon = "fixed"
+    """Fixed or free horizon."""
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000
@@ -66,6 +68,7 @@ class Rollout:
             self.count,
             self.out,
             robot=self.robot,
+            horizon=self.horizon,
             seed=self.seed,
             recoveries=self.recoveries,
             noise=self.noise,
@@ -78,7 +81,7 @@ class Rollout:
             f"({summary.unsolved} scenarios without a certified optimum and "
             f"{summary.failed_replays} failed replays left out)"
         )
-        name = dataset_id(self.family, self.robot)
+        name = dataset_id(self.family, self.robot, self.horizon)
         print(f"load it with minari.load_dataset({name!r}) and MINARI_DATASETS_PATH={self.out}")
         write_json(asdict(summary), self.json)
         return 0

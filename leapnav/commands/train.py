@@ -68,7 +68,7 @@ def _describe(evaluation: Evaluation) -> str:
 def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
     """Return the class of the command for a command line.
 
-    Its defaults depend on the family, the warm start and the run to resume in the arguments, so these are read before
+    Its defaults depend on the family, the horizon, the warm start and the run to resume in the arguments, read before
     the command line is parsed.
 
     Args:
@@ -89,8 +89,9 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
         if not following or following[0].startswith("--"):
             raise ValueError("warm_start: expected demonstrations or a policy, got none")
     warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
+    free = {"horizon": "free"} if is_train and _option(arguments, "--horizon") == "free" else {}
     defaults: dict[str, Any] = {
-        name: replace(kind.tuned(family, warm=warm), out=tyro.MISSING) for name, kind in ALGORITHMS.items()
+        name: replace(kind.tuned(family, warm=warm, **free), out=tyro.MISSING) for name, kind in ALGORITHMS.items()
     }
     if is_train and "--resume" in arguments and out is not None:
         algorithm, config = read_config(Path(out))

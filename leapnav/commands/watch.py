@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from leapnav.commands.options import Family, PolicyName, Robot
+from leapnav.commands.options import Family, Horizon, PolicyName, Robot
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ class Watch:
     """Family of the scenarios."""
     robot: Robot = "unicycle"
     """Model of the robot, for the expert and the baselines; a learned policy has its own."""
+    horizon: Horizon = "fixed"
+    """Fixed or free horizon, for the expert and the baselines; a learned policy has its own."""
     split: Literal["train", "test", "fresh"] = "test"
     """Split of the included banks, or "fresh" for newly sampled scenarios."""
     index: int | None = None
@@ -98,7 +100,8 @@ class Watch:
         from leapnav.training.policies.files import policy_environment
         from leapnav.training.scoring.policy_specs import BASELINES
 
-        return {"robot": self.robot} if self.policy in BASELINES else policy_environment(self.policy)
+        own = {"robot": self.robot, "horizon": self.horizon}
+        return own if self.policy in BASELINES else policy_environment(self.policy)
 
     def _make(self, render_mode: str) -> gym.Env[Any, Any]:
         import gymnasium as gym

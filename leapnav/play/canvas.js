@@ -147,11 +147,11 @@ function drawPlane(width, height) {
   }
   if (play.time === null) return;
   if (solution && solution.path) {
-    drawRobot(poseAt(solution.path.states, play.time, scenario.horizon), colors.optimum, false);
+    drawRobot(poseAt(solution.path.states, play.time, durationOf(solution.path)), colors.optimum, false);
   }
   if (episode) {
     const duration = episode.period * (episode.states.length - 1);
-    drawRobot(poseAt(episode.states, play.time, Math.min(duration, scenario.horizon)), episodeColor, false);
+    drawRobot(poseAt(episode.states, play.time, Math.min(duration, scenario.horizon ?? duration)), episodeColor, false);
   }
 }
 

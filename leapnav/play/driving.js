@@ -7,15 +7,21 @@ const CONTROL_PERIOD = 0.05; // s, as in the environment
 const MAX_CATCH_UP = 0.25; // s; a longer pause of the page does not count as driving time
 const SPEED_SMOOTHING = 0.2, TURN_SMOOTHING = 0.3; // largest change of an action per control period, by key
 const MAX_DRIVEN_HORIZON = 300; // s, as on the server
+const POSITION_TOLERANCE = 0.1, HEADING_TOLERANCE = 0.1; // m, rad, as in the environment
 const DRIVE_KEYS = {
   ArrowUp: [1, 0], w: [1, 0], ArrowDown: [-1, 0], s: [-1, 0], ArrowLeft: [0, 1], a: [0, 1], ArrowRight: [0, -1], d: [0, -1],
 };
 const heldKeys = new Set();
 let padCommand = null; // (speed, turn rate) as fractions of the limits, while the pad is held
 
+// The time (s) after which the driving ends.
+function maxDuration(scenario) {
+  return isFree(scenario) ? Math.min(scenario.time_limit ?? MAX_DRIVEN_HORIZON, MAX_DRIVEN_HORIZON) : scenario.horizon;
+}
+
 function startDriving() {
   if (!canEdit() || drag !== null) return;
-  if (!(play.scenario.horizon > 0 && play.scenario.horizon <= MAX_DRIVEN_HORIZON)) {
+  if (!(maxDuration(play.scenario) > 0 && maxDuration(play.scenario) <= MAX_DRIVEN_HORIZON)) {
     play.notice = `driving: expected a horizon of at most ${MAX_DRIVEN_HORIZON} s`;
     show();
     return;
@@ -64,22 +70,28 @@ function arcEnd([x, y, heading], distance, turn) {
 
 function advance(driving, elapsed) {
   const { scenario } = driving, { max_speed: maxSpeed, max_turn_rate: maxTurnRate } = scenario.robot;
-  const maxCount = Math.ceil(scenario.horizon / CONTROL_PERIOD - 1e-9);
+  const limit = maxDuration(scenario), maxCount = Math.ceil(limit / CONTROL_PERIOD - 1e-9);
   driving.time += elapsed;
   while (driving.actions.length < maxCount && driving.time >= (driving.actions.length + 1) * CONTROL_PERIOD) {
     const action = nextAction(driving.action).map((value) => Math.round(value * 1000) / 1000);
-    const period = Math.min(CONTROL_PERIOD, scenario.horizon - driving.actions.length * CONTROL_PERIOD);
+    const period = Math.min(CONTROL_PERIOD, limit - driving.actions.length * CONTROL_PERIOD);
     driving.action = action;
     driving.actions.push(action);
     driving.pose = arcEnd(driving.pose, action[0] * maxSpeed * period, action[1] * maxTurnRate * period);
     driving.states.push(driving.pose);
-    if (isInContact(scenario, driving.pose)) {
+    if (isInContact(scenario, driving.pose) || (isFree(scenario) && isAtGoal(scenario, driving.pose))) {
       finishDriving();
       return;
     }
   }
   // The last period may be shorter than the others.
-  if (driving.actions.length === maxCount || driving.time >= scenario.horizon + CONTROL_PERIOD) finishDriving();
+  if (driving.actions.length === maxCount || driving.time >= limit + CONTROL_PERIOD) finishDriving();
+}
+
+// Whether the robot is at the goal pose, within the tolerances; the server decides, too.
+function isAtGoal({ goal }, [x, y, heading]) {
+  const turn = hasHeading(goal) ? heading - goal[2] : 0;
+  return Math.hypot(x - goal[0], y - goal[1]) <= POSITION_TOLERANCE && Math.abs(wrapped(turn)) <= HEADING_TOLERANCE;
 }
 
 // Whether the robot is in contact with an obstacle or a wall. The server decides; this only ends the driving.
@@ -103,8 +115,9 @@ async function finishDriving() {
 function showDriving() {
   const driving = play.driving;
   if (!driving) return;
-  const left = Math.max(driving.scenario.horizon - driving.time, 0).toFixed(1);
-  setText("drive-time", driving.hasBegun ? `Time left: ${left} s` : `${left} s; the time starts with the first input`);
+  const { scenario, time, hasBegun } = driving, left = Math.max(maxDuration(scenario) - time, 0).toFixed(1);
+  const shown = isFree(scenario) ? `Time: ${time.toFixed(1)} s` : hasBegun ? `Time left: ${left} s` : `${left} s`;
+  setText("drive-time", hasBegun ? shown : `${shown}; the time starts with the first input`);
 }
 
 // The outcome of an episode of a person or a policy, in one line.

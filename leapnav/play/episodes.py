@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from leapnav.envs.scenarios.scenario import Scenario, ScenarioError
+from leapnav.envs.scenarios.faults import ScenarioError
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import is_finite_number
 from leapnav.experts.data.demonstrations import state_of
 from leapnav.experts.optimum import find_reached_optimum
@@ -50,7 +51,7 @@ def replay_actions(scenario: Scenario, actions: Any) -> dict[str, Any]:
     Args:
         scenario: the scenario.
         actions: a list of pairs (speed, turn rate) as fractions of the robot's limits, one per control period. A list
-            that ends before the horizon ends the episode as `stopped`.
+            that ends before the horizon, or before the goal if the horizon is free, ends the episode as `stopped`.
 
     Returns:
         As `play_policy`; `policy` is "you".
@@ -63,17 +64,17 @@ def replay_actions(scenario: Scenario, actions: Any) -> dict[str, Any]:
     from leapnav.envs.navigation import NavigateEnv
 
     check_horizon(scenario)
-    array = check_actions(actions, math.ceil(scenario.fixed_horizon / CONTROL_PERIOD - 1e-9))
+    limit = MAX_DRIVE_HORIZON if scenario.horizon is None else scenario.horizon
+    array = check_actions(actions, math.ceil(limit / CONTROL_PERIOD - 1e-9))
     env = NavigateEnv(scenario=scenario, observation="state", control_period=CONTROL_PERIOD)
     return {"policy": "you", **_play(scenario, env, replay(array))}
 
 
 def check_horizon(scenario: Scenario) -> None:
     """Raise ValueError if the horizon is too long for an episode on the page."""
-    if scenario.fixed_horizon > MAX_DRIVE_HORIZON:
-        raise ValueError(
-            f"horizon: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {scenario.fixed_horizon:g}"
-        )
+    field = "horizon" if scenario.horizon is not None else "time_limit"
+    if (limit := scenario.episode_limit) > MAX_DRIVE_HORIZON:
+        raise ValueError(f"{field}: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {limit:g}")
 
 
 def check_actions(actions: Any, max_count: int) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 // The panels of the page and their controls.
 
+const DEFAULT_HORIZON = 10, DEFAULT_TIME_WEIGHT = 0.5; // s, 1/s
+
 const settings = () => document.querySelectorAll("[data-group]"); // number inputs of robot and cost
 
 // ---- Display
@@ -18,6 +20,7 @@ function show() {
   if (needed) setText("use-horizon", `Use ${needed}\u00a0s`);
   setText("notice", play.notice || "");
   setText("cost", path ? format(path.cost, 6) : "–");
+  setText("duration", path ? `${format(durationOf(path), 3)}\u00a0s` : "–");
   setText("clearance", path && path.clearance !== null ? `${format(path.clearance, 3)}\u00a0m` : "–");
   setText("residual", path && path.residual !== null ? path.residual.toExponential(0) : "–");
   setText("milliseconds", solution ? `${format(solution.milliseconds, 1)}\u00a0ms` : "–");
@@ -83,13 +86,18 @@ function alternativeRow(row, i, path) {
 // Numbers of the scenario; a field that is being edited keeps its text.
 function showSettings() {
   if (!play.scenario) return;
-  if (document.activeElement !== byId("horizon")) byId("horizon").value = play.scenario.horizon;
+  const free = isFree(play.scenario), path = play.solution && play.solution.path;
+  byId("free-horizon").checked = free;
+  byId("horizon").disabled = free;
+  if (free) byId("horizon").value = path ? durationOf(path).toFixed(2) : "";
+  else if (document.activeElement !== byId("horizon")) byId("horizon").value = play.scenario.horizon;
   showRobotFields();
   const { weights } = robotOf(play.scenario);
   for (const input of settings()) {
     const { group, field } = input.dataset, value = (play.scenario[group] || {})[field];
     if (document.activeElement !== input) input.value = value === undefined ? "" : value;
     if (field === "speed_weight" || field === "turn_weight") input.disabled = !weights.includes(field);
+    if (field === "time_weight") input.disabled = !free;
   }
   byId("drive").disabled = modelOf(play.scenario) !== "unicycle";
 }
@@ -125,13 +133,24 @@ document.addEventListener("change", ({ target: input }) => {
 byId("model").addEventListener("change", () => {
   if (!canEdit()) return;
   const { fields, weights } = play.robots[byId("model").value], { start_motion, goal_motion, ...scenario } = play.scenario;
-  const cost = Object.entries(scenario.cost || {}).filter(([name]) => name.startsWith("proximity") || weights.includes(name));
+  const kept = [...weights, "proximity_weight", "proximity_scale", "time_weight"];
+  const cost = Object.entries(scenario.cost || {}).filter(([name]) => kept.includes(name));
   const radius = scenario.robot && scenario.robot.radius;
   changeScenario({ ...scenario, robot: { ...fields, ...(radius ? { radius } : {}) }, cost: Object.fromEntries(cost) });
 });
 
 byId("horizon").addEventListener("change", () => {
   if (canEdit()) edit({ horizon: Number(byId("horizon").value) });
+});
+
+// A horizon that becomes fixed is the duration of the optimum.
+byId("free-horizon").addEventListener("change", () => {
+  if (!canEdit()) return;
+  const { time_limit: limit, ...scenario } = play.scenario, { time_weight: weight, ...cost } = scenario.cost || {};
+  const path = play.solution && play.solution.path;
+  const duration = path ? Math.max(Number(durationOf(path).toFixed(2)), 0.01) : DEFAULT_HORIZON;
+  if (isFree(scenario)) changeScenario({ ...scenario, horizon: duration, cost });
+  else changeScenario({ ...scenario, horizon: null, cost: { ...cost, time_weight: DEFAULT_TIME_WEIGHT } });
 });
 
 byId("use-horizon").addEventListener("click", () => {
@@ -186,7 +205,8 @@ byId("play").addEventListener("click", () => {
   function frame(now) {
     start = start === null ? now : start;
     const time = (now - start) / 1000;
-    play.time = time <= play.scenario.horizon && canEdit() ? time : null;
+    const path = play.solution && play.solution.path, duration = play.scenario.horizon ?? (path ? durationOf(path) : 0);
+    play.time = time <= duration && canEdit() ? time : null;
     draw();
     if (play.time !== null) requestAnimationFrame(frame);
   }

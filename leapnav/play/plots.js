@@ -149,5 +149,6 @@ function drawPlots(width, height) {
   at(boxes[1], "Costates", lines(costateNames, path.costates), { minRange: 0.1 });
   at(boxes[2], "Hamiltonian", [["H (1/s)", path.hamiltonian, curves[5]]], { minRange: 1e-3 });
   at(boxes[3], "Clearance (m)", [["", path.clearances, curves[5]]], { minRange: 0.1, includesZero: true });
-  drawAbscissa(boxes, "0", `${play.scenario.horizon} s`, "time", height);
+  const duration = play.scenario.horizon ?? Number(durationOf(path).toFixed(3));
+  drawAbscissa(boxes, "0", `${duration} s`, "time", height);
 }

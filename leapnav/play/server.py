@@ -194,7 +194,6 @@ def _error_response(error: Exception) -> Response:
 
 def _scenario(content: dict[str, Any]) -> Scenario:
     scenario = Scenario.from_dict(content.get("scenario"))
-    scenario.check_horizon()
     if not scenario.name.isprintable():
         raise ValueError(f"Scenario: name: expected printable characters, got {ascii(scenario.name)[:80]}")
     return scenario

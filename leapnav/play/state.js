@@ -37,6 +37,9 @@ const play = (window.play = {
 let drag = null, following = false, searching = false, changed = false, searchTimer = null, revision = 0;
 let moveTime = null; // time (ms) of the first pointer move that is in no request yet
 
+const isFree = (scenario) => scenario.horizon === null;
+const durationOf = (path) => path.times[path.times.length - 1]; // s
+
 const robotOf = (scenario) => play.robots[(scenario.robot || {}).model || "unicycle"];
 
 // ---- Requests

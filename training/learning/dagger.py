@@ -276,8 +276,8 @@ class _Episode:
 
 
 def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> list[Scenario]:
-    """Return scenarios for the rest of an episode, each from a takeover, with decreasing horizons."""
-    end, horizon = len(episode.states) * period, episode.scenario.fixed_horizon
+    """Return scenarios for the rest of an episode, each from a takeover, with decreasing times left."""
+    end, horizon = len(episode.states) * period, episode.scenario.horizon
     if episode.success:
         times = rng.uniform(0.0, end, 1)
     elif episode.collision:
@@ -288,10 +288,12 @@ def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> li
     steps = np.unique((times / period).round().astype(int))
     scenarios = []
     for step in steps[(steps > 0) & (steps < len(episode.states))].tolist():
-        if horizon - step * period < MIN_TIME_LEFT:
+        if horizon is not None and horizon - step * period < MIN_TIME_LEFT:
             break
         x, y, heading, *motion = episode.states[step].tolist()
-        rest: dict[str, Any] = {"start": (x, y, heading), "horizon": round(horizon - step * period, 9)}
+        rest: dict[str, Any] = {"start": (x, y, heading)}
+        if horizon is not None:
+            rest["horizon"] = round(horizon - step * period, 9)
         if motion:
             rest["start_motion"] = tuple(motion)
         scenarios.append(episode.scenario.model_copy(update=rest))

@@ -14,15 +14,17 @@ from zipfile import is_zipfile
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
-from leapnav.envs.scenarios.scenario import Cost, Scenario, check_robot
+from leapnav.envs.scenarios.cost import Cost
+from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
+from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.files import atomic_path
 from leapnav.experts.data.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
 
 FORMAT = 2  # version of the file format
 # Arguments of the environment that select the scenarios; the meaning of an observation does not depend on them.
-SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario", "robot")
+SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario", "robot", "horizon")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +124,16 @@ class Dataset:
         return self._per_sample([robot.parameters(cost) for robot, cost in self._robots])
 
     @property
+    def time_left(self) -> np.ndarray:
+        """Time (N,) until the expert reaches the goal (s); with a free horizon, an estimate from the cost-to-go.
+
+        An optimum with a free horizon has H = 0, hence a running cost of 2 (c + Phi), which is at least 2 c.
+        """
+        if not self.settings.free_horizon:
+            return self.observations[:, TIME_LEFT]
+        return -self.returns / (2.0 * self._per_sample([cost.time_weight for _, cost in self._robots]))
+
+    @property
     def is_reversible(self) -> bool:
         """Whether all robots have footprints that a rotation by 180 degrees does not change."""
         return all(bool((robot.discs()[:, 0] == 0.0).all()) for robot, _ in self._robots)
@@ -219,8 +231,10 @@ class Dataset:
         if not scenarios:
             raise ValueError("dataset: expected at least one episode, got none")
         arrays: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
-        robot = json.loads(scenarios[0])["robot"]["model"]
-        return cls(**arrays, scenarios=tuple(scenarios), settings=EnvironmentSettings(robot=robot))
+        fields = json.loads(scenarios[0])
+        horizon = "free" if fields["horizon"] is None else "fixed"
+        settings = EnvironmentSettings(robot=fields["robot"]["model"], horizon=horizon)
+        return cls(**arrays, scenarios=tuple(scenarios), settings=settings)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the dataset to a file, atomically."""

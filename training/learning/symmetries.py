@@ -19,7 +19,7 @@ _TIME_REVERSE_SIGNS = th.tensor([-1.0, -1, 1, 1, 1, -1, -1, 1, 1])
 
 
 def mirror(
-    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle
+    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle, n_goal: int = GOAL_ENTRIES
 ) -> tuple[th.Tensor, th.Tensor]:
     """Exchange left and right.
 
@@ -27,6 +27,7 @@ def mirror(
         observations (B, d): observations with lidar ranges.
         actions (B, m): actions.
         model: the robot's model.
+        n_goal: number of entries of the observation's part `goal`.
 
     Returns:
         The mirrored observations and actions.
@@ -36,14 +37,14 @@ def mirror(
 
     """
     symmetry = _require(model, "mirror", model.mirror)
-    first = GOAL_ENTRIES + len(symmetry.motion)
+    first = n_goal + len(symmetry.motion)
     ranges = observations[:, first:]
     ranges = th.cat([ranges[:, :1], ranges[:, 1:].flip(1)], dim=1)
-    return _transformed(observations, actions, _MIRROR_SIGNS, symmetry, ranges)
+    return _transformed(observations, actions, _MIRROR_SIGNS[:n_goal], symmetry, ranges)
 
 
 def time_reverse(
-    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle
+    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle, n_goal: int = GOAL_ENTRIES
 ) -> tuple[th.Tensor, th.Tensor]:
     """Exchange forwards and backwards: rotate the robot and the goal heading by 180 degrees, and negate the speed.
 
@@ -51,6 +52,7 @@ def time_reverse(
         observations (B, d): observations with an even number of lidar ranges.
         actions (B, m): actions.
         model: the robot's model.
+        n_goal: number of entries of the observation's part `goal`.
 
     Returns:
         The transformed observations and actions.
@@ -60,11 +62,11 @@ def time_reverse(
 
     """
     symmetry = _require(model, "reversal", model.reversal)
-    ranges = observations[:, GOAL_ENTRIES + len(symmetry.motion) :]
+    ranges = observations[:, n_goal + len(symmetry.motion) :]
     if ranges.shape[1] % 2:
         raise ValueError(f"time reversal needs an even number of lidar beams, got {ranges.shape[1]}")
     ranges = ranges.roll(ranges.shape[1] // 2, dims=1)
-    return _transformed(observations, actions, _TIME_REVERSE_SIGNS, symmetry, ranges)
+    return _transformed(observations, actions, _TIME_REVERSE_SIGNS[:n_goal], symmetry, ranges)
 
 
 def _require(model: type[RobotModel], name: str, symmetry: Symmetry | None) -> Symmetry:

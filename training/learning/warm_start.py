@@ -16,7 +16,6 @@ from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_not_negative, check_positive
@@ -141,7 +140,7 @@ def _fit_critic(
     if not known.any():
         raise ValueError("dataset: no sample has a cost-to-go and a costate; start.critic needs them")
     dataset = dataset[known]
-    factors = rewards.factors(dataset.observations[:, TIME_LEFT])
+    factors = rewards.factors(dataset.time_left)
     samples = _CriticSamples(dataset, factors, rewards.period, policy.device)
     slopes = None
     if config.gradient:

@@ -9,10 +9,12 @@ import gymnasium as gym
 import numpy as np
 
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.unwrapping import unwrap
 
 # Gains of the polar controller (rad/s per rad), per unit of the mean speed needed to arrive on time (m/s).
 BEARING_GAIN, HEADING_GAIN = 3.0, -0.8
+BRAKING_DISTANCE = 0.5  # m; closer to the goal, the speed is proportional to the distance if the horizon is free
 
 
 class RandomPolicy:
@@ -48,7 +50,7 @@ class GoToGoal:
     controller of M. Aicardi, G. Casalino, A. Bicchi and A. Balestrino, "Closed loop steering of unicycle-like vehicles
     via Lyapunov techniques" (1995), in the linear form of R. Siegwart and I. Nourbakhsh, "Introduction to Autonomous
     Mobile Robots". The robot drives forwards if the goal is ahead and backwards otherwise, at the speed that is needed
-    to arrive on time.
+    to arrive on time; with a free horizon at the cruise speed, slower close to the goal.
 
     Args:
         env: the environment, single or vector; the speed limits are those of its scenarios.
@@ -73,7 +75,12 @@ class GoToGoal:
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return the actions for observations (d,) or (N, d)."""
         rows = np.atleast_2d(observation).astype(float)
-        ahead, left, cosine, sine, needed_speed = rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 7]
+        ahead, left, cosine, sine = rows[:, :4].T
+        if self._envs[0].settings.free_horizon:
+            cruise_speeds = np.array([scenario.cruise_speed for scenario in self._scenarios()])
+            needed_speed = cruise_speeds * np.minimum(np.hypot(ahead, left) / BRAKING_DISTANCE, 1.0)
+        else:
+            needed_speed = rows[:, 7]
         direction = np.where(ahead >= 0, 1.0, -1.0)
         bearing = np.arctan2(direction * left, direction * ahead)
         heading_is_free = (cosine == 0) & (sine == 0)
@@ -87,8 +94,12 @@ class GoToGoal:
 
     def _limits(self) -> np.ndarray:
         """Return the maximum speeds (m/s) and turn rates (rad/s) of all robots (N, 2)."""
-        robots = []
-        for env in self._envs:
-            scenarios = [env.scenario] if isinstance(env, NavigateEnv) else env.scenarios
-            robots += [scenario.robot for scenario in scenarios]
+        robots: list[Any] = [scenario.robot for scenario in self._scenarios()]  # unicycles, see `__init__`
         return np.array([(robot.max_speed, robot.max_turn_rate) for robot in robots])
+
+    def _scenarios(self) -> list[Scenario]:
+        """Return the scenarios of all robots."""
+        found: list[Scenario] = []
+        for env in self._envs:
+            found += [env.scenario] if isinstance(env, NavigateEnv) else env.scenarios
+        return found

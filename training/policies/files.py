@@ -33,7 +33,7 @@ BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
 FORMAT, READ_FORMATS = 3, (2, 3)  # version of policy.json; in version 2 every network is that of `network`
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
-OBSERVED = (*SENSORS, "robot", "actuation", "dict_observation")
+OBSERVED = (*SENSORS, "robot", "horizon", "actuation", "dict_observation")
 # Fields of policy.json with their types, besides `format` and `environment`.
 FIELDS = {"kind": str, "hidden": list, "critic": list, "actor_only": bool, "training": dict, "sha256": str}
 
@@ -233,7 +233,8 @@ def _n_controls(environment: Mapping[str, Any]) -> int:
 
 def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
     """Check that an environment has the observations that the policy was trained with."""
-    trained = {"robot": "unicycle", **description["environment"]}  # earlier files do not contain the robot
+    # Earlier files contain neither the robot nor the horizon.
+    trained = {"robot": "unicycle", "horizon": "fixed", **description["environment"]}
     for inner in unwrap(env):
         settings = _as_dict(inner.settings)
         differing = [

@@ -6,12 +6,13 @@ import copy
 from typing import Any, cast
 
 import torch as th
+from gymnasium.spaces import Box
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 
-from leapnav.envs.simulation.observations import TIME_LEFT
+from leapnav.envs.simulation.observations import TIME_LEFT, has_time_left
 
 # Fraction of the action noise that remains at the horizon. Without any noise the likelihoods would be infinite.
 MIN_NOISE_FRACTION = 0.3
@@ -32,6 +33,7 @@ class KLRegularizedPolicy(ActorCriticPolicy):
         quiet: time before the horizon at which the standard deviation of the actions starts to decrease (s). It is
             proportional to the remaining time from then on, but not below 30 %; 0: it does not decrease. An error
             shortly before the horizon cannot be corrected, and would hide the effect of earlier actions on the return.
+            Not used with a free horizon.
 
     Attributes:
         divergence: mean KL divergence of the last batch.
@@ -51,6 +53,7 @@ class KLRegularizedPolicy(ActorCriticPolicy):
         # latent features alone, which do not contain the remaining time.
         self._noise_fraction: th.Tensor | float = 1.0
         super().__init__(*args, **kwargs)
+        self._is_timed = has_time_left(cast(Box, self.observation_space).high)
         self.entropy_weight, self.divergence_weight = entropy_weight, divergence_weight
         self.divergence = 0.0
         # The reference is part of the policy, so that checkpoints contain it, but is not optimised.
@@ -80,7 +83,7 @@ class KLRegularizedPolicy(ActorCriticPolicy):
         return super().get_distribution(obs)
 
     def _fraction_of_noise(self, observations: th.Tensor) -> th.Tensor | float:
-        if self.quiet == 0:
+        if self.quiet == 0 or not self._is_timed:
             return 1.0
         return (observations[:, TIME_LEFT, None] / self.quiet).clamp(MIN_NOISE_FRACTION, 1.0)
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, has_time_left
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
@@ -24,62 +24,95 @@ class NavigationFeatures(BaseFeaturesExtractor):
 
     Success depends on the last 0.1 m, and the difference between lidar ranges of 0.3 m and 0.5 m matters more than that
     between 5 m and 10 m. A small network does not resolve such differences in metres and seconds. The features
-    therefore contain logarithms, saturated values and exponentials in addition to the scaled values.
+    therefore contain logarithms, saturated values and exponentials in addition to the scaled values. With a free
+    horizon, the features that depend on the time left are missing.
     """
 
-    POSE_FEATURES = 23  # features of the goal part
-    MOTION_FEATURES = 7  # features of each entry of the motion part
+    # Features of the goal part and of each entry of the motion part, with a fixed and with a free horizon
+    POSE_FEATURES, FREE_POSE_FEATURES = 23, 14
+    MOTION_FEATURES, FREE_MOTION_FEATURES = 7, 3
     BEAM_FEATURES = 3  # features of each lidar beam
 
     def __init__(self, observation_space: spaces.Box) -> None:
+        self._is_timed = has_time_left(observation_space.high)
+        goal = GOAL_ENTRIES if self._is_timed else FREE_GOAL_ENTRIES
         # Ranges are not negative; the entries of the motion part, which is before them, can be.
-        motion = int((observation_space.low[GOAL_ENTRIES:] < 0.0).sum())
-        beams = observation_space.shape[0] - GOAL_ENTRIES - motion
-        features = self.POSE_FEATURES + self.MOTION_FEATURES * motion + self.BEAM_FEATURES * beams
-        super().__init__(observation_space, features)
-        self._first_beam = GOAL_ENTRIES + motion
+        motion = int((observation_space.low[goal:] < 0.0).sum())
+        beams = observation_space.shape[0] - goal - motion
+        if self._is_timed:
+            features = self.POSE_FEATURES + self.MOTION_FEATURES * motion
+        else:
+            features = self.FREE_POSE_FEATURES + self.FREE_MOTION_FEATURES * motion
+        super().__init__(observation_space, features + self.BEAM_FEATURES * beams)
+        self._first_motion, self._first_beam = goal, goal + motion
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features (B, features_dim) of observations (B, d)."""
+        features = self._timed_features if self._is_timed else self._free_features
+        motion, ranges = observations[:, self._first_motion : self._first_beam], observations[:, self._first_beam :]
+        return th.cat([*features(observations, motion), *_range_features(ranges)], dim=1)
+
+    def _free_features(self, observations: th.Tensor, motion: th.Tensor) -> list[th.Tensor]:
+        """Return the features of the pose and of the motion with a free horizon."""
+        goal, heading = observations[:, 0:2], observations[:, 2:4]
+        distance = goal.norm(dim=1, keepdim=True)
+        error = th.atan2(observations[:, 3:4], observations[:, 2:3])
+        bearing = th.atan2(goal[:, 1:2], goal[:, 0:1])
+        return [
+            goal / 5,
+            distance / 5,
+            heading,
+            goal / (distance + 0.1),
+            th.log(distance + 0.05),
+            th.tanh(goal / 0.3),
+            th.tanh(error / 0.3),
+            error,
+            th.cos(error - 2 * bearing),  # see `_timed_features`
+            th.sin(error - 2 * bearing),
+            (motion / 2).clamp(-3, 3),
+            th.tanh(motion / 0.3),
+            th.tanh(motion / 0.05),
+        ]
+
+    def _timed_features(self, observations: th.Tensor, motion: th.Tensor) -> list[th.Tensor]:
+        """Return the features of the pose and of the motion with a fixed horizon."""
         goal, time_left = observations[:, 0:2], observations[:, 4:5]
         distance = goal.norm(dim=1, keepdim=True)
         heading = observations[:, 2:4]  # cosine and sine of the heading error
         error = th.atan2(observations[:, 3:4], observations[:, 2:3])
         bearing = th.atan2(goal[:, 1:2], goal[:, 0:1])
         needed_speeds, needed_turn_rate = observations[:, 5:8], observations[:, 8:9]  # to arrive on time
-        motion, ranges = observations[:, GOAL_ENTRIES : self._first_beam], observations[:, self._first_beam :]
         to_rest = _acceleration_to_rest(motion, th.cat([needed_speeds[:, :1], needed_turn_rate], dim=1), time_left)
-        return th.cat(
-            [
-                goal / 5,
-                distance / 5,
-                heading,
-                time_left / 10,
-                needed_speeds.clamp(-3, 3),
-                (needed_turn_rate / 2).clamp(-3, 3),
-                th.tanh(needed_speeds[:, :2]),
-                goal / (distance + 0.1),
-                th.log(distance + 0.05),
-                th.log(time_left + 0.05),
-                th.exp(-time_left),
-                th.tanh(goal / 0.3),
-                th.tanh(error / 0.3),
-                error,
-                # The angle is zero where a single circular arc reaches the goal pose: the chord of an arc has half its
-                # change of heading.
-                th.cos(error - 2 * bearing),
-                th.sin(error - 2 * bearing),
-                (motion / 2).clamp(-3, 3),
-                th.tanh(motion / 0.3),
-                th.tanh(motion / 0.05),
-                (to_rest / 6).clamp(-3, 3),
-                th.tanh(to_rest),
-                ranges / 5,
-                th.exp(-(ranges - ROBOT_RADIUS) / 0.3),
-                ROBOT_RADIUS / ranges.clamp(min=0.1),
-            ],
-            dim=1,
-        )
+        return [
+            goal / 5,
+            distance / 5,
+            heading,
+            time_left / 10,
+            needed_speeds.clamp(-3, 3),
+            (needed_turn_rate / 2).clamp(-3, 3),
+            th.tanh(needed_speeds[:, :2]),
+            goal / (distance + 0.1),
+            th.log(distance + 0.05),
+            th.log(time_left + 0.05),
+            th.exp(-time_left),
+            th.tanh(goal / 0.3),
+            th.tanh(error / 0.3),
+            error,
+            # The angle is zero where a single circular arc reaches the goal pose: the chord of an arc has half its
+            # change of heading.
+            th.cos(error - 2 * bearing),
+            th.sin(error - 2 * bearing),
+            (motion / 2).clamp(-3, 3),
+            th.tanh(motion / 0.3),
+            th.tanh(motion / 0.05),
+            (to_rest / 6).clamp(-3, 3),
+            th.tanh(to_rest),
+        ]
+
+
+def _range_features(ranges: th.Tensor) -> list[th.Tensor]:
+    """Return the features of the lidar ranges (B, beams)."""
+    return [ranges / 5, th.exp(-(ranges - ROBOT_RADIUS) / 0.3), ROBOT_RADIUS / ranges.clamp(min=0.1)]
 
 
 def _acceleration_to_rest(rates: th.Tensor, needed: th.Tensor, time_left: th.Tensor) -> th.Tensor:
@@ -159,7 +192,7 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
 
     """
     shape = observation_space.shape if isinstance(observation_space, spaces.Box) else ()
-    if not (len(shape) == 1 and shape[0] > GOAL_ENTRIES):
+    if not (len(shape) == 1 and shape[0] > FREE_GOAL_ENTRIES):
         got = f"a Box of shape {shape}" if shape else type(observation_space).__name__
         raise ValueError(f"observation_space: expected that of {ENVIRONMENT} with a lidar, got {got}")
     if not (isinstance(action_space, spaces.Box) and len(action_space.shape) == 1):

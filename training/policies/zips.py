@@ -24,7 +24,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots.base import robot_class
-from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, has_time_left
 from leapnav.training.policies.architecture import ACTIVATIONS, EXTRACTORS, Architecture, is_actor_weight, widths
 
 # Kinds of policies by the module of their class, with the default widths of Stable-Baselines3.
@@ -96,9 +96,13 @@ def _environment(path: Path, data: Mapping[str, Any], given: Mapping[str, Any] |
     stored = _described(data.get("observation_space"))
     shape = stored.get("_shape")
     arguments = dict(given or {})
-    if given is None and isinstance(shape, list) and len(shape) == 1 and shape[0] > GOAL_ENTRIES:
-        reach = re.findall(r"[-\d.e+]+", str(stored.get("high")))
-        arguments = {"lidar_beams": shape[0] - GOAL_ENTRIES, "lidar_range": float(reach[-1]) if reach else 10.0}
+    if given is None and isinstance(shape, list) and len(shape) == 1 and shape[0] > FREE_GOAL_ENTRIES:
+        high = [float(number) for number in re.findall(r"[-+]?\d[\d.e+-]*", str(stored.get("high")))] or [10.0]
+        is_timed = has_time_left(np.array(high)) and shape[0] > GOAL_ENTRIES
+        goal = GOAL_ENTRIES if is_timed else FREE_GOAL_ENTRIES
+        arguments = {"lidar_beams": shape[0] - goal, "lidar_range": high[-1]}
+        if not is_timed:
+            arguments["horizon"] = "free"
     space: Any = NavigateEnv(split="fresh", **arguments).observation_space
     is_box = isinstance(space, spaces.Box) and shape == list(space.shape)
     if not is_box or any(str(getattr(space, side)) != stored.get(side) for side in ("low", "high")):

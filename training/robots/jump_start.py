@@ -65,17 +65,15 @@ class JumpStart(VecEnvWrapper):
         bank = self._banks[self._rng.integers(len(self._banks))]
         index = int(self._rng.integers(len(bank)))
         scenario, reference = bank[index], bank.reference(index)
-        latest = max(0.0, 1.0 - MIN_REMAINING_TIME / scenario.fixed_horizon)
+        latest = max(0.0, 1.0 - MIN_REMAINING_TIME / float(bank.horizons[index]))
         fraction = min(self._rng.uniform(0.0, self.max_fraction), latest)
         k = int(fraction * (len(reference.times) - 1))
         if k == 0:
             return scenario
-        return scenario.model_copy(
-            update={
-                "start": tuple(reference.states[k].astype(float).tolist()),
-                "horizon": float(scenario.fixed_horizon - reference.times[k]),
-            }
-        )
+        update: dict[str, Any] = {"start": tuple(reference.states[k].astype(float).tolist())}
+        if scenario.horizon is not None:
+            update["horizon"] = float(scenario.horizon - reference.times[k])
+        return scenario.model_copy(update=update)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state that determines the following jump starts."""

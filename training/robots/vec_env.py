@@ -126,12 +126,13 @@ class NavigateVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all robots; a robot whose episode ends starts the next one."""
-        observations, rewards, ended, _, infos = self.venv.step(self._actions)
+        observations, rewards, terminated, truncated, infos = self.venv.step(self._actions)
+        ended = terminated | truncated
         self._returns += rewards
         self._lengths += 1
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if self._step_infos:
-            rows = [{**select_robot(infos, i), "TimeLimit.truncated": False} for i in range(self.num_envs)]
+            rows = [{**select_robot(infos, i), "TimeLimit.truncated": bool(truncated[i])} for i in range(self.num_envs)]
         if ended.any():
             last = infos.pop("final_info"), infos.pop("final_obs")
             for i in np.flatnonzero(ended).tolist():
@@ -139,7 +140,7 @@ class NavigateVecEnv(VecEnv):
                 rows[i] = {
                     **select_robot(last[0], i),
                     "terminal_observation": last[1][i],
-                    "TimeLimit.truncated": False,
+                    "TimeLimit.truncated": bool(truncated[i]),
                     "episode": {
                         "r": round(float(self._returns[i]), 6),
                         "l": int(self._lengths[i]),

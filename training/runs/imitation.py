@@ -166,7 +166,8 @@ def _demonstrations(run: Run, count: int, workers: int, progress: bool) -> Datas
     if not any(folder.glob("**/metadata.json")):
         # The scenarios depend on the seed of the run.
         seed = environment_seed(run.config.seed, DEMONSTRATION_STREAM)
-        rollout(run.config.family, count, folder, robot=run.config.robot, seed=seed, workers=workers, progress=progress)
+        task: dict[str, Any] = {"robot": run.config.robot, "horizon": run.config.horizon}
+        rollout(run.config.family, count, folder, **task, seed=seed, workers=workers, progress=progress)
     return Dataset.of(folder)
 
 

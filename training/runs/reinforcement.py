@@ -205,7 +205,7 @@ def _training_env(config: Config) -> VecEnv:
     venv: VecEnv = robots
     if config.jump_start > 0:
         families = FAMILIES if config.family == ALL else (config.family,)
-        banks = [ScenarioBank.shipped(family, "train", config.robot) for family in families]
+        banks = [ScenarioBank.shipped(family, "train", config.robot, config.horizon) for family in families]
         venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
     if config.graded_miss:
         venv = GradedMiss(venv)

@@ -98,6 +98,7 @@ class Run:
             stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
+        stored.setdefault("horizon", "fixed")  # in runs of versions without a free horizon
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
@@ -122,10 +123,9 @@ class Run:
         """
         count = None if final else self.config.evaluation_scenarios
         options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
-        evaluations = [
-            evaluate(policy, ScenarioBank.shipped(family, "test", self.config.robot), count=count, **options)
-            for family in self.families
-        ]
+        robot, horizon = self.config.robot, self.config.horizon
+        banks = [ScenarioBank.shipped(family, "test", robot, horizon) for family in self.families]
+        evaluations = [evaluate(policy, bank, count=count, **options) for bank in banks]
         line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
         for family, evaluation in zip(self.families, evaluations, strict=True):
             line[family] = plain({name: getattr(evaluation, name) for name in MEASURES})

@@ -141,25 +141,33 @@ def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | No
 
 
 def included_banks(
-    specs: Sequence[PolicySpec], families: Sequence[str], split: str = "test", robot: str | None = None
+    specs: Sequence[PolicySpec],
+    families: Sequence[str],
+    split: str = "test",
+    robot: str | None = None,
+    horizon: str | None = None,
 ) -> list[ScenarioBank]:
-    """Return the included banks of families for the robot of policies.
+    """Return the included banks of families for the robot and the horizon of policies.
 
     Args:
         specs: the policies.
         families: the families.
         split: "train" or "test".
         robot: model of the robot; None: that of the policies, or the unicycle if all of them are baselines.
+        horizon: "fixed" or "free"; None: that of the policies, or "fixed" if all of them are baselines.
 
     Raises:
-        ValueError: there is no such bank, or the policies have different robots.
+        ValueError: there is no such bank, or the policies have different robots or horizons.
 
     """
     robots = {spec.robot for spec in specs} - {None} if robot is None else {robot}
     if len(robots) > 1:
         raise ValueError(f"policies: expected policies of one robot, got {', '.join(sorted(map(str, robots)))}")
-    model = robots.pop() if robots else None
-    return [ScenarioBank.shipped(family, split, model or "unicycle") for family in families]
+    horizons = {spec.horizon for spec in specs} - {None} if horizon is None else {horizon}
+    if len(horizons) > 1:
+        raise ValueError("policies: expected policies of one kind of horizon, got fixed and free")
+    model, kind = (found.pop() if found else None for found in (robots, horizons))
+    return [ScenarioBank.shipped(family, split, model or "unicycle", kind or "fixed") for family in families]
 
 
 def compare_policies(

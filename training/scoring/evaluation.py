@@ -242,7 +242,7 @@ def evaluate(
         policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class or a
             function of an environment, with a parameter `env`, that returns one, such as `ExpertPolicy`; or any other
             function, which maps one observation to an action.
-        bank: a bank, or the name of a family for its test split, with the robot of `environment`.
+        bank: a bank, or the name of a family for its test split, with the robot and the horizon of `environment`.
         count: number of scenarios, from the first of the bank; None: all.
         environment: arguments of the environment, such as `observation`.
         seed: random seed of the disturbances.
@@ -265,8 +265,9 @@ def evaluate(
             if not isinstance(bank, str):
                 raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
             check_choice("family", bank, FAMILIES)
-        robot = check_robot((environment or {}).get("robot") or "unicycle")
-        bank = ScenarioBank.shipped(bank, "test", robot.model)
+        given = environment or {}
+        robot = check_robot(given.get("robot") or "unicycle")
+        bank = ScenarioBank.shipped(bank, "test", robot.model, given.get("horizon") or "fixed")
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
     arguments = dict(environment or {})
@@ -297,7 +298,8 @@ def _play_batch(
     state, starts = None, np.ones(count, dtype=bool)
     while any(episode is None for episode in episodes):
         actions, state = policy.predict(observations, state, starts, deterministic=True)
-        observations, rewards, starts, _, infos = venv.step(actions)
+        observations, rewards, terminated, truncated, infos = venv.step(actions)
+        starts = terminated | truncated
         playing = np.array([episode is None for episode in episodes])
         returns += np.where(playing, rewards, 0.0)
         # Robots whose episode has ended are already in the next one; their last step is in `final_info`.

@@ -45,6 +45,11 @@ class PolicySpec:
         """Model of the robot that the policy drives; None for a baseline."""
         return None if self.is_baseline else check_robot(self.environment.get("robot") or "unicycle").model
 
+    @property
+    def horizon(self) -> str | None:
+        """Kind of the horizon for which the policy was trained; None for a baseline."""
+        return None if self.is_baseline else self.environment.get("horizon") or "fixed"
+
 
 def load_policy_spec(
     name: str, *, seed: int = 0, environment: Mapping[str, Any] | None = None, trust: bool = False

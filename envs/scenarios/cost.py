@@ -1,0 +1,29 @@
+"""Weights of the running cost of a scenario."""
+
+from __future__ import annotations
+
+import math
+
+from leapnav.envs.robots import RobotModel
+from leapnav.envs.utils.records import Frozen, NotNegative, Positive
+
+
+class Cost(Frozen):
+    """Weights of the running cost c + 1/2 (speed_weight v^2 + turn_weight omega^2) + Phi(q), see the robot's model.
+
+    The time weight c is the cost per second.
+    """
+
+    speed_weight: Positive = 1.0
+    turn_weight: Positive = 0.5
+    proximity_weight: NotNegative = 1.0
+    proximity_scale: Positive = 0.1
+    time_weight: NotNegative = 0.0
+
+
+def cruise_speed(robot: RobotModel, cost: Cost) -> float:
+    """Return the speed (m/s) at which c = 1/2 speed_weight v^2, at most the limit of the robot.
+
+    An optimum with a free horizon has H = 0, hence this speed on a straight line without obstacles.
+    """
+    return min(math.sqrt(2.0 * cost.time_weight / robot.metric(cost)[0]), robot.speed_limits()[0])
