@@ -26,6 +26,8 @@ SETTINGS = [
     {"disturbance": 0.2, "actuation": "motor", "terminate_on_collision": False},
     {"dict_observation": True, "observation": "map"},
     {"scenario": scenario_fields(), "control_period": 0.11},
+    {"horizon": "free", "reward": "shaped"},
+    {"horizon": "free", "terminate_on_collision": False, "actuation": "motor"},
 ]
 
 

@@ -160,14 +160,25 @@ def included_banks(
         ValueError: there is no such bank, or the policies have different robots or horizons.
 
     """
-    robots = {spec.robot for spec in specs} - {None} if robot is None else {robot}
-    if len(robots) > 1:
-        raise ValueError(f"policies: expected policies of one robot, got {', '.join(sorted(map(str, robots)))}")
-    horizons = {spec.horizon for spec in specs} - {None} if horizon is None else {horizon}
-    if len(horizons) > 1:
-        raise ValueError("policies: expected policies of one kind of horizon, got fixed and free")
-    model, kind = (found.pop() if found else None for found in (robots, horizons))
-    return [ScenarioBank.shipped(family, split, model or "unicycle", kind or "fixed") for family in families]
+    model = _common("robot", [spec.robot for spec in specs], robot) or "unicycle"
+    kind = _common("horizon", [spec.horizon for spec in specs], horizon) or "fixed"
+    return [ScenarioBank.shipped(family, split, model, kind) for family in families]
+
+
+def _common(name: str, values: Sequence[str | None], given: str | None) -> str | None:
+    """Return the value that policies have in common, None for baselines, which have none; or the given one.
+
+    Raises:
+        ValueError: they have different values, or another one is given.
+
+    """
+    found = {value for value in values if value is not None}
+    if len(found) > 1:
+        raise ValueError(f"policies: expected policies of one {name}, got {', '.join(sorted(found))}")
+    common = found.pop() if found else given
+    if given is not None and common != given:
+        raise ValueError(f"{name}: expected that of the policies, {common!r}, got {given!r}")
+    return common
 
 
 def compare_policies(
