@@ -28,6 +28,7 @@ BLOCKS = [
     r"True \d\.\d+\n",
     r"(.*\n)*41 2 3\n",
     rf"(.*\n)*{RATE}\n",
+    r"True 8\.35 0\.99\n",
     r"\(1024, 41\) \(1024,\)\n",
     r"True\n",
     BANK,
