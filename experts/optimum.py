@@ -18,7 +18,7 @@ from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.shapes.sampling import sample_grid
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
-from leapnav.experts.numerics.shooting import time_curvature
+from leapnav.experts.numerics.shooting import hamiltonians, time_curvature
 from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -114,6 +114,7 @@ KERNELS = (
     solve_nodes,
     *CERTIFICATE_KERNELS,
     time_curvature,
+    hamiltonians,
 )
 
 
@@ -153,6 +154,8 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
     prepare(*KERNELS, *(() if is_unicycle else (descent.descend,)))
     problem = OptimalControlProblem.from_scenario(scenario)
+    if problem.horizon is None and problem.starts_at_goal:
+        return as_optimum(failure(problem, Status.ZERO_HORIZON))
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
@@ -257,7 +260,11 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
             if not batch:
                 break
             taken += batch
-            shortest_time = min(shortest_time, *(float(shortest_durations(c.poses, scenario).sum()) for c in batch))
+            # A free horizon is never too short.
+            durations = [
+                0.0 if scenario.horizon is None else float(shortest_durations(c.poses, scenario).sum()) for c in batch
+            ]
+            shortest_time = min(shortest_time, *durations)
             search.add(Trajectory(c.times, c.poses) for c in batch)
             if not thorough:
                 break

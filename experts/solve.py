@@ -84,6 +84,8 @@ def solve(
     if guess is not None:
         ocp, path, options = _from_guess(ocp, guess, options)
         extremal = METHODS[method](ocp, path, options)
+    elif ocp.horizon is None and ocp.starts_at_goal:
+        extremal = failure(ocp, Status.ZERO_HORIZON)
     elif isinstance(problem, Scenario):
         candidate = best_candidate(Lattice(problem))
         if candidate is None:

@@ -16,6 +16,7 @@ from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
 from leapnav.experts import (
     ControlAffineSystem,
     OptimalControlProblem,
+    Status,
     Trajectory,
     continuation,
     find_optimum,
@@ -236,6 +237,21 @@ def test_controls_at_their_bounds_all_the_time_leave_no_other_duration_close_by(
     assert extremal.success
     assert extremal.certificate.time_curvature == math.inf
     assert extremal.horizon == pytest.approx(6.0, rel=1e-9)
+
+
+def test_an_optimum_that_takes_no_time_is_none():
+    scenario = free(sample_scenario("open", 3))
+    x, y, heading = scenario.start
+    for goal in ((x, y, heading), (x, y, heading + 2 * math.pi), (x, y, None)):
+        assert find_optimum(scenario.model_copy(update={"goal": goal})).status is Status.ZERO_HORIZON
+    assert find_optimum(scenario.model_copy(update={"goal": (x, y, heading + 0.001)})).success
+
+
+def test_a_large_time_weight_is_certified():
+    fast = free(sample_scenario("open", 3, {"model": "unicycle", "max_speed": 1e4, "max_turn_rate": 1e4}), 1e6)
+    slow = free(sample_scenario("open", 3), 1e-2)
+    costs = [find_optimum(scenario).cost for scenario in (fast, slow)]
+    assert costs[0] == pytest.approx(1e4 * costs[1], rel=1e-3)  # J = d sqrt(2 c) without proximity cost
 
 
 def test_a_problem_with_a_free_horizon_survives_pickling():

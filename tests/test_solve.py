@@ -4,7 +4,7 @@ import pickle
 import numpy as np
 import pytest
 import sympy as sp
-from helpers import best_known, published_problems, shooting_guess
+from helpers import best_known, published_problems, scenario_fields, shooting_guess
 
 from leapnav.envs import Scenario
 from leapnav.experts import (
@@ -232,10 +232,12 @@ def straight(problem):
     return OptimalControlProblem.from_scenario(problem).straight_line()
 
 
+AT_GOAL = {"goal": [1, 1, 2 * math.pi], "horizon": None, "cost": {"time_weight": 0.5}}  # of scenario_fields
 VAN_DER_POL = PROBLEMS["van-der-pol-free-end"][0]
 # A solve that ends with each status; only find_optimum returns HORIZON_TOO_SHORT, see test_optimum.
 FAILURES = {
     Status.NO_PATH: lambda: solve(blocked()),
+    Status.ZERO_HORIZON: lambda: solve(Scenario.from_dict(scenario_fields(**AT_GOAL))),
     Status.STALLED: lambda: solve(unreachable(), method="multiple_shooting"),
     Status.DIVERGED: lambda: solve(hyper_sensitive(100.0), method="single_shooting"),
     Status.SINGULAR: lambda: solve(uncontrollable(), method="multiple_shooting"),

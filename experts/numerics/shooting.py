@@ -33,6 +33,15 @@ def hamiltonian(flow, z, dz):
     return value
 
 
+@kernel(VECTOR(FLOW, MATRIX))
+def hamiltonians(flow, rows):
+    """Return the Hamiltonian at each row (q, lam)."""
+    values, dz = np.empty(len(rows)), np.empty(rows.shape[1])
+    for k in range(len(rows)):
+        values[k] = hamiltonian(flow, rows[k], dz)
+    return values
+
+
 class NewtonSystem(NamedTuple):
     """The linear system of a Newton step, with by-products of its evaluation.
 

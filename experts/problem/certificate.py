@@ -23,7 +23,7 @@ UNCONVERGED_ACCURACY = 1e-9
 # Initial size of the table of integration steps; it grows by a factor of 4 when it is full.
 MIN_ROWS, ROWS_PER_SEGMENT = 512, 24
 # Nodes between which the derivative of the Hamiltonian by the horizon is computed, and the integrator's tolerance.
-MAX_CURVATURE_NODES, CURVATURE_ACCURACY = 33, 1e-5
+MAX_CURVATURE_NODES, CURVATURE_ACCURACY = 17, 1e-5
 MAX_ROWS = 100_000  # integration steps; an extremal that needs more has diverged
 
 CERTIFICATE_KERNELS = (trace, dense_clearance, propagate, orthonormalise)
@@ -100,7 +100,7 @@ def certify(
     curvature, horizon_error = None, None
     if problem.horizon is None:
         largest = float(np.abs(hamiltonian).max())
-        residual = max(residual, largest)
+        residual = max(residual, largest / max(1.0, problem.time_weight))
         at = np.unique(np.linspace(0, n_rows - 1, min(n_rows, MAX_CURVATURE_NODES)).astype(int))
         curvature = time_curvature(arrays.flow, extremal.times[at], z[at], arrays.end, CURVATURE_ACCURACY)
         horizon_error = largest / (curvature * extremal.horizon) if curvature > 0 else math.inf

@@ -22,6 +22,9 @@ class Status(Enum):
     SUCCESS = "certified: a local minimum, to the tolerance"
     NO_PATH = "no path from start to goal was found. Check that the passages between the obstacles are wide enough."
     HORIZON_TOO_SHORT = "the goal is out of reach within the horizon. Try a longer horizon or higher limits."
+    ZERO_HORIZON = (
+        "the start is the goal, so with a free horizon the optimum takes no time. Move the start or the goal."
+    )
     STALLED = "Newton's method stopped making progress. Try method='leapfrog', a better guess, or find_optimum."
     DIVERGED = "the extremal flow diverged from the guess. Try a guess closer to the solution, or method='leapfrog'."
     SINGULAR = "the Newton matrix is singular: the solution is not isolated. Move the start or the goal slightly."
@@ -61,7 +64,7 @@ class Certificate:
 
     Attributes:
         residual: largest violation of the boundary conditions, transversality conditions included, and with a free
-            horizon also H = 0.
+            horizon also |H|, divided by the time weight if that is larger than 1.
         defect: largest difference between a node and the extremal flow from the node before it, integrated at 1e-12.
         hamiltonian_drift: largest minus smallest Hamiltonian. The Hamiltonian is constant along an extremal.
         conjugate_point: time (s) of a conjugate point before the horizon, at which dq(t)/dlambda(0) loses rank; with

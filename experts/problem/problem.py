@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -167,6 +167,12 @@ class OptimalControlProblem:
                 goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
         return replace(self, goal=tuple(goal))
 
+    @property
+    def starts_at_goal(self) -> bool:
+        """Whether the start is the goal, up to multiples of 2 pi of the angles."""
+        goal = self.with_winding_of(np.array([self.start], dtype=float)).goal
+        return all(g is None or math.isclose(s, g, abs_tol=1e-12) for s, g in zip(self.start, goal, strict=True))
+
     def with_horizon(self, horizon: float) -> OptimalControlProblem:
         """Return the problem with a fixed horizon (s)."""
         return replace(self, horizon=horizon)
@@ -191,10 +197,7 @@ class OptimalControlProblem:
     def _compiled(self) -> tuple[ControlAffineSystem, sp.Expr]:
         """System and state cost in the form that is compiled: a time weight is an additional parameter."""
         state_cost = as_expression("state_cost", self.state_cost)
-        if self.time_weight == 0.0:
-            return self.system, state_cost
-        weight = time_weight_symbol()
-        return replace(self.system, parameters=(*self.system.parameters, weight)), state_cost + weight
+        return (self.system, state_cost) if self.time_weight == 0.0 else _weighted(self.system, state_cost)
 
     @property
     def _obstacles(self) -> Obstacles:
@@ -270,6 +273,13 @@ class OptimalControlProblem:
         goal = np.array([s if g is None else g for s, g in zip(self.start, self.goal, strict=True)], dtype=float)
         fraction = np.linspace(0.0, 1.0, points)[:, None]
         return Trajectory(np.linspace(0.0, self.horizon or 1.0, points), start + fraction * (goal - start))
+
+
+@cache
+def _weighted(system: ControlAffineSystem, state_cost: sp.Expr) -> tuple[ControlAffineSystem, sp.Expr]:
+    """Return a system and its state cost with the time weight as an additional parameter."""
+    weight = time_weight_symbol()
+    return replace(system, parameters=(*system.parameters, weight)), state_cost + weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 
 from leapnav.experts.numerics.flow import NewtonOptions
 from leapnav.experts.numerics.integrator import propagate
-from leapnav.experts.numerics.shooting import hamiltonian
+from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.extremal import Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
@@ -166,8 +166,7 @@ class FeasiblePath:
         The derivative of the cost by the factor s of the times is the sum of the Hamiltonians of the arcs times their
         durations. The step is exact for systems without drift, whose cost is E / s + P s.
         """
-        arrays, rates = self.problem.arrays, np.empty(self.nodes.shape[1])
-        values = np.array([hamiltonian(arrays.flow, node, rates) for node in self.nodes[:-1]])
+        values = hamiltonians(self.problem.arrays.flow, self.nodes[:-1])
         slope, before = float(values @ np.diff(self.times)), self.cost
         self.evaluations += len(values)
         factor = time_factor(before, slope, MIN_FACTOR)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from leapnav.experts.numerics.shooting import hamiltonian
+from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.problem.system import differential_drive, unicycle
@@ -75,10 +75,9 @@ class DirectPath:
 
     def time_factor(self, problem: OptimalControlProblem) -> float:
         """Return the factor of all times that reduces the cost, for a problem with a free horizon."""
-        arrays, rates = problem.arrays, np.empty(2 * problem.system.n)
-        z = np.concatenate([self.states, self.costates], axis=1)
-        at = np.unique(np.linspace(0, len(z) - 1, HAMILTONIAN_POINTS).astype(int))
-        values = np.array([hamiltonian(arrays.flow, row, rates) for row in z[at]])
+        at = np.unique(np.linspace(0, len(self.times) - 1, HAMILTONIAN_POINTS).astype(int))
+        z = np.concatenate([self.states[at], self.costates[at]], axis=1)
+        values = hamiltonians(problem.arrays.flow, z)
         return time_factor(self.cost, float(np.trapezoid(values, self.times[at])), MIN_TIME_FACTOR)
 
 
