@@ -65,6 +65,16 @@ def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
         assert rest.horizon >= 1.0
 
 
+def test_with_a_free_horizon_the_expert_takes_over_where_the_robot_stops():
+    scenario = sample_scenario("clutter", 7, horizon="free")
+    moving, still = np.linspace(scenario.start, scenario.goal, 100), np.tile(scenario.goal, (300, 1))
+    episode = _Episode(scenario, np.concatenate([moving, still]).astype(float), success=False, collision=False)
+    starts = [rest.start for rest in _takeovers(episode, 0.05, np.random.default_rng(0))]
+    assert len(starts) > 5 and all(rest in map(tuple, moving) for rest in starts[:-2])
+    assert scenario.goal in starts  # where it has stopped
+    assert _takeovers(episode, 0.05, np.random.default_rng(0))[0].time_limit == scenario.time_limit
+
+
 def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
     """Takeovers after the first one without an optimum are skipped."""
     solvable = sample_scenario("open", 7)

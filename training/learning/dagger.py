@@ -40,8 +40,10 @@ from leapnav.training.threads import limit_threads
 
 EPISODES_PER_TASK = 16  # episodes labelled in one task of a worker
 # Times of the takeovers before a collision (s), denser shortly before it. In an episode that misses its goal the number
-# of takeovers is the same, at uniformly distributed times.
+# of takeovers is the same, at uniformly distributed times. With a free horizon, a robot that misses its goal has mostly
+# stopped, between two paths of similar cost: the times are then those before a time shortly after the stop.
 TAKEOVER_TIMES = np.array([8.0, 6.5, 5.0, 4.0, 3.25, 2.5, 2.0, 1.5, 1.1, 0.8, 0.5, 0.3])
+STOP_DISTANCE, AFTER_STOP = 0.1, 0.6  # m (and rad) from the last state; s
 RELATIVE_SPREAD = 0.2  # half-width of the random factor of these times around 1
 MIN_TIME_LEFT = 1.0  # s before the horizon, after which the expert does not take over
 # Properties of the environment's settings that DAgger does not support, as named in the error message.
@@ -280,9 +282,10 @@ def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> li
     end, horizon = len(episode.states) * period, episode.scenario.horizon
     if episode.success:
         times = rng.uniform(0.0, end, 1)
-    elif episode.collision:
+    elif episode.collision or horizon is None:
         n_takeovers = len(TAKEOVER_TIMES)
-        times = end - TAKEOVER_TIMES * rng.uniform(1 - RELATIVE_SPREAD, 1 + RELATIVE_SPREAD, n_takeovers)
+        decision = end if episode.collision else min(_stop_time(episode.states, period) + AFTER_STOP, end)
+        times = decision - TAKEOVER_TIMES * rng.uniform(1 - RELATIVE_SPREAD, 1 + RELATIVE_SPREAD, n_takeovers)
     else:
         times = np.sort(rng.uniform(0.0, end, len(TAKEOVER_TIMES)))
     steps = np.unique((times / period).round().astype(int))
@@ -298,6 +301,13 @@ def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> li
             rest["start_motion"] = tuple(motion)
         scenarios.append(episode.scenario.model_copy(update=rest))
     return scenarios
+
+
+def _stop_time(states: np.ndarray, period: float) -> float:
+    """Return the time (s) from which the robot stays where the episode ends."""
+    distances = np.linalg.norm(states[:, :3] - states[-1, :3], axis=1)
+    moving = np.flatnonzero(distances > STOP_DISTANCE)
+    return period * (int(moving[-1]) + 1 if len(moving) else 0)
 
 
 def _label(
