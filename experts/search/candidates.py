@@ -200,6 +200,10 @@ class CandidateSearch:
         """Return the metric for a given E."""
         lattice = self.lattice
         speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
+        fastest = math.sqrt(lattice.weights[0]) * lattice.scenario.robot.speed_limits()[0]
+        if lattice.scenario.horizon is None and fastest < math.inf:
+            # At the speed limit, which is below the optimal speed there, a path costs (c + Phi) / v + r_v v / 2 per m.
+            speed = np.where(speed > fastest, 0.5 * (speed**2 / fastest + fastest), speed)
         plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
         return Metric(speed, plane, lattice.cell, *lattice.weights, moves.targets, moves.points, moves.weights)
 
