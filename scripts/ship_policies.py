@@ -11,24 +11,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.scenarios.families import ALL, FAMILIES, collection_name
 from leapnav.training import DAggerRunConfig, evaluate, load_policy, policy_environment, save_policy, train_dagger
 from leapnav.training.config import RobotName
 from leapnav.training.policies.files import SHIPPED, read_description
 
 ROBOTS = ("car", "dynamic_unicycle")
-NAMES = (*FAMILIES, ALL, *(f"{robot}-clutter" for robot in ROBOTS))
+FREE = collection_name("clutter", horizon="free")
+NAMES = (*FAMILIES, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
 
 
 def ship(name: str, runs: Path) -> None:
     """Train the policy of a family, or resume its run; write the actor in half precision, and score it."""
     run = runs / name
-    robot, _, family = name.rpartition("-")
-    config = DAggerRunConfig.tuned(family, out=run)
-    if robot:
+    prefix, _, family = name.rpartition("-")
+    config = DAggerRunConfig.tuned(family, out=run, horizon="free" if name == FREE else "fixed")
+    if prefix in ROBOTS:
         # Their actions are rates of what the unicycle controls directly; the fit needs more weights and epochs.
         dagger = replace(config.dagger, rounds=12, last_epochs=12)
-        config = replace(config, robot=cast(RobotName, robot), hidden=(400, 400, 400), dagger=dagger)
+        config = replace(config, robot=cast(RobotName, prefix), hidden=(400, 400, 400), dagger=dagger)
     train_dagger(replace(config, resume=(run / "config.json").exists()), workers=os.cpu_count() or 1)
     shipped = SHIPPED / name
     shutil.rmtree(shipped, ignore_errors=True)

@@ -38,7 +38,8 @@ def actions(count, seed=0):
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"family": "clutter"}, {"family": "open"}, {"scenario": scenario()}, {"lidar_beams": 7}]
+    "arguments",
+    [{"family": "clutter"}, {"family": "open"}, {"scenario": scenario()}, {"lidar_beams": 7}, {"horizon": "free"}],
 )
 def test_both_checkers_accept_the_environment_without_a_warning(arguments):
     with warnings.catch_warnings():

@@ -121,8 +121,9 @@ def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):
 
 @pytest.mark.parametrize("name", shipped_policies())
 def test_a_policy_that_ships_starts_a_run_with_the_defaults(name, tmp_path):
-    robot, _, family = name.rpartition("-")
-    config = PPOConfig.tuned(family, robot=robot or "unicycle", out=tmp_path, warm_start=(Path(name),))
+    prefix, _, family = name.rpartition("-")
+    task = {"horizon": "free"} if prefix == "free" else {"robot": prefix or "unicycle"}
+    config = PPOConfig.tuned(family, **task, out=tmp_path, warm_start=(Path(name),))
     demos, start = _resolve_warm_start(config)
     assert demos == []
     assert start.observation_space == _training_env(config).observation_space

@@ -167,7 +167,8 @@ def _print_summary(bank: ScenarioBank) -> None:
 
     residual, defect, drift, _ = bank.certificates.max(axis=0)
     excess = bank.second_costs / bank.costs - 1
-    print(f"{bank.path}: {len(bank)} scenarios of {bank.family}, seed {bank.seed}, leapnav {bank.software}")
+    kind = "" if bank.horizon == "fixed" else ", free horizon"
+    print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, seed {bank.seed}, leapnav {bank.software}")
     print("  checksums          verified")
     print(f"  sampled            {bank.drawn}")
     for reason, count in bank.rejected.items():
@@ -181,7 +182,7 @@ def _print_summary(bank: ScenarioBank) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     for name, values, scale in (
         ("J*", bank.costs, 1),
-        ("horizon (s)", bank.horizons, 1),
+        ("horizon (s)" if bank.horizon == "fixed" else "duration (s)", bank.horizons, 1),
         ("clearance (m)", bank.certificates[:, 3], 1),
         ("excess cost of the second best (%)", excess[np.isfinite(excess)], 100),
     ):
