@@ -30,6 +30,7 @@ RATES = [
     ("vector, 32 beams, car", ROBOTS, {"robot": "car"}, 10.0),
     ("vector, 32 beams, dynamic_unicycle", ROBOTS, {"robot": "dynamic_unicycle"}, 10.0),
     ("vector, 32 beams, differential_drive", ROBOTS, {"robot": "differential_drive"}, 10.0),
+    ("vector, 32 beams, free horizon", ROBOTS, {"horizon": "free"}, 10.0),
     ("vector, state, motors", ROBOTS, {"observation": "state", "actuation": "motor"}, None),
     ("vector, 32 lidar beams, disturbed", ROBOTS, {"disturbance": 0.1}, None),
     ("vector of 16, 32 lidar beams", 16, {}, None),

@@ -22,8 +22,8 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
     | | 2, 3 | cosine and sine of the heading | 1 | -1 to 1 |
     | `desired_goal` | 0, 1 | goal position | m | -1000 to 1000 |
     | | 2, 3 | cosine and sine of the goal heading; 0, 0 if the goal heading is free | 1 | -1 to 1 |
-    | `observation` | 0 | time left | s | 0 to 10000 |
-    | | 1 ... | the parts of `NavigateEnv` without `goal` | | |
+    | `observation` | 0 | time left, with a fixed horizon only | s | 0 to 10000 |
+    | | following | the parts of `NavigateEnv` without `goal` | | |
 
     ## Rewards
     | `reward` | Value |

@@ -176,7 +176,8 @@ class EnvironmentSettings:
             self.goal_conditioned
             and self.free_horizon
             and self.observation == "state"
-            and not self.model.sizes()[0] > 3
+            and not self.motors
+            and self.model.sizes()[0] == 3
         ):
             raise ValueError(
                 "observation: with a free horizon, a goal-conditioned environment needs 'lidar' or 'map', got 'state'"

@@ -167,18 +167,6 @@ class Scenario(Frozen):
         return "free" if self.horizon is None else "fixed"
 
     @property
-    def fixed_horizon(self) -> float:
-        """The horizon (s).
-
-        Raises:
-            ScenarioError: it is free.
-
-        """
-        if self.horizon is None:
-            raise ScenarioError(one_line(self.name, ["horizon: expected a number, got None"]))
-        return self.horizon
-
-    @property
     def cruise_speed(self) -> float:
         """Speed (m/s) of an optimum with a free horizon on a straight line without obstacles, at most the limit."""
         return cruise_speed(self.robot, self.cost)

@@ -83,7 +83,9 @@ class ScenarioSource:
         if robot is not None and not agrees:
             raise ValueError(f"robot: expected that of the {place}, {given_by!r}, got {chosen!r}")
         self.robot: RobotModel = given_by or chosen
-        known = self.scenario.horizon_kind if self.scenario is not None else self.bank.horizon if self.bank else None
+        known = None if self.bank is None else self.bank.horizon
+        if self.scenario is not None:
+            known = self.scenario.horizon_kind
         if horizon is not None and known not in (None, horizon):
             raise ValueError(f"horizon: expected that of the {place}, {known!r}, got {horizon!r}")
         self.horizon: str = known or horizon or "fixed"

@@ -84,7 +84,7 @@ def goal_entries(settings: EnvironmentSettings) -> int:
 
 def has_time_left(high: np.ndarray) -> bool:
     """Return whether flat observations with the upper bounds `high` contain the time left, at the index TIME_LEFT."""
-    return len(high) >= GOAL_ENTRIES and float(high[TIME_LEFT]) == MAX_TIME
+    return len(high) >= GOAL_ENTRIES and tuple(high[TIME_LEFT : TIME_LEFT + 2].tolist()) == (MAX_TIME, MAX_RATE)
 
 
 def motion_entries(settings: EnvironmentSettings) -> int:
