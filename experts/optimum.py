@@ -18,7 +18,7 @@ from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.shapes.sampling import sample_grid
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
-from leapnav.experts.numerics.shooting import hamiltonians, time_curvature
+from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -113,7 +113,6 @@ KERNELS = (
     arcs_descent.descend,
     solve_nodes,
     *CERTIFICATE_KERNELS,
-    time_curvature,
     hamiltonians,
 )
 

@@ -9,9 +9,8 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
-from leapnav.experts.numerics.flow import END_CONDITION, FLOW, EndCondition
+from leapnav.experts.numerics.flow import END_CONDITION, FLOW
 from leapnav.experts.numerics.integrator import propagate
-from leapnav.experts.numerics.linear import solve_banded
 
 
 @kernel(NOTHING(MATRIX, int64))
@@ -130,36 +129,3 @@ def linearise(flow, times, factor, Z, start, end, accuracy, system):
         norm += rhs[i] * rhs[i]
         largest = max(largest, abs(rhs[i]))
     return norm, largest, evaluations
-
-
-@kernel(float64(FLOW, VECTOR, MATRIX, END_CONDITION, float64))
-def time_curvature(flow, times, Z, end, accuracy):
-    """Return d2J/dT2 for extremals with the same ends, which is the derivative of the Hamiltonian.
-
-    It is infinite if no extremal with another duration is close, because controls are at their bounds all the time, and
-    NaN if the flow diverged. `times` and Z (segments + 1, 2n) are those of an extremal.
-    """
-    n = len(end.goal)
-    segments = len(times) - 1
-    half = 3 * n - 1
-    unknowns = 2 * n * (segments + 1)
-    rows, rhs = np.empty((unknowns, 3 * half + 1)), np.empty(unknowns)
-    system = NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
-    fixed = EndCondition(end.goal, end.free, False)
-    norm, _, _ = linearise(flow, times, 1.0, Z, Z[0, :n].copy(), fixed, accuracy, system)
-    if norm == np.inf:
-        return np.nan
-    rates = np.empty(2 * n)
-    for i in range(unknowns):
-        rhs[i] = 0.0
-    for k in range(segments):
-        hamiltonian(flow, Z[k + 1], rates)
-        for i in range(2 * n):
-            rhs[n + 2 * n * k + i] = -(times[k + 1] - times[k]) / times[segments] * rates[i]
-    if not solve_banded(rows, rhs, half):
-        return np.inf
-    hamiltonian(flow, Z[0], rates)
-    curvature = 0.0
-    for i in range(n):
-        curvature += rates[i] * rhs[n + i] - rates[n + i] * rhs[i]
-    return curvature

@@ -9,10 +9,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from leapnav.experts.numerics.integrator import DENSE_TERMS, propagate
-from leapnav.experts.numerics.shooting import time_curvature
 from leapnav.experts.problem.conjugate_points import conjugate_time, first_even_conjugate_time, first_focal_time
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, Status
-from leapnav.experts.problem.frames import orthonormalise
+from leapnav.experts.problem.frames import MIN_DETERMINANT, orthonormalise
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.problem.tracing import FULL, TraceRecord, dense_clearance, trace
 
@@ -22,8 +21,6 @@ ACCURACY = 1e-12
 UNCONVERGED_ACCURACY = 1e-9
 # Initial size of the table of integration steps; it grows by a factor of 4 when it is full.
 MIN_ROWS, ROWS_PER_SEGMENT = 512, 24
-# Nodes between which the derivative of the Hamiltonian by the horizon is computed, and the integrator's tolerance.
-MAX_CURVATURE_NODES, CURVATURE_ACCURACY = 17, 1e-5
 MAX_ROWS = 100_000  # integration steps; an extremal that needs more has diverged
 
 CERTIFICATE_KERNELS = (trace, dense_clearance, propagate, orthonormalise)
@@ -53,10 +50,10 @@ def certify(
     times, nodes = np.ascontiguousarray(times, dtype=float), np.ascontiguousarray(nodes, dtype=float)
     accuracy = ACCURACY if converged is Status.SUCCESS else UNCONVERGED_ACCURACY
     capacity = max(MIN_ROWS, ROWS_PER_SEGMENT * len(times))
-    sensitivity = np.empty((2 * n, n))
+    sensitivity, final = np.empty((2 * n, n)), np.empty((2 * n, n))
     while True:
         out, terms = np.empty((capacity, 4 + m + 4 * n)), np.empty((capacity, DENSE_TERMS, 2 * n + 1))
-        record = TraceRecord(out, terms, sensitivity)
+        record = TraceRecord(out, terms, sensitivity, final)
         n_rows, defect, conjugate_step = trace(arrays.flow, arrays.control, times, nodes, accuracy, record)
         if n_rows != FULL or capacity > MAX_ROWS:
             break
@@ -101,8 +98,7 @@ def certify(
     if problem.horizon is None:
         largest = float(np.abs(hamiltonian).max())
         residual = max(residual, largest / max(1.0, problem.time_weight))
-        at = np.unique(np.linspace(0, n_rows - 1, min(n_rows, MAX_CURVATURE_NODES)).astype(int))
-        curvature = time_curvature(arrays.flow, extremal.times[at], z[at], arrays.end, CURVATURE_ACCURACY)
+        curvature = _time_curvature(final, out[-1, 3 + m + 2 * n : 3 + m + 4 * n], arrays.free)
         horizon_error = largest / (curvature * extremal.horizon) if curvature > 0 else math.inf
     certificate = Certificate(
         residual=residual,
@@ -115,6 +111,31 @@ def certify(
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     return replace(extremal, certificate=certificate, status=status)
+
+
+def _time_curvature(frame: np.ndarray, rates: np.ndarray, free: np.ndarray) -> float:
+    """Return d2J/dT2 for extremals with the same ends, which is the derivative of the Hamiltonian at the final time.
+
+    A change of T moves the final state by q' along an extremal. The initial costate changes so that the goal, and the
+    zero costates of free components, are met again.
+
+    Args:
+        frame (2n, n): a basis of the changes of the final state and costate with the initial costate.
+        rates (2n,): q' and lambda' at the final time.
+        free (n,): which final states are free, bool.
+
+    Returns:
+        The derivative; infinite if no extremal with another duration is close, because controls are at their bounds all
+        the time.
+
+    """
+    n = len(free)
+    upper, lower, rate, costate_rate = frame[:n], frame[n:], rates[:n], rates[n:]
+    conditions = np.where(free[:, None], lower, upper)
+    if abs(np.linalg.det(conditions)) < MIN_DETERMINANT:
+        return math.inf
+    change = np.linalg.solve(conditions, np.where(free, costate_rate, rate))
+    return float((costate_rate @ upper - rate @ lower) @ change)
 
 
 def verify(extremal: Extremal) -> float:

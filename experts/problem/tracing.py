@@ -36,15 +36,17 @@ class TraceRecord(NamedTuple):
             and the determinant of dq/dlambda(0) in an orthonormal basis.
         terms: (N, DENSE_TERMS, 2n + 1), the interpolant of the step that starts at the row.
         sensitivity: (2n, n), dz/dlambda(0), orthonormalised, at the start of the step with the first conjugate point.
+        final: (2n, n), the same at the final time.
 
     """
 
     rows: np.ndarray
     terms: np.ndarray
     sensitivity: np.ndarray
+    final: np.ndarray
 
 
-TRACE_RECORD = record_type(TraceRecord, rows=MATRIX, terms=CUBE, sensitivity=MATRIX)
+TRACE_RECORD = record_type(TraceRecord, rows=MATRIX, terms=CUBE, sensitivity=MATRIX, final=MATRIX)
 
 
 @kernel(tuple_of(int64, float64, int64)(FLOW, CONTROL_FUNCTION, VECTOR, MATRIX, float64, TRACE_RECORD))
@@ -133,6 +135,9 @@ def trace(flow, control, times, Z, accuracy, record):
                             record.sensitivity[i, j] = before_step[i, j]
         for i in range(size):
             defect = max(defect, abs(y[i] - Z[k + 1, i]))
+    for i in range(size):
+        for j in range(n):
+            record.final[i, j] = S[i, j]
     return rows + 1, defect, conjugate
 
 
