@@ -16,11 +16,12 @@ from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, has_time_lef
 from leapnav.experts import ExpertPolicy, build_bank, find_optimum, find_reached_optimum
 from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
-from leapnav.training import Dataset, evaluate, load_policy, make_vec_env, save_policy
+from leapnav.training import Dataset, evaluate, load_policy, make_policy, make_vec_env, save_policy
 from leapnav.training.config import CloningConfig, DAggerConfig, DAggerRunConfig, PPOConfig, SACConfig
 from leapnav.training.learning.cloning import behaviour_clone
 from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.baselines import GoToGoal
+from leapnav.training.policies.momentum import add_momentum, effort_weights
 from leapnav.training.runs.imitation import train_dagger
 from leapnav.training.runs.reinforcement import train_ppo, train_sac
 
@@ -353,3 +354,48 @@ def test_old_banks_and_policies_are_fixed():
     assert (DATA / "best_known.json").exists()
     policy = load_policy("open", NavigateEnv("open", split="fresh"))
     assert has_time_left(policy.observation_space.high)
+
+
+def test_momentum_leaves_decided_actions_unchanged():
+    scenario = straight(time_limit=5.0)
+    weights = effort_weights(scenario)
+    assert weights == pytest.approx((1.0 * 2.0**2, 0.5 * 3.0**2))  # r u_max^2 / (2 c), with c = 0.5
+    for optimum in (find_optimum(sample_scenario("rooms", seed, horizon="free")) for seed in (31_000, 31_001)):
+        actions = optimum.controls / np.array([2.0, 3.0])
+        assert (actions**2 @ weights).min() >= 1 - 1e-6  # H = 0: the effort of an optimum is at least c
+    weights = th.tensor(weights)
+    decided, previous = th.tensor([[0.6, 0.0], [-0.2, 0.5]]), th.tensor([[-1.0, 1.0], [1.0, -1.0]])
+    assert th.equal(add_momentum(decided, previous, weights), decided)
+    undecided = add_momentum(th.tensor([[0.01, 0.0], [-0.01, 0.0], [0.0, 0.0]]), th.tensor([[0.5, 0.0]]), weights)
+    assert (undecided[:, 0] > 0.49).all()  # in the direction of the last action, with the least effort of an optimum
+    alone = add_momentum(th.tensor([[0.01, -0.02]]), th.zeros(1, 2), weights)
+    assert (weights * alone.square()).sum() == pytest.approx(1.0) and alone[0, 1] == pytest.approx(-2 * alone[0, 0])
+
+
+def test_only_robots_without_drift_have_momentum():
+    for robot in ("unicycle", "differential_drive", "car"):
+        assert effort_weights(sample_scenario("open", 3, robot, "free")) is not None
+        assert effort_weights(sample_scenario("open", 3, robot)) is None
+    assert effort_weights(sample_scenario("open", 3, "dynamic_unicycle", "free")) is None
+
+
+def test_a_policy_with_momentum_carries_its_last_action(tmp_path):
+    env = NavigateEnv("open", split="fresh", horizon="free")
+    weights = effort_weights(sample_scenario("open", 3, horizon="free"))
+    plain, policy = (
+        make_policy(env.observation_space, env.action_space, 0, SMALL, effort_weights=w) for w in (None, weights)
+    )
+    observation = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
+    assert plain.predict(observation, deterministic=True)[1] is None
+    first, state = policy.predict(observation, None, np.ones(3, bool), deterministic=True)
+    second, state = policy.predict(observation, state, np.array([False, True, False]), deterministic=True)
+    assert (second[1] == first[1]).all()  # a new episode starts from nothing
+    one, single = policy.predict(observation[0], deterministic=True)
+    again, _ = policy.predict(observation[0], single, np.array([False]), deterministic=True)
+    assert one == pytest.approx(first[0], abs=1e-6) and again == pytest.approx(second[0], abs=1e-6)
+    save_policy(policy, tmp_path / "policy", {"horizon": "free"})
+    loaded = load_policy(tmp_path / "policy")
+    assert loaded.effort_weights == pytest.approx(weights)
+    assert loaded.predict(observation, state, deterministic=True)[0] == pytest.approx(
+        policy.predict(observation, state, deterministic=True)[0], abs=1e-6
+    )

@@ -38,6 +38,20 @@ def test_an_included_policy_acts_the_same_after_the_export(tmp_path, capsys):
     assert [entry["name"] for entry in description["action"]] == ["speed / max_speed", "turn_rate / max_turn_rate"]
 
 
+def test_a_policy_with_momentum_has_its_last_action_as_an_input(tmp_path):
+    assert main(["export", "free-clutter", "--onnx", str(tmp_path / "free.onnx")]) == 0
+    env = NavigateEnv("clutter", split="test", **policy_environment("free-clutter"))
+    policy, session = load_policy("free-clutter"), InferenceSession(str(tmp_path / "free.onnx"))
+    observation, _ = env.reset(seed=0)
+    previous, state = np.zeros((1, 2), np.float32), None
+    for _ in range(30):
+        expected, state = policy.predict(observation, state, deterministic=True)
+        (found,) = session.run(["action"], {"observation": observation[None], "previous_action": previous})
+        np.testing.assert_allclose(found[0], expected, atol=1e-5)
+        previous, observation = found, env.step(expected)[0]
+    assert "previous_action" in json.loads((tmp_path / "free.onnx.json").read_text())
+
+
 @pytest.mark.parametrize("arguments", [dict, lambda: {"policy_kwargs": network(SMALL)}], ids=["default", "navigation"])
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_models_of_stable_baselines3_are_exported(algorithm, arguments, env, tmp_path):

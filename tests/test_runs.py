@@ -338,8 +338,11 @@ def test_tuned_settings_depend_on_the_family_and_the_warm_start():
             assert kind.tuned(family).family == family
     assert PPOConfig.tuned("clutter", warm=True).reward == "cost"
     assert PPOConfig.tuned("clutter", seed=7).seed == 7
+    assert PPOConfig.tuned("clutter").gamma == 1.0
+    free = PPOConfig.tuned("clutter", horizon="free", warm=True)
+    assert 0.99 < free.gamma < 1.0 and free.reward == "cost" and free.environment["horizon"] == "free"
     for kind, tables in configuration._DEFAULTS.items():
-        settings = {field.name for field in fields(getattr(configuration, kind.removesuffix("-warm")))}
+        settings = {field.name for field in fields(getattr(configuration, kind.partition("-")[0]))}
         assert set(tables) <= settings | {"open", "clutter", "polygons", "rooms", "slalom", "all"}
     # Settings of a family, in the run and in a nested configuration.
     assert DAggerRunConfig.tuned("open").hidden == (128, 128)

@@ -213,20 +213,21 @@ class DAgger:
         episodes: list[_Episode] = []
         failures = 0
         driving = f"{name}: driving"
+        memory, starts = None, np.ones(count, dtype=bool)
         with progress_bar(total=self.config.max_failures, label=driving, unit="failures", show=progress) as bar:
             while failures < self.config.max_failures and len(episodes) < self.config.max_episodes:
                 for path, state in zip(paths, self._venv.venv.states, strict=True):
                     path.append(state)
-                actions, _ = self._policy.predict(observations, deterministic=True)
-                stepped, _, dones, infos = self._venv.step(actions)
+                actions, memory = self._policy.predict(observations, memory, starts, deterministic=True)
+                stepped, _, starts, infos = self._venv.step(actions)
                 observations = np.asarray(stepped)
-                for i in np.flatnonzero(dones).tolist():
+                for i in np.flatnonzero(starts).tolist():
                     success, collision = bool(infos[i]["is_success"]), bool(infos[i]["collision"])
                     episodes.append(_Episode(playing[i], np.array(paths[i]), success, collision))
                     paths[i] = []
                     failures += not success
                     advance(bar, not success)
-                if dones.any():
+                if starts.any():
                     playing = self._venv.get_attr("scenario")
             if failures < self.config.max_failures:
                 stop_early(bar, f"{len(episodes)} episodes with {failures} failures")

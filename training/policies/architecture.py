@@ -15,6 +15,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from leapnav.envs.utils.validation import check_choice
+from leapnav.training.policies.momentum import MomentumPolicy, MomentumSACPolicy
 from leapnav.training.policies.network import NavigationFeatures, check_spaces
 
 KINDS = ("actor-critic", "sac", "td3", "tqc")
@@ -31,6 +32,7 @@ class Architecture:
         hidden, critic: widths of the hidden layers of the actor and of the critic.
         extractor: "navigation" (`NavigationFeatures`) or "flatten" (the observation itself).
         activation: name of the activation function in `torch.nn`.
+        effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`, or None.
 
     """
 
@@ -39,6 +41,7 @@ class Architecture:
     critic: tuple[int, ...]
     extractor: str = "navigation"
     activation: str = "ReLU"
+    effort_weights: tuple[float, ...] | None = None
 
     def make(self, observation_space: spaces.Box, action_space: spaces.Space) -> BasePolicy:
         """Create an untrained policy on the CPU.
@@ -53,13 +56,15 @@ class Architecture:
         check_choice("activation", self.activation, ACTIVATIONS)
         if self.extractor == "navigation":
             check_spaces(observation_space, action_space)
-        return _policy_class(self.kind)(
+        momentum = {} if self.effort_weights is None else {"effort_weights": self.effort_weights}
+        return _policy_class(self.kind, has_momentum=bool(momentum))(
             observation_space,
             action_space,
             lambda _: 3e-4,
             net_arch={"pi": list(self.hidden), "vf": list(self.critic), "qf": list(self.critic)},
             activation_fn=ACTIVATIONS[self.activation],
             features_extractor_class=EXTRACTORS[self.extractor],
+            **momentum,
         )
 
     @classmethod
@@ -84,7 +89,7 @@ class Architecture:
         if getattr(given, "use_sde", False):
             raise ValueError("model: expected a policy without state-dependent exploration, got use_sde=True")
         hidden, critic = widths(given.net_arch)
-        return cls(kind, hidden, critic, extractor, activation)
+        return cls(kind, hidden, critic, extractor, activation, getattr(given, "effort_weights", None))
 
 
 def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -119,8 +124,10 @@ def _is_installed(kind: str) -> bool:
     return kind != "tqc" or find_spec("sb3_contrib") is not None
 
 
-def _policy_class(kind: str) -> Any:
+def _policy_class(kind: str, *, has_momentum: bool = False) -> Any:
     """Return the class of a kind of policies."""
+    if has_momentum:
+        return {"actor-critic": MomentumPolicy, "sac": MomentumSACPolicy}[kind]
     if kind == "tqc":
         from sb3_contrib.tqc.policies import TQCPolicy  # from the extra `contrib`
 

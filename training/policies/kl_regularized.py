@@ -8,17 +8,17 @@ from typing import Any, cast
 import torch as th
 from gymnasium.spaces import Box
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 
 from leapnav.envs.simulation.observations import TIME_LEFT, has_time_left
+from leapnav.training.policies.momentum import MomentumPolicy
 
 # Fraction of the action noise that remains at the horizon. Without any noise the likelihoods would be infinite.
 MIN_NOISE_FRACTION = 0.3
 
 
-class KLRegularizedPolicy(ActorCriticPolicy):
+class KLRegularizedPolicy(MomentumPolicy):
     """An actor-critic policy whose loss includes the KL divergence from a reference policy.
 
     The reference policy is a frozen copy of the actor, made by `set_reference`. PPO and A2C subtract `ent_coef` times
@@ -27,7 +27,7 @@ class KLRegularizedPolicy(ActorCriticPolicy):
     may be changed at any time, for example by a callback.
 
     Args:
-        args, kwargs: arguments of `ActorCriticPolicy`.
+        args, kwargs: arguments of `MomentumPolicy`.
         entropy_weight: weight of the entropy.
         divergence_weight: weight of the KL divergence.
         quiet: time before the horizon at which the standard deviation of the actions starts to decrease (s). It is

@@ -13,6 +13,7 @@ from torch import nn
 
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, has_time_left
 from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.training.policies.momentum import MomentumPolicy
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
 ROBOT_RADIUS = 0.25  # radius of the robots in all families (m); a range minus this is the clearance along a beam
@@ -159,6 +160,7 @@ def make_policy(
     seed: int = 0,
     hidden: Sequence[int] = HIDDEN,
     critic: Sequence[int] | None = None,
+    effort_weights: Sequence[float] | None = None,
 ) -> ActorCriticPolicy:
     """Create an untrained actor-critic policy for `leapnav/Navigate-v0`, which PPO and A2C can train.
 
@@ -167,6 +169,7 @@ def make_policy(
         seed: random seed of the weights; the global random generator is not changed.
         hidden: widths of the actor's hidden layers.
         critic: widths of the critic's hidden layers; None: those of the actor.
+        effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`; None: without.
 
     Raises:
         ValueError: the spaces are not those of the environment with a lidar.
@@ -175,12 +178,13 @@ def make_policy(
     check_spaces(observation_space, action_space)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
-        return ActorCriticPolicy(
+        return MomentumPolicy(
             observation_space,
             action_space,
             lr_schedule=lambda _: 3e-4,
             log_std_init=-2.0,
             **network(hidden, critic),
+            effort_weights=effort_weights,
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
 from io import StringIO
@@ -24,21 +24,34 @@ from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.training.policies.actors import mean_action, policy_of
 from leapnav.training.policies.files import load_policy, policy_environment
+from leapnav.training.policies.momentum import add_momentum
 
-INPUT, OUTPUT = "observation", "action"
+INPUT, PREVIOUS, OUTPUT = "observation", "previous_action", "action"
 TOLERANCE = 1e-5  # largest difference of an action from that of torch
 N_CHECKED = 64  # random observations with which the exported policy is compared
 
 
 class _Actor(nn.Module):
-    """The deterministic action of a policy, clipped to [-1, 1]."""
+    """The deterministic action of a policy, clipped to [-1, 1].
+
+    Attributes:
+        inputs: names of the inputs; a policy with momentum has the last action as a second one.
+
+    """
 
     def __init__(self, policy: BasePolicy) -> None:
         super().__init__()
         self.policy = policy
+        weights = getattr(policy, "effort_weights", None)
+        self.weights = None if weights is None else th.tensor(weights)
+        self.inputs = (INPUT,) if weights is None else (INPUT, PREVIOUS)
 
-    def forward(self, observation: th.Tensor) -> th.Tensor:
-        return mean_action(self.policy, observation).clamp(-1.0, 1.0)
+    def forward(self, observation: th.Tensor, previous: th.Tensor | None = None) -> th.Tensor:
+        action = mean_action(self.policy, observation).clamp(-1.0, 1.0)
+        if self.weights is None:
+            return action
+        assert previous is not None  # the second input
+        return add_momentum(action, previous, self.weights)
 
 
 def export_onnx(
@@ -49,7 +62,8 @@ def export_onnx(
     """Export the deterministic actor of a policy to an ONNX file, with a description of its observations beside it.
 
     The model has the input "observation" (N, d), float32, and the output "action" (N, 2) in [-1, 1]: speed and turn
-    rate in units of the robot's limits. The description, `FILE.json`, lists names, units, order and bounds of the
+    rate in units of the robot's limits. A policy with momentum has the second input "previous_action" (N, 2), the last
+    action, zeros at the start of an episode. The description, `FILE.json`, lists names, units, order and bounds of the
     entries of an observation, and the arguments of the environment. After the export, the actions are compared with
     those of torch.
 
@@ -84,16 +98,20 @@ def export_onnx(
         raise ValueError(f"environment: has observations ({len(entries)},), the policy's are {shape}")
     low, high = (np.array([getattr(entry, side) for entry in entries], np.float32) for side in ("low", "high"))
     examples = np.random.default_rng(0).uniform(np.maximum(low, -10), np.minimum(high, 10), (N_CHECKED, len(entries)))
-    observations = th.as_tensor(examples.astype(np.float32))
-    _export(actor, observations, path)
+    inputs = [th.as_tensor(examples.astype(np.float32))]
+    if PREVIOUS in actor.inputs:
+        inputs.append(th.as_tensor(np.random.default_rng(1).uniform(-1.0, 1.0, (N_CHECKED, 2)).astype(np.float32)))
+    _export(actor, inputs, path)
     with th.no_grad():
-        difference = float(np.abs(_run(path, observations.numpy()) - actor(observations).numpy()).max())
+        found = _run(path, {name: values.numpy() for name, values in zip(actor.inputs, inputs, strict=True)})
+        difference = float(np.abs(found - actor(*inputs).numpy()).max())
     if not difference <= TOLERANCE:
         path.unlink()
         raise ValueError(f"{path}: the exported policy has other actions, by {difference:.1e}; nothing was written")
     description = {
         "leapnav": leapnav.__version__,
         "input": {"name": INPUT, "shape": ["N", len(entries)], "type": "float32"},
+        **({PREVIOUS: {"shape": ["N", 2], "type": "float32"}} if PREVIOUS in actor.inputs else {}),
         "output": {"name": OUTPUT, "shape": ["N", 2], "type": "float32"},
         "observation": [{"index": k, **asdict(entry)} for k, entry in enumerate(entries)],
         "action": [{"index": k, **asdict(entry)} for k, entry in enumerate(ACTION)],
@@ -106,7 +124,7 @@ def export_onnx(
     return beside
 
 
-def _export(actor: _Actor, observations: th.Tensor, path: Path) -> None:
+def _export(actor: _Actor, inputs: Sequence[th.Tensor], path: Path) -> None:
     """Write the ONNX file. The exporter prints its progress and warnings of torch's own modules, which are hidden."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     batch = {0: th.export.Dim("batch")}
@@ -115,22 +133,22 @@ def _export(actor: _Actor, observations: th.Tensor, path: Path) -> None:
             warnings.simplefilter("ignore")
             th.onnx.export(
                 actor,
-                (observations,),
+                tuple(inputs),
                 str(partial),
-                input_names=[INPUT],
+                input_names=list(actor.inputs),
                 output_names=[OUTPUT],
                 dynamo=True,
-                dynamic_shapes=(batch,),
+                dynamic_shapes=(batch,) * len(inputs),
                 external_data=False,
             )
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f'the export needs {error.name}: pip install "leapnav[onnx]"') from None
 
 
-def _run(path: Path, observations: np.ndarray) -> np.ndarray:
+def _run(path: Path, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
     try:
         from onnxruntime import InferenceSession
     except ModuleNotFoundError:
         raise ModuleNotFoundError('the export needs onnxruntime: pip install "leapnav[onnx]"') from None
     session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
+    return np.asarray(session.run([OUTPUT], dict(inputs))[0])

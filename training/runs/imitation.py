@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm.auto import tqdm
 
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.experts.acting.policy import ExpertPolicy
@@ -22,6 +23,7 @@ from leapnav.training.learning.dagger import DAgger, Round
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import copy_actor
 from leapnav.training.policies.files import load_policy
+from leapnav.training.policies.momentum import effort_weights
 from leapnav.training.policies.network import make_policy
 from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
@@ -184,7 +186,13 @@ def observed_settings(config: RunConfig) -> EnvironmentSettings:
 def _new_policy(config: RunConfig) -> ActorCriticPolicy:
     """Return an untrained policy with the network and the observations of a run."""
     env = make_env(config)
-    return make_policy(env.observation_space, env.action_space, config.seed, config.hidden)
+    weights = momentum_of(config)
+    return make_policy(env.observation_space, env.action_space, config.seed, config.hidden, effort_weights=weights)
+
+
+def momentum_of(config: RunConfig) -> tuple[float, ...] | None:
+    """Return the weights with which policies of a run have momentum, see `effort_weights`."""
+    return effort_weights(sample_scenario(config.family, 0, config.robot, config.horizon))
 
 
 def show_scores(bar: Any, evaluations: Sequence[Evaluation], **more: Any) -> None:

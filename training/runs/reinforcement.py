@@ -28,12 +28,13 @@ from leapnav.training.learning.warm_start import warm_start
 from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
 from leapnav.training.policies.files import load_policy, policy_folder
 from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
+from leapnav.training.policies.momentum import MomentumSACPolicy
 from leapnav.training.policies.network import network
 from leapnav.training.robots.jump_start import JumpStart
 from leapnav.training.robots.rewards import GradedMiss, ScaledReward
 from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
-from leapnav.training.runs.imitation import make_env, observed_settings, show_scores
+from leapnav.training.runs.imitation import make_env, momentum_of, observed_settings, show_scores
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.evaluation import Evaluation
 from leapnav.training.threads import limit_threads
@@ -79,6 +80,7 @@ def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
                 "log_std_init": math.log(config.std),
                 "entropy_weight": config.ent_coef,
                 "quiet": config.quiet,
+                "effort_weights": momentum_of(config),
             },
             seed=config.seed,
             device="cpu",
@@ -109,8 +111,12 @@ def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
             raise ModuleNotFoundError('TQC needs sb3-contrib: pip install "leapnav[contrib]"') from None
 
     def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
+        momentum = momentum_of(config)
+        policy, options = "MlpPolicy", network(config.hidden)
+        if momentum is not None and config.algorithm == "sac":
+            policy, options = MomentumSACPolicy, {**options, "effort_weights": momentum}
         return algorithm(
-            "MlpPolicy",
+            policy,
             venv,
             learning_rate=LinearSchedule(config.learning_rate, 0.0, 1.0),
             buffer_size=config.buffer_size,
@@ -119,7 +125,7 @@ def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
             gamma=config.gamma,
             gradient_steps=config.gradient_steps,
             ent_coef=config.ent_coef if config.ent_coef.startswith("auto") else float(config.ent_coef),
-            policy_kwargs=network(config.hidden),
+            policy_kwargs=options,
             seed=config.seed,
             device="cpu",
             **_buffer_arguments(config, dataset),
