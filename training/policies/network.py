@@ -178,13 +178,15 @@ def make_policy(
     check_spaces(observation_space, action_space)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
-        return MomentumPolicy(
+        momentum: dict[str, Any] = {} if effort_weights is None else {"effort_weights": effort_weights}
+        kind: Any = MomentumPolicy if momentum else ActorCriticPolicy
+        return kind(
             observation_space,
             action_space,
             lr_schedule=lambda _: 3e-4,
             log_std_init=-2.0,
             **network(hidden, critic),
-            effort_weights=effort_weights,
+            **momentum,
         )
 
 
