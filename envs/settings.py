@@ -11,7 +11,6 @@ import numpy as np
 from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.robots.base import MODELS
-from leapnav.envs.scenarios.scenario import HORIZONS
 from leapnav.envs.utils.validation import (
     check_at_least,
     check_choice,
@@ -24,7 +23,7 @@ from leapnav.envs.utils.validation import (
 )
 
 OBSERVATIONS, REWARDS, ACTUATIONS = ("lidar", "state", "map"), ("cost", "shaped"), ("velocity", "motor")
-GOAL_REWARDS = ("sparse", "cost")
+GOAL_REWARDS, HORIZONS = ("sparse", "cost"), ("fixed", "free")
 # Arguments that determine what is observed.
 SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")
 MIN_PERIOD = 1e-4  # s

@@ -15,7 +15,8 @@ import numpy as np
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.obstacle import Obstacle
-from leapnav.envs.scenarios.scenario import HORIZONS, TIME_LIMIT_FACTOR, Scenario, check_robot
+from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
+from leapnav.envs.settings import HORIZONS
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.clearance import clearances, footprint_clearances
 from leapnav.envs.shapes.field import pack_field

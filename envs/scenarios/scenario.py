@@ -36,7 +36,6 @@ from leapnav.envs.utils.validation import check_positive
 # the start and at the goal (NaN if free), and the parameters (k). If the horizon is free, its column contains the time
 # limit, and a last column the time weight.
 START, GOAL, HORIZON, LIMITS = 0, 3, 6, 7
-HORIZONS = ("fixed", "free")
 TIME_LIMIT_FACTOR = 3.0  # time limit of an episode, as a multiple of the duration of the optimum
 
 

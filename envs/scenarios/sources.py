@@ -12,7 +12,8 @@ from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, check_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
-from leapnav.envs.scenarios.scenario import HORIZONS, Scenario, check_robot
+from leapnav.envs.scenarios.scenario import Scenario, check_robot
+from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 SPLITS = ("train", "test", "fresh")

@@ -19,7 +19,8 @@ from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
 from leapnav.envs.scenarios.families import FAMILIES, collection_name, sample_scenario
-from leapnav.envs.scenarios.scenario import HORIZONS, TIME_LIMIT_FACTOR, check_robot
+from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, check_robot
+from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.store import Arrays, ResumableStore, discard

@@ -21,7 +21,8 @@ from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.families import check_family, sample_scenario
-from leapnav.envs.scenarios.scenario import HORIZONS, Scenario, check_robot
+from leapnav.envs.scenarios.scenario import Scenario, check_robot
+from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
