@@ -148,25 +148,22 @@ class Feedback:
             transition[:] = np.eye(2 * n)
             duration = times[k + 1] - times[k]
             propagate(arrays.flow, extremal[k].copy(), transition, duration, FLOW_ACCURACY, 0.0, False)
-        slopes, shifts = np.zeros((len(times), n, n)), np.zeros((len(times), n))
-        free, rates = arrays.free, np.empty_like(extremal)
-        for z, rate in zip(extremal, rates, strict=True):
-            hamiltonian(arrays.flow, z, rate)
+        slopes, factors = np.zeros((len(times), n, n)), np.empty((len(times) - 1, n, n))
+        free = arrays.free
         for k in range(len(times) - 2, -1, -1):
             A, B = transitions[k, :n, :n], transitions[k, :n, n:]
             C, D = transitions[k, n:, :n], transitions[k, n:, n:]
             if k == len(times) - 2:  # the final condition of each component: on the state, or on the costate if free
-                left, right = np.where(free[:, None], D, B), np.where(free[:, None], C, A)
-                slopes[k] = -np.linalg.solve(left, right)
-                shifts[k] = -np.linalg.solve(left, np.where(free, rates[-1, n:], rates[-1, :n]))
+                factors[k], right = np.where(free[:, None], D, B), np.where(free[:, None], C, A)
+                slopes[k] = -np.linalg.solve(factors[k], right)
             else:
-                left = D - slopes[k + 1] @ B
-                slopes[k] = np.linalg.solve(left, slopes[k + 1] @ A - C)
-                shifts[k] = np.linalg.solve(left, shifts[k + 1])
-        if self.scenario.horizon is None:  # the deviation changes the final time, so that the Hamiltonian remains 0
-            for k in range(len(times) - 1):
-                along = slopes[k].T @ rates[k, :n] - rates[k, n:]
-                slopes[k] -= np.outer(shifts[k], along) / (rates[k, :n] @ shifts[k])
+                factors[k] = D - slopes[k + 1] @ B
+                slopes[k] = np.linalg.solve(factors[k], slopes[k + 1] @ A - C)
+        if self.scenario.horizon is None:
+            rates = np.empty_like(extremal)
+            for z, rate in zip(extremal, rates, strict=True):
+                hamiltonian(arrays.flow, z, rate)
+            _free_final_time(slopes, factors, rates, free)
         last = max(0, int(np.searchsorted(times, end - GAIN_HOLD, side="right")) - 1)
         slopes[last:] = slopes[last]
         return Gains(times, extremal, slopes, arrays.control, arrays.data, self._m)
@@ -245,3 +242,23 @@ class Feedback:
             return True
         self._next_search = time + SEARCH_PAUSE
         return False
+
+
+def _free_final_time(slopes: np.ndarray, factors: np.ndarray, rates: np.ndarray, free: np.ndarray) -> None:
+    """Change slopes (K, n, n) of the costate for a fixed final time to those for a free one, in place.
+
+    A deviation then changes the final time, so that the Hamiltonian remains 0.
+
+    Args:
+        slopes: derivatives of the costate with respect to the state.
+        factors (K - 1, n, n): matrices of the linear systems of the backward sweep.
+        rates (K, 2n): q' and lambda' along the extremal.
+        free (n,): which final states are free, bool.
+
+    """
+    n = len(free)
+    shift = -np.where(free, rates[-1, n:], rates[-1, :n])  # of the final conditions by the final time; then d lambda/dT
+    for k in range(len(factors) - 1, -1, -1):
+        shift = np.linalg.solve(factors[k], shift)
+        along = slopes[k].T @ rates[k, :n] - rates[k, n:]
+        slopes[k] -= np.outer(shift, along) / (rates[k, :n] @ shift)
