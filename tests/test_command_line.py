@@ -9,8 +9,9 @@ import pytest
 from leapnav import durations
 from leapnav.cli import main
 from leapnav.commands.installation.completion import complete_choices
-from leapnav.commands.options import Family, FamilyOrAll, PolicyName, parse_environment
+from leapnav.commands.options import Family, FamilyOrAll, Horizon, PolicyName, parse_environment
 from leapnav.envs import FAMILIES
+from leapnav.envs.settings import HORIZONS
 from leapnav.training import BCConfig, PPOConfig, shipped_policies
 from leapnav.training.policies.files import BASELINES
 
@@ -18,6 +19,7 @@ from leapnav.training.policies.files import BASELINES
 def test_the_choices_shown_are_those_that_exist():
     assert get_args(Family) == tuple(FAMILIES)
     assert get_args(FamilyOrAll) == (*FAMILIES, "all")
+    assert get_args(Horizon) == HORIZONS
     names = get_args(get_args(PolicyName)[0])
     assert sorted(names) == sorted([*BASELINES, *shipped_policies()])
 

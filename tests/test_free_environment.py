@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from helpers import DATA, QUICK, SMALL, fresh, scenario_fields
+from helpers import QUICK, SMALL, fresh, scenario_fields
 
 from leapnav.cli import main
 from leapnav.envs import FAMILIES, NavigateEnv, NavigateGoalEnv, Scenario, ScenarioBank, ScenarioError, sample_scenario
@@ -351,7 +351,6 @@ def test_commands_take_the_horizon(tmp_path, capsys):
 def test_old_banks_and_policies_are_fixed():
     assert ScenarioBank.shipped("open", "test").horizon == "fixed"
     assert Scenario.from_dict(scenario_fields()).horizon_kind == "fixed"
-    assert (DATA / "best_known.json").exists()
     policy = load_policy("open", NavigateEnv("open", split="fresh"))
     assert has_time_left(policy.observation_space.high)
 

@@ -22,6 +22,7 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(
 FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
 # A literal, so that the help texts show the choices; a robot registered by the user is text as well.
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
+HorizonName = Literal["fixed", "free"]
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 
@@ -112,7 +113,7 @@ class RunConfig:
     """Family of the scenarios."""
     robot: RobotName = "unicycle"
     """Model of the robot."""
-    horizon: Literal["fixed", "free"] = "fixed"
+    horizon: HorizonName = "fixed"
     """Fixed horizon, or free: the episode ends at the goal, and the time is part of the cost."""
     seed: int = 0
     """Random seed."""

@@ -195,16 +195,17 @@ class BatchSimulator:
         """
         if not isinstance(choice, Scenario) and self._known_bank is not None and bank is self._known_bank[0]:
             return self._known_bank[0].tasks[choice]
-        robot = choice.robot if isinstance(choice, Scenario) else _require(bank).robot
+        if isinstance(choice, Scenario):
+            name, robot, horizon = f"scenario {choice.name!r}", choice.robot, choice.horizon_kind
+        else:
+            known = _require(bank)
+            name, robot, horizon = f"bank {known.path.name}", known.robot, known.horizon
         if robot.model != self.settings.robot:
-            name = f"scenario {choice.name!r}" if isinstance(choice, Scenario) else f"bank {_require(bank).path.name}"
             raise ValueError(
                 f"robot: this environment is for {self.settings.robot!r}, but {name} has the robot {robot.model!r}; "
                 f"make the environment with robot={robot.model!r}"
             )
-        horizon = choice.horizon_kind if isinstance(choice, Scenario) else _require(bank).horizon
         if horizon != self.settings.horizon:
-            name = f"scenario {choice.name!r}" if isinstance(choice, Scenario) else f"bank {_require(bank).path.name}"
             raise ValueError(
                 f"horizon: this environment is for a {self.settings.horizon} horizon, but that of {name} is {horizon}; "
                 f"make the environment with horizon={horizon!r}"

@@ -6,13 +6,13 @@ import json
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from leapnav.training.config import FamilyName, RobotName
+from leapnav.training.config import FamilyName, HorizonName, RobotName
 
 # Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
 Family = Literal["open", "clutter", "polygons", "rooms", "slalom"]
 FamilyOrAll = FamilyName
 Robot = RobotName
-Horizon = Literal["fixed", "free"]
+Horizon = HorizonName
 PolicyName = (
     Literal[
         "expert",

@@ -68,8 +68,8 @@ def _describe(evaluation: Evaluation) -> str:
 def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
     """Return the class of the command for a command line.
 
-    Its defaults depend on the family, the horizon, the warm start and the run to resume in the arguments, read before
-    the command line is parsed.
+    Its defaults depend on the family, the horizon, the warm start and the run to resume in the arguments, so these are
+    read before the command line is parsed.
 
     Args:
         arguments: the words after `leapnav`.

@@ -3,7 +3,7 @@
 On an optimum with a free horizon the Hamiltonian is 0. For a robot without drift this is 1/2 u'Ru = c + Phi, so the
 effort 1/2 u'Ru of an optimal control is at least the time weight c. Between two paths of similar cost, or where
 obstacles are hidden, a network that was fitted to optimal actions returns smaller ones. Without memory and without the
-time left in the observation, the robot would stay there for ever. The missing effort is therefore added in the
+time left in the observation, the robot would stay there. The missing effort is therefore added in the
 direction of the last action.
 """
 
@@ -34,11 +34,10 @@ def effort_weights(scenario: Scenario) -> tuple[float, ...] | None:
     dynamics = type(robot).dynamics()
     if scenario.horizon is not None or any(dynamics.drift) or dynamics.state_cost != 0:
         return None
-    # With a limit below the optimal speed, also the effort is lower there.
-    least = min(
-        2.0 * cost.time_weight, *(r * u**2 for r, u in zip(robot.control_weight(cost), robot.limits(), strict=True))
-    )
-    return tuple(r * u**2 / least for r, u in zip(robot.control_weight(cost), robot.limits(), strict=True))
+    largest = [r * u**2 for r, u in zip(robot.control_weight(cost), robot.limits(), strict=True)]
+    # If a limit is below the optimal speed, the effort at that limit is smaller.
+    least = min(2.0 * cost.time_weight, *largest)
+    return tuple(value / least for value in largest)
 
 
 def add_momentum(actions: th.Tensor, previous: th.Tensor, weights: th.Tensor) -> th.Tensor:
@@ -57,9 +56,20 @@ def add_momentum(actions: th.Tensor, previous: th.Tensor, weights: th.Tensor) ->
 
 
 class _WithMomentum(BasePolicy):
-    """The method `predict` of a policy with momentum, whose state is the last action."""
+    """A policy with momentum, whose state is the last action.
 
-    effort_weights: tuple[float, ...] | None
+    Args:
+        args, kwargs: arguments of the class without momentum.
+        effort_weights: see the function `effort_weights`; None: without momentum.
+
+    """
+
+    def __init__(self, *args: Any, effort_weights: Sequence[float] | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.effort_weights = None if effort_weights is None else tuple(map(float, effort_weights))
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "effort_weights": self.effort_weights}
 
     def predict(
         self,
@@ -90,28 +100,8 @@ class _WithMomentum(BasePolicy):
 
 
 class MomentumPolicy(_WithMomentum, ActorCriticPolicy):
-    """An actor-critic policy with momentum.
-
-    Args:
-        args, kwargs: arguments of `ActorCriticPolicy`.
-        effort_weights: see the function `effort_weights`; None: without momentum.
-
-    """
-
-    def __init__(self, *args: Any, effort_weights: Sequence[float] | None = None, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.effort_weights = None if effort_weights is None else tuple(map(float, effort_weights))
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "effort_weights": self.effort_weights}
+    """An actor-critic policy with momentum: the arguments of `ActorCriticPolicy`, and `effort_weights`."""
 
 
 class MomentumSACPolicy(_WithMomentum, SACPolicy):
-    """A policy of SAC with momentum; arguments as those of `MomentumPolicy`."""
-
-    def __init__(self, *args: Any, effort_weights: Sequence[float] | None = None, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.effort_weights = None if effort_weights is None else tuple(map(float, effort_weights))
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "effort_weights": self.effort_weights}
+    """A policy of SAC with momentum: the arguments of `SACPolicy`, and `effort_weights`."""
