@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from leapnav.deprecated import deprecated_names
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
+from leapnav.experts.bounds.lower_bound import LowerBound, lower_bound
 from leapnav.experts.continuation import continuation
 from leapnav.experts.minimum_time import MinimumTime, minimum_time
 from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum, shortest_horizon
@@ -14,9 +15,12 @@ from leapnav.experts.problem.certificate import certify, verify
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.problem.system import ControlAffineSystem, differential_drive, unicycle, unicycle_with_inertia
+from leapnav.experts.proofs.checker import check_proof
+from leapnav.experts.proofs.proof import Proof, ProofError
 from leapnav.experts.solve import solve
 
 if TYPE_CHECKING:
+    from leapnav.experts.bounds.plotting import plot_tube
     from leapnav.experts.data.banks import build_bank
     from leapnav.experts.data.demonstrations import load_demonstrations
     from leapnav.experts.data.rollouts import check_dataset, rollout
@@ -28,23 +32,29 @@ __all__ = [
     "ExpertPolicy",
     "Extremal",
     "Iteration",
+    "LowerBound",
     "MinimumTime",
     "NoOptimumError",
     "OptimalControlProblem",
     "Optimum",
+    "Proof",
+    "ProofError",
     "SolveError",
     "Status",
     "Trajectory",
     "build_bank",
     "certify",
     "check_dataset",
+    "check_proof",
     "continuation",
     "differential_drive",
     "find_optimum",
     "find_reached_optimum",
     "load_demonstrations",
+    "lower_bound",
     "minimum_time",
     "plot_extremal",
+    "plot_tube",
     "rollout",
     "shortest_horizon",
     "solve",
@@ -59,6 +69,7 @@ _LAZY = {
     "check_dataset": "leapnav.experts.data.rollouts",
     "load_demonstrations": "leapnav.experts.data.demonstrations",
     "plot_extremal": "leapnav.experts.plotting",
+    "plot_tube": "leapnav.experts.bounds.plotting",
     "rollout": "leapnav.experts.data.rollouts",
 }
 

@@ -20,6 +20,7 @@ from leapnav.commands.installation.compile import Compile
 from leapnav.commands.installation.completion import Completion
 from leapnav.commands.installation.doctor import Doctor
 from leapnav.commands.play import Play
+from leapnav.commands.prove import CheckProof, Prove
 from leapnav.commands.report import Report
 from leapnav.commands.rollout import Rollout
 from leapnav.commands.solve import Solve
@@ -32,6 +33,8 @@ BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
 COMMANDS = {
     "solve": Solve,
+    "prove": Prove,
+    "check-proof": CheckProof,
     "bank": Bank,
     "rollout": Rollout,
     "train": TrainCommand,  # `parse` replaces it by a class whose defaults are those of the family

@@ -38,12 +38,14 @@ class Shape(Frozen):
         smooth_distance: kernel of SMOOTH_DISTANCE_SIGNATURE, a twice continuously differentiable approximation of the
             distance (m), with gradient and Hessian. It may deviate from the distance, by the order of the scale near
             corners, and more inside. The proximity cost is weight * exp(-(d - robot radius) / scale).
+        is_lipschitz: whether the gradient of `smooth_distance` never exceeds 1. Proofs of lower bounds need it.
 
     """
 
     kind: ClassVar[str]
     distance: ClassVar[Any]
     smooth_distance: ClassVar[Any]
+    is_lipschitz: ClassVar[bool] = False
 
     @abstractmethod
     def values(self) -> tuple[float, ...]:

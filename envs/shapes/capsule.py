@@ -61,6 +61,7 @@ class Capsule(Shape):
     kind: ClassVar = "capsule"
     distance: ClassVar = distance
     smooth_distance: ClassVar = smooth_distance
+    is_lipschitz: ClassVar[bool] = True
 
     start: Point
     end: Point

@@ -68,6 +68,7 @@ class Circle(Shape):
     kind: ClassVar = "circle"
     distance: ClassVar = distance
     smooth_distance: ClassVar = smooth_distance
+    is_lipschitz: ClassVar[bool] = True
 
     center: Point
     radius: Positive

@@ -108,6 +108,7 @@ class Polygon(Shape):
     kind: ClassVar = "polygon"
     distance: ClassVar = distance
     smooth_distance: ClassVar = smooth_distance
+    is_lipschitz: ClassVar[bool] = True
 
     vertices: tuple[Point, ...]
 

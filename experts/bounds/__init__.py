@@ -1,0 +1,1 @@
+"""The construction of proofs of lower bounds; `leapnav.experts.proofs` checks them."""

@@ -1,0 +1,278 @@
+"""Splines that nearly are the distance from a pose and satisfy the inequality: what a stage of a proof consists of.
+
+`Distance` solves the eikonal equation, and `improve` turns the solution into a spline that satisfies the inequality:
+
+1. A function of S, with slope 1 / R(S), where R is a quantile of the gradient ratios of the cells at this value of S.
+2. Projections onto the inequality of the cells that still violate it.
+3. The same function with R the maximum, or a common factor, for what is left.
+
+Repeated, the quantile is below 1 where the inequality has slack, so that S grows from round to round.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import float64
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import NOTHING
+from leapnav.experts.bounds.eikonal import make_medium, solve_eikonal
+from leapnav.experts.bounds.projection import Constraints, project_once
+from leapnav.experts.proofs.cells import (
+    BLOCK,
+    EMPTY,
+    GEOMETRY,
+    LAYOUT,
+    MASKS,
+    VALUES,
+    CellSet,
+    control_points,
+    gather,
+)
+from leapnav.experts.proofs.checker import Bound, source_offset, source_slope
+from leapnav.experts.proofs.gauge import SOURCE, Source, gauge, make_source
+from leapnav.experts.proofs.inequality import Functionals, gradient_ratios
+from leapnav.experts.proofs.near_source import cells_near
+from leapnav.experts.proofs.proof import Spline
+from leapnav.experts.proofs.running_cost import RunningCost
+
+# The gauge describes the surroundings of a source up to this lateral distance in spacings, and up to a radius in
+# sqrt(r_w) beyond which the bound of its gradient is too large (it is 1.015 here).
+SOURCE_WIDTH, MAX_GAUGE = 5.66, 1.5
+MARGIN, MAX_MARGIN = (
+    4.0,
+    0.25,
+)  # difference of radius and limit: at most these spacings and this part of the largest gauge
+CORRECTIONS, TOLERANCE = 4, 3e-3  # of the eikonal equation; in n times the spacing
+# n in obstacles grows by exp(depth / (1.2 spacings)), and is constant from 2.2 spacings on.
+DEPTH, MAX_EXPONENT, WALL_DEPTH, WALL = 1.2, 8.0, 2.2, 50.0
+BINS_PER_SPACING = 2  # of the function of S
+MIN_RATIO = 0.8  # of its quantile
+ENOUGH = 1.003  # maximum ratio that is removed by a common factor
+FINISHED = 2e-4  # fraction of the cells; fewer projections end the iteration
+
+
+@dataclass(frozen=True, eq=False)
+class Medium:
+    """What all distances of a level share.
+
+    Attributes:
+        cells: the cells, with a margin.
+        cost: lower bounds of Phi.
+        table: the functionals.
+        constraints: the same in single precision.
+        metric: r_v, r_w.
+        energy: E.
+        highest: Phi above which it is replaced by this value, so that S is less steep near obstacles.
+
+    """
+
+    cells: CellSet
+    cost: RunningCost
+    table: Functionals
+    constraints: Constraints
+    metric: tuple[float, float]
+    energy: float
+    highest: float
+
+    @property
+    def scale(self) -> float:
+        """Change of S over a spacing without obstacles."""
+        return math.sqrt(2 * self.energy * self.metric[0]) * self.cells.grid.spacing
+
+    def slowness(self) -> np.ndarray:
+        """Return n (columns, lines), continued into obstacles."""
+        spacing, clearance = self.cells.grid.spacing, self.cost.clearance
+        depth = np.minimum(np.maximum(-clearance, 0.0) / (DEPTH * spacing), MAX_EXPONENT)
+        n = np.sqrt(2 * (self.energy + np.minimum(self.cost.centre, self.highest) * np.exp(depth)))
+        return np.where(clearance < -WALL_DEPTH * spacing, WALL * math.sqrt(2 * self.energy), n)
+
+
+@dataclass(eq=False)
+class Distance:
+    """The distance from a pose, as a spline on the cells of a level.
+
+    Attributes:
+        medium: the level.
+        pose: the pose (x, y, heading).
+        values (m, 8, 8, 8): coefficients.
+        ratios (m, 8, 8, 8): gradient ratios of `values`.
+
+    """
+
+    medium: Medium
+    pose: tuple[float, float, float]
+    values: np.ndarray = field(init=False)
+    ratios: np.ndarray = field(init=False)
+    source: Source = field(init=False)
+    radius: float = field(init=False)
+    limit: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        medium, cells = self.medium, self.medium.cells
+        r_v, r_w = medium.metric
+        spacing = cells.grid.spacing
+        largest = MAX_GAUGE * math.sqrt(r_w)
+        margin = min(MARGIN * spacing * math.sqrt(r_v), MAX_MARGIN * largest)
+        self.radius = min(math.sqrt(4 * SOURCE_WIDTH * spacing * math.sqrt(r_v * r_w)), largest - margin)
+        self.limit = self.radius + margin
+        self.source = make_source(self.pose, medium.metric, self.limit)
+        self.solve()
+
+    def solve(self) -> None:
+        """Solve the eikonal equation, with the values of the gauge near the source."""
+        medium, cells = self.medium, self.medium.cells
+        layout, grid = cells.layout, cells.grid
+        self.values = np.full(cells.mask.shape, EMPTY, dtype=np.float32)
+        slope = source_slope(self.source, cells, medium.cost, medium.energy, self.limit)
+        passable = medium.cost.clearance > -1.5 * grid.spacing
+        around = CellSet(grid, layout, np.ones_like(cells.mask)).without(~passable)
+        locked = cells_near(self.source, around, self.limit)
+        _plant(self.values, layout, locked, self.source, grid.geometry, slope)
+        equation = make_medium(grid, medium.metric, medium.slowness())
+        tolerance = TOLERANCE * medium.scale
+        solve_eikonal(self.values, locked, layout, equation, corrections=CORRECTIONS, tolerance=tolerance)
+        exempt = cells_near(self.source, cells, self.radius)
+        self._lower_tip(exempt, cells.mask & ~exempt)
+        self.measure(cells)
+
+    def _lower_tip(self, exempt: np.ndarray, others: np.ndarray) -> None:
+        """Lower the coefficients that only exempt cells use, so that the spline does not exceed the gauge there."""
+        needed = np.zeros_like(others)
+        _mark_neighbours(others, self.medium.cells.layout, needed)
+        self.values[exempt & ~needed] -= np.float32(0.35 * self.radius)
+
+    def measure(self, cells: CellSet) -> float:
+        """Compute the gradient ratios on cells, and return the largest."""
+        self.ratios = np.zeros(cells.mask.shape, dtype=np.float32)
+        required = cells.mask & ~cells_near(self.source, cells, self.radius)
+        args = (self.medium.cost, self.medium.table, self.medium.energy, 1.0, self.ratios)
+        return gradient_ratios(self.values, cells.layout, required, *args)[1]
+
+    def improve(self, cells: CellSet, quantile: float, visits: int) -> tuple[Spline, Bound]:
+        """Make the spline satisfy the inequality on cells.
+
+        Args:
+            cells: the cells, on the layout of the level.
+            quantile: quantile of the ratios that the function of S removes before the projections.
+            visits: maximum number of visits of the pending cells.
+
+        Returns:
+            The spline, and what it proves on the cells.
+
+        """
+        medium = self.medium
+        exempt = cells_near(self.source, cells, self.radius)
+        required = cells.mask & ~exempt
+        self.values = self._rescaled(required, quantile)
+        pending = required.copy()
+        for _ in range(visits):
+            count = project_once(self.values, cells.layout, required, pending, medium.cost, medium.constraints)
+            if count <= FINISHED * max(1, int(required.sum())):
+                break
+        worst = self.measure(cells)
+        kept, ratios = self.values, self.ratios
+        if worst > ENOUGH:
+            self.values = self._rescaled(required, 1.0)
+            worst = self.measure(cells)
+        scale = 1.0 / max(1.0, worst * (1.0 + 1e-9))
+        spline = Spline(self.values, scale, self.radius, self.limit)
+        offset = source_offset(spline, self.source, cells, medium.cost, medium.energy, exempt)
+        self.values, self.ratios = kept.copy(), ratios
+        return spline, Bound(spline.values, scale, offset)
+
+    def _rescaled(self, required: np.ndarray, quantile: float) -> np.ndarray:
+        """Return the coefficients of a function of S whose slope is 1 / R(S), see the module."""
+        layout = self.medium.cells.layout
+        lowest, highest = np.zeros_like(self.values), np.zeros_like(self.values)
+        _ranges(self.values, layout, required, lowest, highest)
+        low, high, ratios = lowest[required], highest[required], self.ratios[required]
+        if not len(low):
+            return self.values.copy()
+        width = self.medium.scale / BINS_PER_SPACING
+        origin = min(0.0, float(low.min()))
+        first, last = ((low - origin) / width).astype(int), ((high - origin) / width).astype(int)
+        count = int(last.max()) + 1
+        slowest = np.ones(count)
+        if quantile >= 1.0:
+            for step in range(int((last - first).max()) + 1):
+                np.maximum.at(slowest, np.minimum(first + step, last), ratios)
+        else:
+            bins = (first + last) // 2
+            order = np.lexsort((ratios, bins))
+            bins, ratios = bins[order], ratios[order]
+            starts = np.searchsorted(bins, np.arange(count + 1))
+            filled = np.flatnonzero(np.diff(starts))
+            chosen = starts[filled] + (quantile * (np.diff(starts)[filled] - 1)).astype(int)
+            slowest[filled] = np.maximum(ratios[chosen], MIN_RATIO)
+            slowest = np.convolve(np.pad(slowest, 2, mode="edge"), np.full(5, 0.2), mode="valid")
+        edges = origin + width * np.arange(count + 1)
+        heights = origin + width * np.concatenate([[0.0], np.cumsum(1.0 / slowest)])
+        inside = np.interp(self.values, edges, heights) + np.minimum(self.values - origin, 0.0)
+        inside = np.where(self.values > edges[-1], heights[-1] + (self.values - edges[-1]), inside)
+        return np.where(self.values < 0.5 * EMPTY, inside, self.values).astype(np.float32)
+
+
+@kernel(NOTHING(VALUES, LAYOUT, MASKS, SOURCE, GEOMETRY, float64))
+def _plant(values, layout, locked, source, geometry, slope):
+    """Set the coefficients of the locked cells to the gauge at their centres, times the slope.
+
+    Cells at whose centre the gauge of Koranyi has reached its limit are released.
+    """
+    for block in range(len(locked)):
+        for k in range(BLOCK):
+            heading = (layout.blocks[block, 0] * BLOCK + k + 0.5) * geometry.angle
+            for i in range(BLOCK):
+                x = geometry.x + (layout.blocks[block, 1] * BLOCK + i + 0.5) * geometry.spacing
+                for j in range(BLOCK):
+                    y = geometry.y + (layout.blocks[block, 2] * BLOCK + j + 0.5) * geometry.spacing
+                    if not locked[block, k, i, j]:
+                        continue
+                    height = gauge(x, y, heading, source)
+                    locked[block, k, i, j] = height < 0.999 * source.limit / source.gradient
+                    if locked[block, k, i, j]:
+                        values[block, k, i, j] = slope * height
+
+
+@kernel(NOTHING(VALUES, LAYOUT, MASKS, VALUES, VALUES))
+def _ranges(values, layout, mask, lowest, highest):
+    """Smallest and largest control points of the spline on the cells of a set."""
+    local, points = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2)), np.empty((3, 3, 3))
+    for block in range(len(mask)):
+        if not mask[block].any():
+            continue
+        gather(values, layout, block, local)
+        for k in range(BLOCK):
+            for i in range(BLOCK):
+                for j in range(BLOCK):
+                    if mask[block, k, i, j]:
+                        lowest[block, k, i, j] = control_points(local, k + 1, i + 1, j + 1, points)
+                        highest[block, k, i, j] = points.max()
+
+
+@kernel(NOTHING(MASKS, LAYOUT, MASKS))
+def _mark_neighbours(mask, layout, marked):
+    """Mark the cells of a set and the 26 cells around each."""
+    n_k, n_i, n_j = layout.slots.shape
+    for block in range(len(mask)):
+        if not mask[block].any():
+            continue
+        for k in range(BLOCK):
+            for i in range(BLOCK):
+                for j in range(BLOCK):
+                    if not mask[block, k, i, j]:
+                        continue
+                    for dk in range(-1, 2):
+                        a = (layout.blocks[block, 0] * BLOCK + k + dk) % (n_k * BLOCK)
+                        for di in range(-1, 2):
+                            b = layout.blocks[block, 1] * BLOCK + i + di
+                            for dj in range(-1, 2):
+                                c = layout.blocks[block, 2] * BLOCK + j + dj
+                                if not (0 <= b < n_i * BLOCK and 0 <= c < n_j * BLOCK):
+                                    continue
+                                slot = layout.slots[a // BLOCK, b // BLOCK, c // BLOCK]
+                                if slot >= 0:
+                                    marked[slot, a % BLOCK, b % BLOCK, c % BLOCK] = True

@@ -1,0 +1,251 @@
+"""Lower bounds of the cost of a scenario, with proofs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.experts.bounds.distance import Distance, Medium
+from leapnav.experts.bounds.projection import make_constraints
+from leapnav.experts.optimum import find_optimum
+from leapnav.experts.problem.extremal import SolveError, Status
+from leapnav.experts.proofs.cells import CellSet, Grid
+from leapnav.experts.proofs.checker import Bound, is_proved, length_limit, spline_value, without_excluded
+from leapnav.experts.proofs.inequality import functionals
+from leapnav.experts.proofs.proof import Pose, Proof, Stage, find_ends
+from leapnav.experts.proofs.running_cost import running_cost
+
+# Width of the cells of the first level: at most this multiple of the robot's radius, and this fraction of the arena.
+SPACING_IN_RADII, SPACING_IN_ARENAS = 0.8, 1 / 24
+MAX_CELLS = 8_000_000  # of the first level
+MAX_LEVEL = 5
+# Quantile of the ratios and visits of the pending cells, per round of a level.
+ROUNDS = ((0.95, 8), (0.9, 10), (0.85, 10), (0.8, 10), (0.8, 10), (0.8, 10))
+PROGRESS = 0.93  # a level ends after a round that leaves more than this fraction of the cells
+TOLERANCE = 1.001  # gradient ratio above which a control point is moved
+# Largest Phi of the eikonal equation, relative to that on the optimum, and in E.
+CAP_FACTOR, CAP_IN_ENERGY = 1.15, 0.75
+SLACK = 1e-6  # by which a proved value is smaller than what the functions give, relative
+
+
+class Reference(Protocol):
+    """An optimum, such as `Optimum` or the reference of a bank: what `lower_bound` needs of it."""
+
+    @property
+    def cost(self) -> float:
+        """J."""
+        ...
+
+    @property
+    def states(self) -> np.ndarray:
+        """States (N, n)."""
+        ...
+
+    @property
+    def controls(self) -> np.ndarray:
+        """Controls (N, m)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LowerBound:
+    """A proved lower bound of the cost of a scenario.
+
+    Attributes:
+        value: no collision-free path costs less.
+        gap: 1 - value / cost of the optimum.
+        seconds: duration of the computation.
+        resolution: spacing of the finest cells (m).
+        excluded: fraction of the collision-free configuration space in which no path cheaper than `value` can run.
+        proof: the proof, see `check_proof`.
+        tubes: for each spacing, the cells that a path cheaper than (1 - requested gap) times the cost may meet.
+        free_cells: number of cells of the first level that contain a collision-free point.
+
+    """
+
+    value: float
+    gap: float
+    seconds: float
+    resolution: float
+    excluded: float
+    proof: Proof
+    tubes: tuple[CellSet, ...]
+    free_cells: int
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the numbers of the result."""
+        return {
+            "value": self.value,
+            "gap": self.gap,
+            "seconds": self.seconds,
+            "resolution": self.resolution,
+            "excluded": self.excluded,
+        }
+
+    def __repr__(self) -> str:
+        return (
+            f"LowerBound(value={self.value:.6g}, gap={self.gap:.4g}, resolution={self.resolution:g}, "
+            f"excluded={self.excluded:.4g}, seconds={self.seconds:.3g})"
+        )
+
+
+def lower_bound(
+    scenario: Scenario,
+    optimum: Reference | None = None,
+    gap: float = 0.05,
+    time_limit: float = 60.0,
+    *,
+    threads: int = 2,
+) -> LowerBound:
+    """Prove that no collision-free path of a scenario costs less than (1 - gap) times the cost of an optimum.
+
+    Functions that bound the distance from the start and to the goal exclude the cells of configuration space through
+    which no cheaper path can run. In the cells that are left the spacing is halved, until start and goal are too far
+    apart or excluded. See `leapnav.experts.proofs.checker` for the theorem.
+
+    Args:
+        scenario: the scenario, with a unicycle or a differential drive, and fixed or free horizon.
+        optimum: the best known path; None computes it with `find_optimum`.
+        gap: the relative optimality gap to prove.
+        time_limit: time after which the best bound that is proved so far is returned (s); a level that has begun is
+            finished first.
+        threads: 2 computes the distances from the start and from the goal at the same time.
+
+    Returns:
+        The lower bound. Its gap is larger than the argument if the time was not sufficient.
+
+    Raises:
+        SolveError: there is no certified optimum.
+        ValueError: lower bounds cannot be proved for such a scenario, or an argument is out of range.
+
+    """
+    ends = find_ends(scenario)
+    if not 0.0 < gap < 1.0:
+        raise ValueError(f"gap: expected a number between 0 and 1, got {gap!r}")
+    if not time_limit > 0:
+        raise ValueError(f"time_limit: expected a positive number (s), got {time_limit!r}")
+    start = time.perf_counter()
+    if optimum is None:
+        found = find_optimum(scenario)
+        if found.status is not Status.SUCCESS:
+            raise SolveError(found, scenario.name)
+        optimum = found
+    return _Producer(scenario, ends, optimum, gap, threads).run(start, time_limit)
+
+
+class _Producer:
+    """The construction of a proof: its stages, and the cells that are left."""
+
+    def __init__(
+        self, scenario: Scenario, ends: tuple[Pose, Pose], optimum: Reference, gap: float, threads: int
+    ) -> None:
+        self.scenario, self.ends, self.cost, self.threads = scenario, ends, optimum.cost, threads
+        states, controls = np.asarray(optimum.states, dtype=float), np.asarray(optimum.controls, dtype=float)
+        proximity = np.array([proximity_value(x, y, scenario.field[2], scenario.field) for x, y in states[:, :2]])
+        if scenario.horizon is None:
+            self.energy = scenario.cost.time_weight
+        else:
+            weights = np.array(scenario.robot.control_weight(scenario.cost))
+            self.energy = float(np.median(0.5 * (controls**2) @ weights - proximity))
+        if not self.energy > 0:
+            raise ValueError(
+                f"horizon: lower bounds need a positive kinetic energy minus proximity cost on the optimum, got "
+                f"{self.energy:.4g}; the horizon is too long"
+            )
+        self.highest = max(CAP_IN_ENERGY * self.energy, CAP_FACTOR * float(proximity.max()))
+        grid = first_grid(scenario)
+        empty = Proof(scenario, (1.0 - gap) * self.cost, self.energy, grid.spacing, grid.headings, ())
+        self.proof, self.cells, self.stages = empty, CellSet.full(grid), list[Stage]()
+        self.limit = length_limit(empty)
+        self.best, self.free_cells, self.tubes = -math.inf, 0, list[CellSet]()
+
+    def run(self, start: float, time_limit: float) -> LowerBound:
+        """Add stages until the value is proved or the time is over."""
+        proved, level = False, 0
+        while not proved:
+            proved = self._level(level, start + time_limit)
+            self.tubes.append(self.cells)
+            elapsed = time.perf_counter() - start
+            if proved or level == MAX_LEVEL or elapsed > time_limit:
+                break
+            level += 1
+            self.cells = self.cells.refined()
+        value = self.proof.value if proved else self.best
+        proof = Proof(self.scenario, value, self.energy, self.proof.spacing, self.proof.headings, tuple(self.stages))
+        left = len(self.cells) / 8**level / self.free_cells
+        seconds = time.perf_counter() - start
+        gap = 1.0 - value / self.cost
+        tubes = tuple(self.tubes)
+        spacing = self.cells.grid.spacing
+        return LowerBound(value, gap, seconds, spacing, 1.0 - left, proof, tubes, self.free_cells)
+
+    def _level(self, level: int, end: float) -> bool:
+        """Add the stages of a level; return whether the value is proved."""
+        scenario, grid = self.scenario, self.cells.grid
+        cost = running_cost(scenario, grid, self.cells.columns())
+        cells = self.cells.without(~np.isfinite(cost.lowest)).with_margin()
+        cost = running_cost(scenario, grid, cells.columns())
+        if level == 0:
+            self.free_cells = len(cells)
+        metric = scenario.robot.metric(scenario.cost)
+        table = functionals(grid, metric, cost.squares.shape[2])
+        constraints = make_constraints(table, cost.squares, self.energy, TOLERANCE)
+        medium = Medium(cells, cost, table, constraints, metric, self.energy, self.highest)
+        distances = self._both(lambda pose: Distance(medium, pose), self.ends)
+        for number, (quantile, visits) in enumerate(ROUNDS):
+            current = cells
+            found = self._both(lambda distance: distance.improve(current, quantile, visits), distances)  # noqa: B023
+            (first, start), (second, goal) = found
+            self.stages.append(Stage(level, cells.layout.blocks, first, second))
+            before, cells = len(cells), without_excluded(cells, start, goal, self.limit)
+            if is_proved(cells, self.ends, start, self.limit):
+                self.cells = cells
+                return True
+            self.best = max(self.best, self._value(cells, start))
+            if time.perf_counter() > end or (number > 0 and len(cells) > PROGRESS * before):
+                break
+        self.cells = cells
+        return False
+
+    def _value(self, cells: CellSet, start: Bound) -> float:
+        """Return the bound that the function of the start proves at the goal."""
+        length = start.scale * spline_value(start.values, cells, self.ends[1]) - start.offset
+        return length - (self.limit - self.proof.value) - SLACK * max(1.0, abs(length))
+
+    def _both(self, function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]:
+        """Apply a function to both arguments, in two threads if there are two."""
+        if self.threads < 2:
+            return [function(argument) for argument in arguments]
+        with ThreadPoolExecutor(2) as pool:
+            return list(pool.map(function, arguments))
+
+
+def first_grid(scenario: Scenario) -> Grid:
+    """Return the grid of the first level.
+
+    Raises:
+        ValueError: the arena is too large for the robot's radius.
+
+    """
+    x_min, y_min, x_max, y_max = scenario.arena
+    radius = float(scenario.discs[0, 1])
+    spacing = min(SPACING_IN_RADII * radius, SPACING_IN_ARENAS * max(x_max - x_min, y_max - y_min))
+    metric = scenario.robot.metric(scenario.cost)
+    turns = 2 * math.pi * math.sqrt(metric[1] / metric[0]) / (0.7 * spacing)
+    headings = min(max(8 * round(turns / 8), 32), 64)
+    grid = Grid.over(scenario.arena, spacing, headings)
+    count = grid.headings * grid.columns * grid.lines
+    if count > MAX_CELLS:
+        raise ValueError(
+            f"arena: lower bounds need at most {MAX_CELLS:,} cells of {spacing:.3g} m, got {count:,}; the arena is too "
+            "large for the robot's radius"
+        )
+    return grid

@@ -1,0 +1,295 @@
+r"""The checker of lower bounds: whoever trusts this module and those it imports need not trust how a proof was found.
+
+Notation. q = (x, y, theta); a path has the velocity x' = v cos(theta), y' = v sin(theta), theta' = omega and costs
+J = int (c + 1/2 (r_v v^2 + r_w omega^2) + Phi(x, y)) dt. E > 0 is a number, n(q) = sqrt(2 (E + Phi)), and
+grad_H S = ((cos(theta) S_x + sin(theta) S_y) / sqrt(r_v), S_theta / sqrt(r_w)) is the horizontal gradient.
+
+**Theorem.** Let A be a set of closed cells of configuration space, periodic in theta, and let S be a function that is
+Lipschitz continuous along paths in A and satisfies
+
+    |grad_H S(q)| <= n(q)     almost everywhere along paths in A.                                                  (1)
+
+Then every collision-free path in A from q_0 to q_1 in time T costs J >= S(q_1) - S(q_0) + (c - E) T.
+
+Proof. By Cauchy's inequality, dS/dt <= |grad_H S| |(sqrt(r_v) v, sqrt(r_w) omega)| <= n |...|, and by that of
+arithmetic and geometric means, n |...| <= 1/2 n^2 + 1/2 (r_v v^2 + r_w omega^2) = E + Phi + 1/2 (...). Integrate.
+
+Limits of the controls only exclude paths, so the bound holds with them. With a free horizon E = c is used, and the last
+term vanishes. Write L for V + (E - c) T: to prove J >= V is to prove S(q_1) - S(q_0) >= L for all paths with J < V.
+
+**The functions.** A quadratic spline s satisfies (1) on a cell if `gradient_ratios` proves it there. Near the start q_0
+it cannot. Let N be the gauge of `leapnav.experts.proofs.gauge`, and C the cells of A that may meet {N < b} and are
+connected to the cell of q_0. The function g = m min(N, b) on C, g = m b elsewhere, is continuous on A, since the cells
+of A that adjoin C do not meet {N < b}; and it satisfies (1) if m^2 <= 2 (E + Phi) on C. Let D be a part of C with
+s - k <= g on D. Then S = max(g, s - k) satisfies (1) on A if s does on A without D: on D, S = g, and elsewhere S is
+the maximum of two functions that satisfy (1), and has the derivative of one of them at almost every time. S(q_0) = 0,
+since q_0 is in D.
+`source_offset` computes k. The same holds for the goal, since (1) does not change with the sign of S.
+
+**Exclusion.** Let S_0 and S_1 be such functions for the start and the goal. A path in A with J < V through q satisfies
+S_0(q) + S_1(q) < L. So if s_0 + s_1 - k_0 - k_1 >= L on a cell, or s_0 - k_0 >= L, or s_1 - k_1 >= L, no path with
+J < V that stays in A meets the cell: all of them stay in the set without it. A proof consists of stages. The first has
+for A all cells that contain a collision-free point, each further one the cells that are left, after the spacing was
+halved or not. J >= V is proved once the cell of the start or of the goal is excluded, or s_0(q_1) - k_0 >= L.
+
+**Rounding.** Functions of cells are bounded by their control points, whose rounding errors are bounded by
+`Functionals.rounding`. Other errors are covered by margins: `ROUNDING` of the modules used, and of this one for L.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import float64
+
+from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.types import NOTHING
+from leapnav.experts.proofs.cells import (
+    BLOCK,
+    LAYOUT,
+    MASKS,
+    VALUES,
+    CellSet,
+    Grid,
+    Layout,
+    control_points,
+    gather,
+    make_layout,
+)
+from leapnav.experts.proofs.gauge import Source, make_source
+from leapnav.experts.proofs.inequality import Functionals, functionals, gradient_ratios
+from leapnav.experts.proofs.near_source import cells_near, excess
+from leapnav.experts.proofs.proof import Pose, Proof, ProofError, Spline, find_ends
+from leapnav.experts.proofs.running_cost import RunningCost, running_cost
+
+ROUNDING = 1e-9  # relative to L, or to 1 if that is larger
+MAX_LEVEL = 8
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A function S of the theorem in a stage: max(g, scale * s - offset).
+
+    Attributes:
+        values, scale: the spline s.
+        offset: k.
+
+    """
+
+    values: np.ndarray
+    scale: float
+    offset: float
+
+
+def check_proof(proof: Proof) -> float:
+    """Check a proof and return the lower bound that it proves.
+
+    Raises:
+        ProofError: the proof is wrong or incomplete; the message names the stage and the fault.
+        ValueError: lower bounds cannot be proved for such a scenario.
+
+    """
+    scenario = proof.scenario
+    ends = find_ends(scenario)
+    limit = length_limit(proof)
+    cells = CellSet.full(Grid.over(scenario.arena, proof.spacing, proof.headings))
+    level = 0
+    for number, stage in enumerate(proof.stages):
+        name = f"stage {number}"
+        if not level <= stage.level <= MAX_LEVEL:
+            raise ProofError(f"{name}: level: expected {level} to {MAX_LEVEL}, got {stage.level}")
+        while level < stage.level:
+            cells, level = cells.refined(), level + 1
+        cost = running_cost(scenario, cells.grid, cells.columns())
+        cells = cells.without(~np.isfinite(cost.lowest))
+        placed = cells.on(_stage_layout(cells.grid, stage.blocks, name))
+        if placed is None:
+            raise ProofError(f"{name}: blocks: some cells are neither excluded nor in a block")
+        cells = placed
+        table = functionals(cells.grid, scenario.robot.metric(scenario.cost), cost.squares.shape[2])
+        bounds = []
+        for side, spline, pose in (("start", stage.start, ends[0]), ("goal", stage.goal, ends[1])):
+            try:
+                bounds.append(prove_bound(proof, spline, pose, cells, cost, table))
+            except ProofError as error:
+                raise ProofError(f"{name}: {side}: {error}") from None
+        cells = without_excluded(cells, bounds[0], bounds[1], limit)
+        if is_proved(cells, ends, bounds[0], limit):
+            return proof.value
+    raise ProofError(f"value: the stages do not prove {proof.value!r}")
+
+
+def length_limit(proof: Proof) -> float:
+    """Return L, rounded up.
+
+    Raises:
+        ProofError: E or V is no number with which a bound can be proved.
+
+    """
+    scenario, energy = proof.scenario, proof.energy
+    weight = scenario.cost.time_weight
+    if not (np.isfinite(energy) and energy > 0 and np.isfinite(proof.value)):
+        raise ProofError(f"energy, value: expected a positive and a finite number, got {energy!r} and {proof.value!r}")
+    if scenario.horizon is None and energy != weight:
+        raise ProofError(f"energy: expected the time weight {weight!r}, since the horizon is free, got {energy!r}")
+    limit = proof.value + (0.0 if scenario.horizon is None else (energy - weight) * scenario.horizon)
+    return limit + ROUNDING * max(1.0, abs(limit))
+
+
+def _stage_layout(grid: Grid, blocks: np.ndarray, name: str) -> Layout:
+    """Return the layout of a stage.
+
+    Raises:
+        ProofError: the blocks are not distinct positions in the grid, in ascending order.
+
+    """
+    shape = np.array([grid.headings, grid.columns, grid.lines]) // BLOCK
+    if blocks.ndim != 2 or blocks.shape[1:] != (3,) or (blocks < 0).any() or (blocks >= shape).any():
+        raise ProofError(f"{name}: blocks: expected positions in a grid of {shape.tolist()} blocks")
+    layout = make_layout(grid, blocks)
+    if not np.array_equal(layout.blocks, blocks):
+        raise ProofError(f"{name}: blocks: expected distinct blocks in ascending order")
+    return layout
+
+
+def prove_bound(
+    proof: Proof,
+    spline: Spline,
+    pose: Pose,
+    cells: CellSet,
+    cost: RunningCost,
+    table: Functionals,
+) -> Bound:
+    """Prove that a spline satisfies the inequality, and return the function S.
+
+    Args:
+        proof: the proof.
+        spline: the spline, on the layout of the cells.
+        pose: the start or the goal.
+        cells: A, on the layout of the stage.
+        cost: lower bounds of Phi.
+        table: the functionals of the grid.
+
+    Raises:
+        ProofError: it does not satisfy the inequality.
+
+    """
+    if spline.values.shape != cells.mask.shape or spline.values.dtype != np.float32:
+        raise ProofError(f"values: expected float32 of the shape {cells.mask.shape}, got {spline.values.shape}")
+    if not (np.isfinite(spline.values).all() and spline.scale > 0 and 0 < spline.radius <= spline.limit):
+        raise ProofError("expected finite values, a positive scale and 0 < radius <= limit")
+    values = np.ascontiguousarray(spline.values)
+    source = make_source(pose, proof.scenario.robot.metric(proof.scenario.cost), spline.limit)
+    exempt = cells_near(source, cells, spline.radius)
+    if not CellSet(cells.grid, cells.layout, exempt).contains(pose):
+        raise ProofError("the cell of the pose is not in the set")
+    others = cells.mask & ~exempt
+    allowed = (1.0 - 1e-12) / spline.scale
+    ratios = np.zeros(cells.mask.shape, dtype=np.float32)
+    worst = gradient_ratios(values, cells.layout, others, cost, table, proof.energy, allowed, ratios)[1]
+    if worst > allowed:
+        k, i, j = worst_cell(cells, ratios)
+        x, y = cells.grid.x + (i + 0.5) * cells.grid.spacing, cells.grid.y + (j + 0.5) * cells.grid.spacing
+        raise ProofError(
+            f"the gradient may be {worst * spline.scale:.6g} times as large as allowed at ({x:.4g}, {y:.4g}, "
+            f"{(k + 0.5) * cells.grid.angle:.4g})"
+        )
+    return Bound(values, spline.scale, source_offset(spline, source, cells, cost, proof.energy, exempt))
+
+
+def source_offset(
+    spline: Spline, source: Source, cells: CellSet, cost: RunningCost, energy: float, exempt: np.ndarray
+) -> float:
+    """Return k: an upper bound of the spline minus g on the cells where the inequality is not required."""
+    slope = source_slope(source, cells, cost, energy, spline.limit)
+    args = (spline.values, cells.layout, exempt, source, cells.grid.geometry, spline.scale, slope, spline.limit)
+    return max(excess(*args), 0.0) + ROUNDING
+
+
+def source_slope(source: Source, cells: CellSet, cost: RunningCost, energy: float, limit: float) -> float:
+    """Return m: the square root of a lower bound of 2 (E + Phi) on the cells that may meet {N < limit}."""
+    near = cells_near(source, cells, limit)
+    blocks = cells.layout.blocks
+    lowest = cost.lowest.reshape(cost.lowest.shape[0] // BLOCK, BLOCK, -1, BLOCK).transpose(0, 2, 1, 3)
+    lowest = np.broadcast_to(lowest[blocks[:, 1], blocks[:, 2]][:, None], near.shape)
+    return float(np.sqrt(2.0 * (energy + lowest[near].min(initial=np.inf if near.any() else 0.0)))) * (1.0 - 1e-12)
+
+
+def worst_cell(cells: CellSet, ratios: np.ndarray) -> tuple[int, int, int]:
+    """Return the indices of the cell with the largest ratio."""
+    b, k, i, j = np.unravel_index(int(ratios.argmax()), ratios.shape)
+    block = cells.layout.blocks[b]
+    return int(block[0] * BLOCK + k), int(block[1] * BLOCK + i), int(block[2] * BLOCK + j)
+
+
+def without_excluded(cells: CellSet, start: Bound, goal: Bound, limit: float) -> CellSet:
+    """Return the cells that are not excluded."""
+    mask = cells.mask.copy()
+    total = limit + start.offset + goal.offset
+    limits = Limits(start.scale, goal.scale, limit + start.offset, limit + goal.offset, total)
+    _exclude(start.values, goal.values, cells.layout, limits, mask)
+    return CellSet(cells.grid, cells.layout, mask)
+
+
+class Limits(NamedTuple):
+    """Factors of both splines, and what excludes a cell: a smallest value of the first, of the second or of the sum."""
+
+    start_scale: float
+    goal_scale: float
+    start: float
+    goal: float
+    total: float
+
+
+LIMITS = record_type(Limits, **dict.fromkeys(Limits._fields, float64))
+
+
+@kernel(NOTHING(VALUES, VALUES, LAYOUT, LIMITS, MASKS))
+def _exclude(start, goal, layout, limits, mask):
+    """Remove the cells from a set that the smallest control points exclude."""
+    shape = (BLOCK + 2, BLOCK + 2, BLOCK + 2)
+    first, second, total = np.empty(shape), np.empty(shape), np.empty(shape)
+    points = np.empty((3, 3, 3))
+    for b in range(len(mask)):
+        if not mask[b].any():
+            continue
+        gather(start, layout, b, first)
+        gather(goal, layout, b, second)
+        first *= limits.start_scale
+        second *= limits.goal_scale
+        total[:] = first + second
+        for k in range(BLOCK):
+            for i in range(BLOCK):
+                for j in range(BLOCK):
+                    if mask[b, k, i, j]:
+                        mask[b, k, i, j] = (
+                            control_points(total, k + 1, i + 1, j + 1, points) < limits.total
+                            and control_points(first, k + 1, i + 1, j + 1, points) < limits.start
+                            and control_points(second, k + 1, i + 1, j + 1, points) < limits.goal
+                        )
+
+
+def is_proved(cells: CellSet, ends: tuple[Pose, Pose], start: Bound, limit: float) -> bool:
+    """Whether no path that stays in the cells can be cheaper: the ends are excluded, or the goal is too far."""
+    if not all(map(cells.contains, ends)):
+        return True
+    return start.scale * spline_value(start.values, cells, ends[1]) - start.offset >= limit + ROUNDING
+
+
+def spline_value(values: np.ndarray, cells: CellSet, pose: Pose) -> float:
+    """Return the value of a spline at a pose in a cell of the set."""
+    k, i, j = cells.grid.cell(pose)
+    local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
+    slot = cells.layout.slots[k // BLOCK, i // BLOCK, j // BLOCK]
+    gather(values, cells.layout, slot, local)
+    around = local[k % BLOCK : k % BLOCK + 3, i % BLOCK : i % BLOCK + 3, j % BLOCK : j % BLOCK + 3]
+    x, y, heading = pose
+    places = (
+        heading % (2 * np.pi) / cells.grid.angle - k,
+        (x - cells.grid.x) / cells.grid.spacing - i,
+        (y - cells.grid.y) / cells.grid.spacing - j,
+    )
+    weights = [np.array([0.5 * (1 - t) ** 2, 0.5 + t * (1 - t), 0.5 * t * t]) for t in places]
+    return float(np.einsum("a,b,c,abc", *weights, around))
