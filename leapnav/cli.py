@@ -20,10 +20,10 @@ from leapnav.commands.installation.compile import Compile
 from leapnav.commands.installation.completion import Completion
 from leapnav.commands.installation.doctor import Doctor
 from leapnav.commands.play import Play
-from leapnav.commands.prove import CheckProof, Prove
 from leapnav.commands.report import Report
 from leapnav.commands.rollout import Rollout
-from leapnav.commands.solve import Solve
+from leapnav.commands.scenario.prove import CheckProof, Prove
+from leapnav.commands.scenario.solve import Solve
 from leapnav.commands.train import TrainCommand, train_command
 from leapnav.commands.watch import Watch
 from leapnav.outputs import FAILED, json_on_stdout

@@ -52,7 +52,7 @@ DEPTH, MAX_EXPONENT, WALL_DEPTH, WALL = 1.2, 8.0, 2.2, 50.0
 BINS_PER_SPACING = 2  # of the function of S
 MIN_RATIO = 0.8  # of its quantile
 ENOUGH = 1.003  # maximum ratio that is removed by a common factor
-FINISHED = 2e-4  # fraction of the cells; fewer projections end the iteration
+MORE_VISITS, FEW = 30, 0.05  # further visits while at most this fraction of the cells is pending
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +83,21 @@ class Medium:
         """Change of S over a spacing without obstacles."""
         return math.sqrt(2 * self.energy * self.metric[0]) * self.cells.grid.spacing
 
+    def free(self, cells: CellSet) -> np.ndarray:
+        """Return the mask of the collision-free cells in the blocks that a stage with some cells contains."""
+        used = self.cells.layout.slots[tuple(cells.with_margin().layout.blocks.T)]
+        mask = np.zeros_like(cells.mask)
+        mask[used] = True
+        return CellSet(cells.grid, cells.layout, mask).without(~np.isfinite(self.cost.lowest)).mask
+
     def slowness(self) -> np.ndarray:
         """Return n (columns, lines), continued into obstacles."""
         spacing, clearance = self.cells.grid.spacing, self.cost.clearance
         depth = np.minimum(np.maximum(-clearance, 0.0) / (DEPTH * spacing), MAX_EXPONENT)
-        n = np.sqrt(2 * (self.energy + np.minimum(self.cost.centre, self.highest) * np.exp(depth)))
+        # With the lowest Phi of a cell instead of that at its centre, S is less steep near obstacles, where it would
+        # violate the inequality in most cells.
+        proximity = np.minimum(np.minimum(self.cost.lowest, self.cost.centre), self.highest)
+        n = np.sqrt(2 * (self.energy + proximity * np.exp(depth)))
         return np.where(clearance < -WALL_DEPTH * spacing, WALL * math.sqrt(2 * self.energy), n)
 
 
@@ -127,17 +137,18 @@ class Distance:
         medium, cells = self.medium, self.medium.cells
         layout, grid = cells.layout, cells.grid
         self.values = np.full(cells.mask.shape, EMPTY, dtype=np.float32)
-        slope = source_slope(self.source, cells, medium.cost, medium.energy, self.limit)
+        free = medium.free(cells)
+        slope = source_slope(self.source, cells, free, medium.cost, medium.energy, self.limit)
         passable = medium.cost.clearance > -1.5 * grid.spacing
         around = CellSet(grid, layout, np.ones_like(cells.mask)).without(~passable)
-        locked = cells_near(self.source, around, self.limit)
+        locked = cells_near(self.source, around, around.mask, self.limit)
         _plant(self.values, layout, locked, self.source, grid.geometry, slope)
         equation = make_medium(grid, medium.metric, medium.slowness())
         tolerance = TOLERANCE * medium.scale
         solve_eikonal(self.values, locked, layout, equation, corrections=CORRECTIONS, tolerance=tolerance)
-        exempt = cells_near(self.source, cells, self.radius)
+        exempt = cells_near(self.source, cells, free, self.radius)
         self._lower_tip(exempt, cells.mask & ~exempt)
-        self.measure(cells)
+        self.measure(cells.mask & ~exempt)
 
     def _lower_tip(self, exempt: np.ndarray, others: np.ndarray) -> None:
         """Lower the coefficients that only exempt cells use, so that the spline does not exceed the gauge there."""
@@ -145,12 +156,12 @@ class Distance:
         _mark_neighbours(others, self.medium.cells.layout, needed)
         self.values[exempt & ~needed] -= np.float32(0.35 * self.radius)
 
-    def measure(self, cells: CellSet) -> float:
-        """Compute the gradient ratios on cells, and return the largest."""
-        self.ratios = np.zeros(cells.mask.shape, dtype=np.float32)
-        required = cells.mask & ~cells_near(self.source, cells, self.radius)
-        args = (self.medium.cost, self.medium.table, self.medium.energy, 1.0, self.ratios)
-        return gradient_ratios(self.values, cells.layout, required, *args)[1]
+    def measure(self, required: np.ndarray) -> float:
+        """Compute the gradient ratios on the cells of a mask, and return the largest."""
+        medium = self.medium
+        self.ratios = np.zeros(required.shape, dtype=np.float32)
+        args = (medium.cost, medium.table, medium.energy, 1.0, self.ratios)
+        return gradient_ratios(self.values, medium.cells.layout, required, *args)[1]
 
     def improve(self, cells: CellSet, quantile: float, visits: int) -> tuple[Spline, Bound]:
         """Make the spline satisfy the inequality on cells.
@@ -158,29 +169,31 @@ class Distance:
         Args:
             cells: the cells, on the layout of the level.
             quantile: quantile of the ratios that the function of S removes before the projections.
-            visits: maximum number of visits of the pending cells.
+            visits: number of visits of the pending cells; more follow if only few are pending.
 
         Returns:
             The spline, and what it proves on the cells.
 
         """
         medium = self.medium
-        exempt = cells_near(self.source, cells, self.radius)
+        free = medium.free(cells)
+        exempt = cells_near(self.source, cells, free, self.radius)
         required = cells.mask & ~exempt
         self.values = self._rescaled(required, quantile)
         pending = required.copy()
-        for _ in range(visits):
+        for visit in range(visits + MORE_VISITS):
             count = project_once(self.values, cells.layout, required, pending, medium.cost, medium.constraints)
-            if count <= FINISHED * max(1, int(required.sum())):
+            if count == 0 or (visit >= visits and pending.sum() > FEW * required.sum()):
                 break
-        worst = self.measure(cells)
+        worst = self.measure(required)
         kept, ratios = self.values, self.ratios
         if worst > ENOUGH:
             self.values = self._rescaled(required, 1.0)
-            worst = self.measure(cells)
+            worst = self.measure(required)
         scale = 1.0 / max(1.0, worst * (1.0 + 1e-9))
         spline = Spline(self.values, scale, self.radius, self.limit)
-        offset = source_offset(spline, self.source, cells, medium.cost, medium.energy, exempt)
+        slope = source_slope(self.source, cells, free, medium.cost, medium.energy, self.limit)
+        offset = source_offset(spline, self.source, cells, exempt, slope)
         self.values, self.ratios = kept.copy(), ratios
         return spline, Bound(spline.values, scale, offset)
 

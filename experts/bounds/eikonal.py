@@ -13,10 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float32, float64, int64, types
+from numba import boolean, float32, float64, int32, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import FLAGS, MATRIX, NOTHING
+from leapnav.envs.kernels.types import CUBE, FLAGS, MATRIX, NOTHING
 from leapnav.experts.proofs.cells import BLOCK, EMPTY, LAYOUT, MASKS, VALUES, Grid, gather
 
 MAX_ROUNDS = 1000
@@ -103,7 +103,7 @@ def relax(values, factor, locked, layout, medium, active, tolerance, once):
             gather(values, layout, b, local)
             k0, i0, j0 = layout.blocks[b, 0], layout.blocks[b, 1], layout.blocks[b, 2]
             for sweep in range(8):
-                _sweep(local, factor[b], locked[b], medium, k0 * BLOCK, i0 * BLOCK, j0 * BLOCK, sweep, once)
+                _sweep(local, factor[b], locked[b], medium, layout.blocks[b], sweep, once)
             change, lowest = 0.0, EMPTY
             for k in range(BLOCK):
                 for i in range(BLOCK):
@@ -131,10 +131,12 @@ _BLOCK_MASK = types.Array(boolean, 3, "C")
 
 
 @kernel(
-    NOTHING(float64[:, :, ::1], _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, int64, int64, int64, int64, boolean), fastmath=True
+    NOTHING(CUBE, _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, types.Array(int32, 1, "C"), int64, boolean),
+    fastmath=True,
 )
-def _sweep(local, factor, locked, medium, k0, i0, j0, sweep, assign):
+def _sweep(local, factor, locked, medium, block, sweep, assign):
     """One Gauss-Seidel sweep over a block in one of 8 orders."""
+    k0, i0, j0 = block[0] * BLOCK, block[1] * BLOCK, block[2] * BLOCK
     down_k, down_i, down_j = sweep >= 4, sweep % 2 == 1, sweep // 2 % 2 == 1
     weight_l, weight_t = 1.0 / medium.forward**2, 1.0 / medium.turn**2
     for kk in range(BLOCK):

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from leapnav.experts.problem.extremal import SolveError, Status
 from leapnav.experts.proofs.cells import CellSet, Grid
 from leapnav.experts.proofs.checker import Bound, is_proved, length_limit, spline_value, without_excluded
 from leapnav.experts.proofs.inequality import functionals
-from leapnav.experts.proofs.proof import Pose, Proof, Stage, find_ends
+from leapnav.experts.proofs.proof import Pose, Proof, Spline, Stage, find_ends
 from leapnav.experts.proofs.running_cost import running_cost
 
 # Width of the cells of the first level: at most this multiple of the robot's radius, and this fraction of the arena.
@@ -204,7 +204,7 @@ class _Producer:
             current = cells
             found = self._both(lambda distance: distance.improve(current, quantile, visits), distances)  # noqa: B023
             (first, start), (second, goal) = found
-            self.stages.append(Stage(level, cells.layout.blocks, first, second))
+            self.stages.append(_stage(level, cells, first, second))
             before, cells = len(cells), without_excluded(cells, start, goal, self.limit)
             if is_proved(cells, self.ends, start, self.limit):
                 self.cells = cells
@@ -226,6 +226,14 @@ class _Producer:
             return [function(argument) for argument in arguments]
         with ThreadPoolExecutor(2) as pool:
             return list(pool.map(function, arguments))
+
+
+def _stage(level: int, cells: CellSet, start: Spline, goal: Spline) -> Stage:
+    """Return a stage with the blocks that the cells need."""
+    layout = cells.with_margin().layout
+    used = cells.layout.slots[tuple(layout.blocks.T)]
+    first, second = (replace(spline, values=spline.values[used]) for spline in (start, goal))
+    return Stage(level, layout.blocks, first, second)
 
 
 def first_grid(scenario: Scenario) -> Grid:

@@ -187,6 +187,11 @@ class CellSet:
         return bool(slot >= 0 and self.mask[slot, k % BLOCK, i % BLOCK, j % BLOCK])
 
 
+def whole(grid: Grid, layout: Layout) -> CellSet:
+    """Return the set of all cells of a layout."""
+    return CellSet(grid, layout, np.ones((len(layout.blocks), BLOCK, BLOCK, BLOCK), dtype=bool))
+
+
 def _in_order(grid: Grid, blocks: np.ndarray, mask: np.ndarray) -> CellSet:
     """Return the set with masks of blocks in any order."""
     layout = make_layout(grid, blocks)

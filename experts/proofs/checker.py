@@ -18,13 +18,13 @@ Limits of the controls only exclude paths, so the bound holds with them. With a 
 term vanishes. Write L for V + (E - c) T: to prove J >= V is to prove S(q_1) - S(q_0) >= L for all paths with J < V.
 
 **The functions.** A quadratic spline s satisfies (1) on a cell if `gradient_ratios` proves it there. Near the start q_0
-it cannot. Let N be the gauge of `leapnav.experts.proofs.gauge`, and C the cells of A that may meet {N < b} and are
-connected to the cell of q_0. The function g = m min(N, b) on C, g = m b elsewhere, is continuous on A, since the cells
-of A that adjoin C do not meet {N < b}; and it satisfies (1) if m^2 <= 2 (E + Phi) on C. Let D be a part of C with
-s - k <= g on D. Then S = max(g, s - k) satisfies (1) on A if s does on A without D: on D, S = g, and elsewhere S is
-the maximum of two functions that satisfy (1), and has the derivative of one of them at almost every time. S(q_0) = 0,
-since q_0 is in D.
-`source_offset` computes k. The same holds for the goal, since (1) does not change with the sign of S.
+it cannot. Let N be the gauge of `leapnav.experts.proofs.gauge`, and C the cells of A that are connected to the cell of
+q_0 by cells that contain a collision-free point and may meet {N < b}. The function g = m min(N, b) on C, g = m b
+elsewhere, is continuous on A, since the cells of A that adjoin C do not meet {N < b}; and it satisfies (1) if
+m^2 <= 2 (E + Phi) on C. Let D be a part of C with s - k <= g on D. Then S = max(g, s - k) satisfies (1) on A if s does
+on A without D: on D, S = g, and elsewhere S is the maximum of two functions that satisfy (1), and has the derivative of
+one of them at almost every time. S(q_0) = 0, since q_0 is in D. `source_offset` computes k. The same holds for the
+goal, since (1) does not change with the sign of S.
 
 **Exclusion.** Let S_0 and S_1 be such functions for the start and the goal. A path in A with J < V through q satisfies
 S_0(q) + S_1(q) < L. So if s_0 + s_1 - k_0 - k_1 >= L on a cell, or s_0 - k_0 >= L, or s_1 - k_1 >= L, no path with
@@ -57,6 +57,7 @@ from leapnav.experts.proofs.cells import (
     control_points,
     gather,
     make_layout,
+    whole,
 )
 from leapnav.experts.proofs.gauge import Source, make_source
 from leapnav.experts.proofs.inequality import Functionals, functionals, gradient_ratios
@@ -102,9 +103,10 @@ def check_proof(proof: Proof) -> float:
             raise ProofError(f"{name}: level: expected {level} to {MAX_LEVEL}, got {stage.level}")
         while level < stage.level:
             cells, level = cells.refined(), level + 1
-        cost = running_cost(scenario, cells.grid, cells.columns())
-        cells = cells.without(~np.isfinite(cost.lowest))
-        placed = cells.on(_stage_layout(cells.grid, stage.blocks, name))
+        full = whole(cells.grid, _stage_layout(cells.grid, stage.blocks, name))
+        cost = running_cost(scenario, cells.grid, cells.columns() | full.columns())
+        free = full.without(~np.isfinite(cost.lowest)).mask
+        placed = cells.without(~np.isfinite(cost.lowest)).on(full.layout)
         if placed is None:
             raise ProofError(f"{name}: blocks: some cells are neither excluded nor in a block")
         cells = placed
@@ -112,7 +114,7 @@ def check_proof(proof: Proof) -> float:
         bounds = []
         for side, spline, pose in (("start", stage.start, ends[0]), ("goal", stage.goal, ends[1])):
             try:
-                bounds.append(prove_bound(proof, spline, pose, cells, cost, table))
+                bounds.append(prove_bound(proof, spline, pose, cells, free, cost, table))
             except ProofError as error:
                 raise ProofError(f"{name}: {side}: {error}") from None
         cells = without_excluded(cells, bounds[0], bounds[1], limit)
@@ -159,6 +161,7 @@ def prove_bound(
     spline: Spline,
     pose: Pose,
     cells: CellSet,
+    free: np.ndarray,
     cost: RunningCost,
     table: Functionals,
 ) -> Bound:
@@ -169,6 +172,7 @@ def prove_bound(
         spline: the spline, on the layout of the cells.
         pose: the start or the goal.
         cells: A, on the layout of the stage.
+        free (m, 8, 8, 8): the cells of the layout that contain a collision-free point.
         cost: lower bounds of Phi.
         table: the functionals of the grid.
 
@@ -182,7 +186,7 @@ def prove_bound(
         raise ProofError("expected finite values, a positive scale and 0 < radius <= limit")
     values = np.ascontiguousarray(spline.values)
     source = make_source(pose, proof.scenario.robot.metric(proof.scenario.cost), spline.limit)
-    exempt = cells_near(source, cells, spline.radius)
+    exempt = cells_near(source, cells, free, spline.radius)
     if not CellSet(cells.grid, cells.layout, exempt).contains(pose):
         raise ProofError("the cell of the pose is not in the set")
     others = cells.mask & ~exempt
@@ -196,21 +200,21 @@ def prove_bound(
             f"the gradient may be {worst * spline.scale:.6g} times as large as allowed at ({x:.4g}, {y:.4g}, "
             f"{(k + 0.5) * cells.grid.angle:.4g})"
         )
-    return Bound(values, spline.scale, source_offset(spline, source, cells, cost, proof.energy, exempt))
+    slope = source_slope(source, cells, free, cost, proof.energy, spline.limit)
+    return Bound(values, spline.scale, source_offset(spline, source, cells, exempt, slope))
 
 
-def source_offset(
-    spline: Spline, source: Source, cells: CellSet, cost: RunningCost, energy: float, exempt: np.ndarray
-) -> float:
+def source_offset(spline: Spline, source: Source, cells: CellSet, exempt: np.ndarray, slope: float) -> float:
     """Return k: an upper bound of the spline minus g on the cells where the inequality is not required."""
-    slope = source_slope(source, cells, cost, energy, spline.limit)
     args = (spline.values, cells.layout, exempt, source, cells.grid.geometry, spline.scale, slope, spline.limit)
     return max(excess(*args), 0.0) + ROUNDING
 
 
-def source_slope(source: Source, cells: CellSet, cost: RunningCost, energy: float, limit: float) -> float:
+def source_slope(
+    source: Source, cells: CellSet, free: np.ndarray, cost: RunningCost, energy: float, limit: float
+) -> float:
     """Return m: the square root of a lower bound of 2 (E + Phi) on the cells that may meet {N < limit}."""
-    near = cells_near(source, cells, limit)
+    near = cells_near(source, cells, free, limit)
     blocks = cells.layout.blocks
     lowest = cost.lowest.reshape(cost.lowest.shape[0] // BLOCK, BLOCK, -1, BLOCK).transpose(0, 2, 1, 3)
     lowest = np.broadcast_to(lowest[blocks[:, 1], blocks[:, 2]][:, None], near.shape)

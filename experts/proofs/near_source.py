@@ -23,11 +23,19 @@ from leapnav.experts.proofs.gauge import SOURCE, Source, gauge_minimum
 MAX_DIVISIONS = 8  # of a cell, per axis, for the bound of the excess
 
 
-def cells_near(source: Source, cells: CellSet, radius: float) -> np.ndarray:
-    """Return the mask of the cells that may meet {gauge < radius} and are connected to the cell of the source."""
+def cells_near(source: Source, cells: CellSet, free: np.ndarray, radius: float) -> np.ndarray:
+    """Return the mask of the cells that may meet {gauge < radius} and are connected to the cell of the source.
+
+    Args:
+        source: the source.
+        cells: the cells.
+        free (m, 8, 8, 8): cells of the same layout through which they may be connected.
+        radius: the radius.
+
+    """
     layout = cells.layout
     near, found = np.zeros_like(cells.mask), np.zeros_like(cells.mask)
-    _mark_near(cells.mask, layout, source, cells.grid.geometry, radius, near)
+    _mark_near(free, layout, source, cells.grid.geometry, radius, near)
     k, i, j = cells.grid.cell((source.x, source.y, source.heading))
     if layout.slots[k // BLOCK, i // BLOCK, j // BLOCK] >= 0:
         connected(near, layout, k, i, j, found)
