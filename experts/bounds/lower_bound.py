@@ -14,6 +14,7 @@ import numpy as np
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts.bounds.distance import Distance, Medium
+from leapnav.experts.bounds.duality import best_energy
 from leapnav.experts.bounds.projection import make_constraints
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import SolveError, Status
@@ -64,6 +65,9 @@ class LowerBound:
         gap: 1 - value / cost of the optimum.
         seconds: duration of the computation.
         resolution: spacing of the finest cells (m).
+        duality_gap: estimate of the gap that remains because the horizon is fixed, however fine the cells are: the
+            distance of the optimum from the convex envelope of the optimal cost over the horizon, see
+            `leapnav.experts.bounds.duality`; 0 with a free horizon.
         excluded: fraction of the collision-free configuration space in which no path cheaper than `value` can run.
         proof: the proof, see `check_proof`.
         tubes: for each spacing, the cells that a path cheaper than (1 - requested gap) times the cost may meet.
@@ -75,6 +79,7 @@ class LowerBound:
     gap: float
     seconds: float
     resolution: float
+    duality_gap: float
     excluded: float
     proof: Proof
     tubes: tuple[CellSet, ...]
@@ -87,6 +92,7 @@ class LowerBound:
             "gap": self.gap,
             "seconds": self.seconds,
             "resolution": self.resolution,
+            "duality_gap": self.duality_gap,
             "excluded": self.excluded,
         }
 
@@ -114,7 +120,7 @@ def lower_bound(
     Args:
         scenario: the scenario, with a unicycle or a differential drive, and fixed or free horizon.
         optimum: the best known path; None computes it with `find_optimum`.
-        gap: the relative optimality gap to prove.
+        gap: the relative optimality gap to prove; if that is impossible because of the duality gap, their sum.
         time_limit: time after which the best bound that is proved so far is returned (s); a level that has begun is
             finished first.
         threads: 2 computes the distances from the start and from the goal at the same time.
@@ -150,11 +156,14 @@ class _Producer:
         self.scenario, self.ends, self.cost, self.threads = scenario, ends, optimum.cost, threads
         states, controls = np.asarray(optimum.states, dtype=float), np.asarray(optimum.controls, dtype=float)
         proximity = np.array([proximity_value(x, y, scenario.field[2], scenario.field) for x, y in states[:, :2]])
+        self.duality_gap = 0.0
         if scenario.horizon is None:
             self.energy = scenario.cost.time_weight
         else:
             weights = np.array(scenario.robot.control_weight(scenario.cost))
             self.energy = float(np.median(0.5 * (controls**2) @ weights - proximity))
+            if self.energy > 0:
+                self.energy, self.duality_gap = best_energy(scenario, self.cost, self.energy)
         if not self.energy > 0:
             raise ValueError(
                 f"horizon: lower bounds need a positive kinetic energy minus proximity cost on the optimum, got "
@@ -162,6 +171,8 @@ class _Producer:
             )
         self.highest = max(CAP_IN_ENERGY * self.energy, CAP_FACTOR * float(proximity.max()))
         grid = first_grid(scenario)
+        if gap < self.duality_gap + 1e-3:
+            gap = min(gap + self.duality_gap, 0.999)
         empty = Proof(scenario, (1.0 - gap) * self.cost, self.energy, grid.spacing, grid.headings, ())
         self.proof, self.cells, self.stages = empty, CellSet.full(grid), list[Stage]()
         self.limit = length_limit(empty)
@@ -181,11 +192,17 @@ class _Producer:
         value = self.proof.value if proved else self.best
         proof = Proof(self.scenario, value, self.energy, self.proof.spacing, self.proof.headings, tuple(self.stages))
         left = len(self.cells) / 8**level / self.free_cells
-        seconds = time.perf_counter() - start
-        gap = 1.0 - value / self.cost
-        tubes = tuple(self.tubes)
-        spacing = self.cells.grid.spacing
-        return LowerBound(value, gap, seconds, spacing, 1.0 - left, proof, tubes, self.free_cells)
+        return LowerBound(
+            value=value,
+            gap=1.0 - value / self.cost,
+            seconds=time.perf_counter() - start,
+            resolution=self.cells.grid.spacing,
+            duality_gap=self.duality_gap,
+            excluded=1.0 - left,
+            proof=proof,
+            tubes=tuple(self.tubes),
+            free_cells=self.free_cells,
+        )
 
     def _level(self, level: int, end: float) -> bool:
         """Add the stages of a level; return whether the value is proved."""

@@ -52,6 +52,8 @@ class Prove:
         print(f"  optimum            {optimum.cost:.9f}")
         print(f"  lower bound        {bound.value:.9f}")
         print(f"  gap                {100 * bound.gap:.3f} %")
+        if bound.duality_gap > 1e-4:
+            print(f"  duality gap        {100 * bound.duality_gap:.3f} % (estimate), because the horizon is fixed")
         print(f"  excluded           {100 * bound.excluded:.3f} % of the collision-free configuration space")
         print(f"  resolution         {bound.resolution:.4g} m")
         print(f"  time               {bound.seconds:.1f} s")
