@@ -1,9 +1,9 @@
 """The energy E of a lower bound with a fixed horizon, and what no energy can prove.
 
 The bound is at most d(E) - (E - c) T, where d(E) is the minimum of J + (E - c) T over paths of any duration T: the
-minimum cost with a free horizon and the time weight E. It is a concave function of E with the slope T(E) - T, where T(E) is the
-duration of that minimum, and its maximum is the convex envelope of T -> J*(T) at T. It equals J*(T) unless T lies under
-a common tangent of two branches, between whose durations T(E) jumps.
+minimum cost with a free horizon and the time weight E. It is a concave function of E with the slope T(E) - T, where
+T(E) is the duration of that minimum, and its maximum is the convex envelope of T -> J*(T) at T. It equals J*(T) unless
+T lies under a common tangent of two branches, between whose durations T(E) jumps.
 """
 
 from __future__ import annotations
