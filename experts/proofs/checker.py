@@ -95,6 +95,11 @@ def check_proof(proof: Proof) -> float:
     scenario = proof.scenario
     ends = find_ends(scenario)
     limit = length_limit(proof)
+    if not (0.0 < proof.spacing < np.inf and proof.headings > 0 and proof.headings % BLOCK == 0):
+        raise ProofError(
+            f"spacing, headings: expected a positive number and a multiple of {BLOCK}, got {proof.spacing!r} and "
+            f"{proof.headings!r}"
+        )
     cells = CellSet.full(Grid.over(scenario.arena, proof.spacing, proof.headings))
     level = 0
     for number, stage in enumerate(proof.stages):
@@ -182,8 +187,11 @@ def prove_bound(
     """
     if spline.values.shape != cells.mask.shape or spline.values.dtype != np.float32:
         raise ProofError(f"values: expected float32 of the shape {cells.mask.shape}, got {spline.values.shape}")
-    if not (np.isfinite(spline.values).all() and spline.scale > 0 and 0 < spline.radius <= spline.limit):
-        raise ProofError("expected finite values, a positive scale and 0 < radius <= limit")
+    numbers = spline.scale, spline.radius, spline.limit
+    if not (np.isfinite(spline.values).all() and np.isfinite(numbers).all()):
+        raise ProofError("expected finite values, scale, radius and limit")
+    if not (spline.scale > 0 and 0 < spline.radius <= spline.limit):
+        raise ProofError("expected a positive scale and 0 < radius <= limit")
     values = np.ascontiguousarray(spline.values)
     source = make_source(pose, proof.scenario.robot.metric(proof.scenario.cost), spline.limit)
     exempt = cells_near(source, cells, free, spline.radius)
@@ -193,7 +201,7 @@ def prove_bound(
     allowed = (1.0 - 1e-12) / spline.scale
     ratios = np.zeros(cells.mask.shape, dtype=np.float32)
     worst = gradient_ratios(values, cells.layout, others, cost, table, proof.energy, allowed, ratios)[1]
-    if worst > allowed:
+    if not worst <= allowed:
         k, i, j = worst_cell(cells, ratios)
         x, y = cells.grid.x + (i + 0.5) * cells.grid.spacing, cells.grid.y + (j + 0.5) * cells.grid.spacing
         raise ProofError(
@@ -268,10 +276,10 @@ def _exclude(start, goal, layout, limits, mask):
             for i in range(BLOCK):
                 for j in range(BLOCK):
                     if mask[b, k, i, j]:
-                        mask[b, k, i, j] = (
-                            control_points(total, k + 1, i + 1, j + 1, points) < limits.total
-                            and control_points(first, k + 1, i + 1, j + 1, points) < limits.start
-                            and control_points(second, k + 1, i + 1, j + 1, points) < limits.goal
+                        mask[b, k, i, j] = not (
+                            control_points(total, k + 1, i + 1, j + 1, points) >= limits.total
+                            or control_points(first, k + 1, i + 1, j + 1, points) >= limits.start
+                            or control_points(second, k + 1, i + 1, j + 1, points) >= limits.goal
                         )
 
 
