@@ -31,7 +31,7 @@ def steps():
 
 def test_single_shooting_misses_the_goal_and_stalls(methods):
     single = methods["single shooting"]
-    # The flow from the start amplifies rounding errors: with the same source, other machine code gave 3, 6 and 7 iterates.
+    # The flow amplifies rounding errors: with the same source, different machine code gave 3, 6 and 7 iterates.
     assert single["status"] == "stalled" and len(single["iterates"]) >= 2
     residuals = [iterate["residual"] for iterate in single["iterates"]]
     assert residuals == sorted(residuals, reverse=True)  # of damped Newton steps
