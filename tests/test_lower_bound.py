@@ -245,6 +245,8 @@ def test_other_false_claims_are_refused(bound: LowerBound, optimum: Optimum):
         (replace(proof, energy=-1.0), "positive"),
         (replace(proof, headings=proof.headings + 4), "headings"),
         (replace(proof, spacing=math.nan), "spacing"),
+        (replace(proof, spacing=-0.2), "spacing"),
+        (replace(proof, energy=1e300), "energy"),
         (changed(proof, 0, start=replace(first.start, scale=math.inf)), "finite values, scale"),
         (replace(proof, stages=()), "do not prove"),
         (replace(proof, stages=proof.stages[-1:]), "neither excluded nor in a block|gradient"),
@@ -270,6 +272,37 @@ def test_other_false_claims_are_refused(bound: LowerBound, optimum: Optimum):
     )
     with pytest.raises(ProofError):
         check_proof(replace(proof, stages=exempt))
+
+
+@pytest.mark.parametrize(("height", "scale"), [(3e38, 1.0), (1e20, 1.0), (1e15, 1.0), (1e9, 1.0), (2.0, 1e308)])
+def test_a_large_constant_proves_nothing(bound: LowerBound, height: float, scale: float):
+    """Its gradient is 0, and sums with it have large rounding errors."""
+    stage = bound.proof.stages[0]
+    flat = replace(stage.start, values=np.full_like(stage.start.values, height), scale=scale)
+    false = changed(replace(bound.proof, value=1e-3, stages=(stage,)), 0, start=flat, goal=flat)
+    with pytest.raises(ProofError):
+        check_proof(replace(false, energy=1e-6))
+
+
+def test_a_goal_heading_just_below_zero_is_in_the_first_cell(bound: LowerBound):
+    cells, _ = first_cells(bound.proof)
+    values = np.random.default_rng(0).normal(size=cells.mask.shape).astype(np.float32)
+    at_zero = spline_value(values, cells, (2.0, 2.0, 0.0))
+    for heading in (-1e-16, -2.4e-16, 2 * math.pi, -1e-12):
+        assert spline_value(values, cells, (2.0, 2.0, heading)) == pytest.approx(at_zero, abs=1e-6)
+
+
+def test_phi_deep_in_an_obstacle_does_not_block_free_squares():
+    """Phi overflows at the centre of a square of which another part is free."""
+    scenario = Scenario.from_dict(
+        SCENARIO.to_dict()
+        | {"cost": {"proximity_scale": 1e-4}, "obstacles": [{"circle": {"center": [2.6, 2.2], "radius": 0.4}}]}
+    )
+    grid = Grid.over(scenario.arena, 4.0, 8)
+    cost = running_cost(scenario, grid, np.ones((grid.columns, grid.lines), dtype=bool))
+    for x, y in np.random.default_rng(0).uniform(0.3, 4.7, (500, 2)):
+        if clearance(x, y, scenario.field)[0] > 0:
+            assert np.isfinite(cost.lowest[int((x - grid.x) / 4.0), int((y - grid.y) / 4.0)])
 
 
 def test_the_start_and_the_goal_cannot_be_exchanged_for_poses_that_are_closer(bound: LowerBound):
@@ -366,6 +399,10 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert plot.stat().st_size > 10_000
     assert main(["check-proof", str(proof)]) == 0
     assert "no collision-free path costs less than" in capsys.readouterr().out
+    assert main(["check-proof", str(proof), "--scenario", str(scenario)]) == 0
+    other = tmp_path / "other.json"
+    Scenario.from_dict(SCENARIO.to_dict() | {"horizon": 7.0}).to_json(other)
+    assert main(["check-proof", str(proof), "--scenario", str(other)]) == 1
     false = replace(Proof.load(proof), value=100.0)
     false.save(proof)
     assert main(["check-proof", str(proof)]) == 1

@@ -38,7 +38,8 @@ class Shape(Frozen):
         smooth_distance: kernel of SMOOTH_DISTANCE_SIGNATURE, a twice continuously differentiable approximation of the
             distance (m), with gradient and Hessian. It may deviate from the distance, by the order of the scale near
             corners, and more inside. The proximity cost is weight * exp(-(d - robot radius) / scale).
-        is_lipschitz: whether the gradient of `smooth_distance` never exceeds 1. Proofs of lower bounds need it.
+        is_lipschitz: whether `distance` is the Euclidean distance everywhere, inside as well, and the gradient of
+            `smooth_distance` never exceeds 1. Proofs of lower bounds need both.
 
     """
 

@@ -38,8 +38,8 @@ halved or not. J >= V is proved once the cell of the start or of the goal is exc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, cast
 
 import numpy as np
 from numba import float64
@@ -48,6 +48,7 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import NOTHING
 from leapnav.experts.proofs.cells import (
     BLOCK,
+    EMPTY,
     LAYOUT,
     MASKS,
     VALUES,
@@ -65,8 +66,10 @@ from leapnav.experts.proofs.near_source import cells_near, excess
 from leapnav.experts.proofs.proof import Pose, Proof, ProofError, Spline, find_ends
 from leapnav.experts.proofs.running_cost import RunningCost, running_cost
 
-ROUNDING = 1e-9  # relative to L, or to 1 if that is larger
+ROUNDING = 1e-9  # relative to L and its terms, or to 1 if that is larger
+SPLINE_ROUNDING = 1e-14  # of sums of coefficients, relative to the largest coefficient: 90 units
 MAX_LEVEL = 8
+MAX_NUMBER = 1e12  # of V, E and the coefficients, so that nothing overflows
 
 
 @dataclass(frozen=True)
@@ -95,16 +98,12 @@ def check_proof(proof: Proof) -> float:
     scenario = proof.scenario
     ends = find_ends(scenario)
     limit = length_limit(proof)
-    if not (0.0 < proof.spacing < np.inf and proof.headings > 0 and proof.headings % BLOCK == 0):
-        raise ProofError(
-            f"spacing, headings: expected a positive number and a multiple of {BLOCK}, got {proof.spacing!r} and "
-            f"{proof.headings!r}"
-        )
+    _check_grid(proof)
     cells = CellSet.full(Grid.over(scenario.arena, proof.spacing, proof.headings))
     level = 0
     for number, stage in enumerate(proof.stages):
         name = f"stage {number}"
-        if not level <= stage.level <= MAX_LEVEL:
+        if not (isinstance(cast(object, stage.level), int) and level <= stage.level <= MAX_LEVEL):
             raise ProofError(f"{name}: level: expected {level} to {MAX_LEVEL}, got {stage.level}")
         while level < stage.level:
             cells, level = cells.refined(), level + 1
@@ -128,6 +127,21 @@ def check_proof(proof: Proof) -> float:
     raise ProofError(f"value: the stages do not prove {proof.value!r}")
 
 
+def _check_grid(proof: Proof) -> None:
+    """Check that the cells of level 0 cover configuration space.
+
+    Raises:
+        ProofError: they may not.
+
+    """
+    x_min, y_min, x_max, y_max = proof.scenario.arena
+    spacing, headings = proof.spacing, proof.headings
+    if not 0.0 < spacing <= max(x_max - x_min, y_max - y_min):
+        raise ProofError(f"spacing: expected a positive number, at most the size of the arena, got {spacing!r}")
+    if not (isinstance(cast(object, headings), int) and headings > 0 and headings % BLOCK == 0):
+        raise ProofError(f"headings: expected a multiple of {BLOCK}, got {headings!r}")
+
+
 def length_limit(proof: Proof) -> float:
     """Return L, rounded up.
 
@@ -137,12 +151,12 @@ def length_limit(proof: Proof) -> float:
     """
     scenario, energy = proof.scenario, proof.energy
     weight = scenario.cost.time_weight
-    if not (np.isfinite(energy) and energy > 0 and np.isfinite(proof.value)):
+    if not (0 < energy <= MAX_NUMBER and abs(proof.value) <= MAX_NUMBER):
         raise ProofError(f"energy, value: expected a positive and a finite number, got {energy!r} and {proof.value!r}")
     if scenario.horizon is None and energy != weight:
         raise ProofError(f"energy: expected the time weight {weight!r}, since the horizon is free, got {energy!r}")
-    limit = proof.value + (0.0 if scenario.horizon is None else (energy - weight) * scenario.horizon)
-    return limit + ROUNDING * max(1.0, abs(limit))
+    shift = 0.0 if scenario.horizon is None else (energy - weight) * scenario.horizon
+    return proof.value + shift + ROUNDING * max(1.0, abs(proof.value), abs(shift))
 
 
 def _stage_layout(grid: Grid, blocks: np.ndarray, name: str) -> Layout:
@@ -192,7 +206,10 @@ def prove_bound(
         raise ProofError("expected finite values, scale, radius and limit")
     if not (spline.scale > 0 and 0 < spline.radius <= spline.limit):
         raise ProofError("expected a positive scale and 0 < radius <= limit")
-    values = np.ascontiguousarray(spline.values)
+    if not spline.scale * max(EMPTY, float(np.abs(spline.values).max())) <= MAX_NUMBER:
+        raise ProofError(f"expected coefficients of at most {MAX_NUMBER:g}")
+    spline = replace(spline, values=np.ascontiguousarray(spline.values))
+    values = spline.values
     source = make_source(pose, proof.scenario.robot.metric(proof.scenario.cost), spline.limit)
     exempt = cells_near(source, cells, free, spline.radius)
     if not CellSet(cells.grid, cells.layout, exempt).contains(pose):
@@ -215,7 +232,8 @@ def prove_bound(
 def source_offset(spline: Spline, source: Source, cells: CellSet, exempt: np.ndarray, slope: float) -> float:
     """Return k: an upper bound of the spline minus g on the cells where the inequality is not required."""
     args = (spline.values, cells.layout, exempt, source, cells.grid.geometry, spline.scale, slope, spline.limit)
-    return max(excess(*args), 0.0) + ROUNDING
+    magnitude = spline.scale * max(EMPTY, float(np.abs(spline.values).max()))
+    return max(excess(*args), 0.0) + ROUNDING + SPLINE_ROUNDING * magnitude
 
 
 def source_slope(
@@ -298,10 +316,11 @@ def spline_value(values: np.ndarray, cells: CellSet, pose: Pose) -> float:
     gather(values, cells.layout, slot, local)
     around = local[k % BLOCK : k % BLOCK + 3, i % BLOCK : i % BLOCK + 3, j % BLOCK : j % BLOCK + 3]
     x, y, heading = pose
+    # Relative to the cell; a heading just below 0 is 2 pi modulo 2 pi by rounding, in cell 0.
     places = (
-        heading % (2 * np.pi) / cells.grid.angle - k,
-        (x - cells.grid.x) / cells.grid.spacing - i,
-        (y - cells.grid.y) / cells.grid.spacing - j,
+        heading % (2 * np.pi) / cells.grid.angle,
+        (x - cells.grid.x) / cells.grid.spacing,
+        (y - cells.grid.y) / cells.grid.spacing,
     )
-    weights = [np.array([0.5 * (1 - t) ** 2, 0.5 + t * (1 - t), 0.5 * t * t]) for t in places]
+    weights = [np.array([0.5 * (1 - t) ** 2, 0.5 + t * (1 - t), 0.5 * t * t]) for t in np.mod(places, 1.0)]
     return float(np.einsum("a,b,c,abc", *weights, around))

@@ -187,5 +187,6 @@ def gradient_ratios(values, layout, mask, cost, functionals, energy, enough, rat
                             square = max(square, found / (2.0 * (energy + phi)))
                     # Rounded up to single precision.
                     ratios[b, k, i, j] = math.sqrt(square) * (1.0 + 1e-6)
-                    worst = max(worst, math.sqrt(square))
+                    if not math.sqrt(square) <= worst:  # also if it is not a number
+                        worst = math.sqrt(square)
     return divided, worst

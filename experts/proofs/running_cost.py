@@ -25,6 +25,7 @@ from leapnav.experts.proofs.cells import Grid
 
 ROUNDING = 1e-9  # subtracted from Phi and from the clearance: 1000 times their rounding errors and neglected terms
 SQUARE = 1 / 8  # width of a square, in proximity scales, that is small enough
+MAX_PHI = 1e30  # larger values, which overflow single precision, are replaced by the bound 0
 MAX_SQUARES = 4  # squares per axis of a cell
 
 
@@ -83,6 +84,8 @@ def _bound(field, x, y, spacing, needed, cost):
                     if middle < spacing and clearance(px, py, field)[0] + reach < -ROUNDING:
                         continue
                     value = disc_proximity(px, py, field[2], field)[0] * factor - ROUNDING
+                    if not value < MAX_PHI:  # also if it is not a number, deep in an obstacle
+                        value = 0.0
                     # Rounded down to single precision.
                     cost.squares[i, j, a, b] = max(value * (1.0 - 1e-6), 0.0)
                     cost.lowest[i, j] = min(cost.lowest[i, j], max(value * (1.0 - 1e-6), 0.0))

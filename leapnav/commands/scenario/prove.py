@@ -78,12 +78,18 @@ class CheckProof:
 
     proof: tyro.conf.Positional[Path]
     """File written by `leapnav prove --proof`."""
+    scenario: Path | None = None
+    """Scenario file (JSON) that must be the one of the proof."""
 
     def run(self) -> int:
         """Check and report."""
+        from leapnav.envs.scenarios.scenario import Scenario
         from leapnav.experts import Proof, ProofError, check_proof
 
         proof = Proof.load(self.proof)
+        if self.scenario is not None and Scenario.from_json(self.scenario) != proof.scenario:
+            print(f"{proof.scenario.name}: the proof is for another scenario than {self.scenario}")
+            return FAILED
         start = perf_counter()
         try:
             value = check_proof(proof)
@@ -91,5 +97,6 @@ class CheckProof:
             print(f"{proof.scenario.name}: the proof is wrong: {error}")
             return FAILED
         print(f"{proof.scenario.name}: no collision-free path costs less than {value!r}")
+        print(f"  start {proof.scenario.start}, goal {proof.scenario.goal}, {len(proof.scenario.obstacles)} obstacles")
         print(f"  checked {len(proof.stages)} stages in {perf_counter() - start:.1f} s")
         return 0
