@@ -42,17 +42,16 @@ from leapnav.experts.proofs.running_cost import RunningCost
 # The gauge describes the surroundings of a source up to this lateral distance in spacings, and up to a radius in
 # sqrt(r_w) beyond which the bound of its gradient is too large (it is 1.015 here).
 SOURCE_WIDTH, MAX_GAUGE = 5.66, 1.5
-MARGIN, MAX_MARGIN = (
-    4.0,
-    0.25,
-)  # difference of radius and limit: at most these spacings and this part of the largest gauge
-CORRECTIONS, TOLERANCE = 4, 3e-3  # of the eikonal equation; in n times the spacing
+# Difference of radius and limit: at most these spacings, and this part of the largest gauge.
+MARGIN, MAX_MARGIN = 4.0, 0.25
+CORRECTIONS, TOLERANCE = 3, 3e-3  # of the eikonal equation; in n times the spacing
 # n in obstacles grows by exp(depth / (1.2 spacings)), and is constant from 2.2 spacings on.
 DEPTH, MAX_EXPONENT, WALL_DEPTH, WALL = 1.2, 8.0, 2.2, 50.0
 BINS_PER_SPACING = 2  # of the function of S
+SAMPLE = 2  # of the cells, one in so many along each axis determines the first function of S
 MIN_RATIO = 0.8  # of its quantile
 ENOUGH = 1.003  # maximum ratio that is removed by a common factor
-MORE_VISITS, FEW = 30, 0.05  # further visits while at most this fraction of the cells is pending
+MORE_VISITS, FEW = 60, 0.25  # further visits while at most this fraction of the cells is pending
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +108,9 @@ class Distance:
         medium: the level.
         pose: the pose (x, y, heading).
         values (m, 8, 8, 8): coefficients.
-        ratios (m, 8, 8, 8): gradient ratios of `values`.
+        ratios (m, 8, 8, 8): gradient ratios of `values`, 0 where they are not known.
+        source: the gauge around the pose.
+        radius, limit: see `leapnav.experts.proofs.proof.Spline`.
 
     """
 
@@ -148,7 +149,9 @@ class Distance:
         solve_eikonal(self.values, locked, layout, equation, corrections=CORRECTIONS, tolerance=tolerance)
         exempt = cells_near(self.source, cells, free, self.radius)
         self._lower_tip(exempt, cells.mask & ~exempt)
-        self.measure(cells.mask & ~exempt)
+        sample = np.zeros_like(exempt)
+        sample[:, ::SAMPLE, ::SAMPLE, ::SAMPLE] = True
+        self.measure(cells.mask & ~exempt & sample)
 
     def _lower_tip(self, exempt: np.ndarray, others: np.ndarray) -> None:
         """Lower the coefficients that only exempt cells use, so that the spline does not exceed the gauge there."""
@@ -199,34 +202,46 @@ class Distance:
 
     def _rescaled(self, required: np.ndarray, quantile: float) -> np.ndarray:
         """Return the coefficients of a function of S whose slope is 1 / R(S), see the module."""
-        layout = self.medium.cells.layout
+        known = required & (self.ratios > 0)
         lowest, highest = np.zeros_like(self.values), np.zeros_like(self.values)
-        _ranges(self.values, layout, required, lowest, highest)
-        low, high, ratios = lowest[required], highest[required], self.ratios[required]
+        _ranges(self.values, self.medium.cells.layout, known, lowest, highest)
+        known &= highest < 0.5 * EMPTY
+        low, high, ratios = lowest[known], highest[known], self.ratios[known]
         if not len(low):
             return self.values.copy()
         width = self.medium.scale / BINS_PER_SPACING
         origin = min(0.0, float(low.min()))
         first, last = ((low - origin) / width).astype(int), ((high - origin) / width).astype(int)
         count = int(last.max()) + 1
-        slowest = np.ones(count)
         if quantile >= 1.0:
-            for step in range(int((last - first).max()) + 1):
-                np.maximum.at(slowest, np.minimum(first + step, last), ratios)
+            slowest = _largest_per_bin(first, last, ratios, count)
         else:
-            bins = (first + last) // 2
-            order = np.lexsort((ratios, bins))
-            bins, ratios = bins[order], ratios[order]
-            starts = np.searchsorted(bins, np.arange(count + 1))
-            filled = np.flatnonzero(np.diff(starts))
-            chosen = starts[filled] + (quantile * (np.diff(starts)[filled] - 1)).astype(int)
-            slowest[filled] = np.maximum(ratios[chosen], MIN_RATIO)
+            slowest = np.maximum(_quantile_per_bin((first + last) // 2, ratios, count, quantile), MIN_RATIO)
             slowest = np.convolve(np.pad(slowest, 2, mode="edge"), np.full(5, 0.2), mode="valid")
         edges = origin + width * np.arange(count + 1)
         heights = origin + width * np.concatenate([[0.0], np.cumsum(1.0 / slowest)])
-        inside = np.interp(self.values, edges, heights) + np.minimum(self.values - origin, 0.0)
-        inside = np.where(self.values > edges[-1], heights[-1] + (self.values - edges[-1]), inside)
-        return np.where(self.values < 0.5 * EMPTY, inside, self.values).astype(np.float32)
+        inside = np.interp(self.values, edges, heights)
+        below, above = np.minimum(self.values - origin, 0.0), np.maximum(self.values - edges[-1], 0.0)
+        return np.where(self.values < 0.5 * EMPTY, inside + below + above, self.values).astype(np.float32)
+
+
+def _largest_per_bin(first: np.ndarray, last: np.ndarray, ratios: np.ndarray, count: int) -> np.ndarray:
+    """Return the largest ratio, at least 1, of the cells whose bins, `first` to `last`, include each bin."""
+    largest = np.ones(count)
+    for step in range(int((last - first).max()) + 1):
+        np.maximum.at(largest, np.minimum(first + step, last), ratios)
+    return largest
+
+
+def _quantile_per_bin(bins: np.ndarray, ratios: np.ndarray, count: int, quantile: float) -> np.ndarray:
+    """Return a quantile of the ratios in each bin, 1 in empty bins."""
+    order = np.lexsort((ratios, bins))
+    starts = np.searchsorted(bins[order], np.arange(count + 1))
+    sizes = np.diff(starts)
+    filled = np.flatnonzero(sizes)
+    found = np.ones(count)
+    found[filled] = ratios[order][starts[filled] + (quantile * (sizes[filled] - 1)).astype(int)]
+    return found
 
 
 @kernel(NOTHING(VALUES, LAYOUT, MASKS, SOURCE, GEOMETRY, float64))

@@ -2,9 +2,9 @@
 
 With steps h sqrt(r_v) along the heading and dtheta sqrt(r_w) in the heading, and the smaller values S_l and S_t of the
 neighbours in these two directions, S solves (S - S_l)^2 / step_l^2 + (S - S_t)^2 / step_t^2 = n^2, by Gauss-Seidel
-sweeps in alternating order over blocks whose surroundings changed, those with the lowest values first. `correct`
-reduces n where central differences of S are too large, so that a repeated solution is accurate to second order where S
-is smooth.
+sweeps in alternating order over the block whose surroundings changed to the lowest value (the heap cell method of
+Chacon and Vladimirsky, SIAM J. Sci. Comput. 34, 2012). `correct` reduces n where central differences of S are too
+large, so that a repeated solution is accurate to second order where S is smooth.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ import numpy as np
 from numba import boolean, float32, float64, int32, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import CUBE, FLAGS, MATRIX, NOTHING
-from leapnav.experts.proofs.cells import BLOCK, EMPTY, LAYOUT, MASKS, VALUES, Grid, gather
+from leapnav.envs.kernels.types import CUBE, MATRIX, NOTHING
+from leapnav.experts.proofs.cells import BLOCK, EMPTY, LAYOUT, MASKS, VALUES, Grid, Layout, gather
 
-MAX_ROUNDS = 1000
+MAX_VISITS = 60  # of a block, on average
+PASSES = 3  # over all blocks after a correction
+IDLE = 2  # sweeps without a change after which a block is left
 MIN_FACTOR, POWER = 0.8, 0.8  # of the correction
 
 
@@ -51,7 +53,7 @@ def make_medium(grid: Grid, metric: tuple[float, float], slowness: np.ndarray) -
 
 
 def solve_eikonal(
-    values: np.ndarray, locked: np.ndarray, layout: object, medium: Medium, *, corrections: int, tolerance: float
+    values: np.ndarray, locked: np.ndarray, layout: Layout, medium: Medium, *, corrections: int, tolerance: float
 ) -> None:
     """Solve the equation in place.
 
@@ -65,79 +67,103 @@ def solve_eikonal(
 
     """
     factor = np.ones_like(values)
-    active = np.ones(len(values), dtype=np.bool_)
-    relax(values, factor, locked, layout, medium, active, tolerance, False)
+    relax(values, factor, locked, layout, medium, tolerance)
     for _ in range(corrections):
         correct(values, factor, layout, medium)
-        for _ in range(2):
-            active[:] = True
-            relax(values, factor, locked, layout, medium, active, tolerance, True)
+        for _ in range(PASSES):
+            repeat(values, factor, locked, layout, medium, tolerance)
 
 
-@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, FLAGS, float64, boolean), fastmath=True)
-def relax(values, factor, locked, layout, medium, active, tolerance, once):
-    """Relax the active blocks until none is active, or visit each of them once.
+@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, float64))
+def relax(values, factor, locked, layout, medium, tolerance):
+    """Visit blocks, that whose surroundings changed to the lowest value first, until nothing changes.
 
     Args:
-        values: the solution; it only decreases, except if `once`.
+        values: the solution; it only decreases.
         factor: factor of n in each cell.
         locked: cells that are not changed.
-        layout, medium: see `solve_eikonal`.
-        active (m,): blocks to visit.
-        tolerance: see `solve_eikonal`.
-        once: visit each block once, and allow increases.
+        layout, medium, tolerance: see `solve_eikonal`.
 
     """
     local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
-    keys = np.empty(len(values))
+    keys = np.full(len(values), np.inf)  # lowest value to which the surroundings changed since the last visit
     n_k, n_i, n_j = layout.slots.shape
     for b in range(len(values)):
-        keys[b] = values[b].min()
-    for _ in range(1 if once else MAX_ROUNDS):
-        visited = False
-        for b in np.argsort(keys):
-            if not active[b]:
-                continue
-            active[b] = False
-            visited = True
-            gather(values, layout, b, local)
-            k0, i0, j0 = layout.blocks[b, 0], layout.blocks[b, 1], layout.blocks[b, 2]
-            for sweep in range(8):
-                _sweep(local, factor[b], locked[b], medium, layout.blocks[b], sweep, once)
-            change, lowest = 0.0, EMPTY
-            for k in range(BLOCK):
-                for i in range(BLOCK):
-                    for j in range(BLOCK):
-                        value = float32(local[k + 1, i + 1, j + 1])
-                        change = max(change, abs(values[b, k, i, j] - value))
-                        values[b, k, i, j] = value
-                        lowest = min(lowest, value)
-            keys[b] = lowest
-            if change <= tolerance or once:
-                continue
-            for dk in range(-1, 2):
-                for di in range(-1, 2):
-                    for dj in range(-1, 2):
-                        if 0 <= i0 + di < n_i and 0 <= j0 + dj < n_j:
-                            slot = layout.slots[(k0 + dk) % n_k, i0 + di, j0 + dj]
-                            if slot >= 0:
-                                active[slot] = True
-        if not visited:
+        if locked[b].any():
+            keys[b] = values[b].min()
+    for _ in range(MAX_VISITS * len(values)):
+        b = np.argmin(keys)
+        if keys[b] == np.inf:
             break
+        keys[b] = np.inf
+        gather(values, layout, b, local)
+        _sweep_block(local, factor[b], locked[b], medium, layout.blocks[b], tolerance, False)
+        lowest = _store(local, values[b], tolerance)
+        if lowest == np.inf:
+            continue
+        k0, i0, j0 = layout.blocks[b, 0], layout.blocks[b, 1], layout.blocks[b, 2]
+        for dk in range(-1, 2):
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    if 0 <= i0 + di < n_i and 0 <= j0 + dj < n_j:
+                        slot = layout.slots[(k0 + dk) % n_k, i0 + di, j0 + dj]
+                        if slot >= 0 and slot != b:
+                            keys[slot] = min(keys[slot], lowest)
+
+
+@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, float64))
+def repeat(values, factor, locked, layout, medium, tolerance):
+    """Visit each block once in the order of their values, which may also increase; see `relax`."""
+    local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
+    keys = np.empty(len(values))
+    for b in range(len(values)):
+        keys[b] = values[b].min()
+    for b in np.argsort(keys):
+        gather(values, layout, b, local)
+        _sweep_block(local, factor[b], locked[b], medium, layout.blocks[b], tolerance, True)
+        _store(local, values[b], tolerance)
 
 
 _BLOCK_VALUES = types.Array(float32, 3, "C")
 _BLOCK_MASK = types.Array(boolean, 3, "C")
 
 
+_POSITION = types.Array(int32, 1, "C")
+
+
+@kernel(float64(CUBE, _BLOCK_VALUES, float64))
+def _store(local, values, tolerance):
+    """Copy a block back; return the lowest value that decreased by more than the tolerance, or infinity."""
+    lowest = np.inf
+    for k in range(BLOCK):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                value = float32(local[k + 1, i + 1, j + 1])
+                if values[k, i, j] - value > tolerance:
+                    lowest = min(lowest, value)
+                values[k, i, j] = value
+    return lowest
+
+
+@kernel(NOTHING(CUBE, _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, _POSITION, float64, boolean))
+def _sweep_block(local, factor, locked, medium, block, tolerance, assign):
+    """Sweep over a block until nothing changes, at most once in each of 8 orders."""
+    idle = 0
+    for sweep in range(8):
+        idle = 0 if _sweep(local, factor, locked, medium, block, sweep, tolerance, assign) else idle + 1
+        if idle == IDLE:
+            break
+
+
 @kernel(
-    NOTHING(CUBE, _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, types.Array(int32, 1, "C"), int64, boolean),
+    boolean(CUBE, _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, _POSITION, int64, float64, boolean),
     fastmath=True,
 )
-def _sweep(local, factor, locked, medium, block, sweep, assign):
-    """One Gauss-Seidel sweep over a block in one of 8 orders."""
+def _sweep(local, factor, locked, medium, block, sweep, tolerance, assign):
+    """One Gauss-Seidel sweep over a block in one of 8 orders; return whether a value changed by the tolerance."""
     k0, i0, j0 = block[0] * BLOCK, block[1] * BLOCK, block[2] * BLOCK
-    down_k, down_i, down_j = sweep >= 4, sweep % 2 == 1, sweep // 2 % 2 == 1
+    down_k, down_i, down_j = sweep % 2 == 1, sweep // 2 % 2 == 1, sweep >= 4
+    changed = False
     weight_l, weight_t = 1.0 / medium.forward**2, 1.0 / medium.turn**2
     for kk in range(BLOCK):
         k = BLOCK - 1 - kk if down_k else kk
@@ -167,6 +193,9 @@ def _sweep(local, factor, locked, medium, block, sweep, assign):
                 )
                 along = min(ahead, behind)
                 across = min(local[a + 1, i + 1, j + 1], local[a - 1, i + 1, j + 1])
+                present = local[a, i + 1, j + 1]
+                if not assign and min(along, across) >= present:
+                    continue
                 n = medium.slowness[i0 + i, j0 + j] * factor[k, i, j]
                 value = min(along + n * medium.forward, across + n * medium.turn)
                 difference = across - along
@@ -175,8 +204,10 @@ def _sweep(local, factor, locked, medium, block, sweep, assign):
                     both = (along * weight_l + across * weight_t + math.sqrt(square)) / (weight_l + weight_t)
                     if both > along and both > across:
                         value = min(value, both)
-                if assign or value < local[a, i + 1, j + 1]:
+                if assign or value < present:
+                    changed = changed or abs(present - value) > tolerance
                     local[a, i + 1, j + 1] = value
+    return changed
 
 
 @kernel(NOTHING(VALUES, VALUES, LAYOUT, MEDIUM))

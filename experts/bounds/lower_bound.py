@@ -29,8 +29,8 @@ SPACING_IN_RADII, SPACING_IN_ARENAS = 0.8, 1 / 24
 MAX_CELLS = 8_000_000  # of the first level
 MAX_LEVEL = 5
 # Quantile of the ratios and visits of the pending cells, per round of a level.
-ROUNDS = ((0.95, 8), (0.9, 10), (0.85, 10), (0.8, 10), (0.8, 10), (0.8, 10))
-PROGRESS = 0.93  # a level ends after a round that leaves more than this fraction of the cells
+ROUNDS = ((0.95, 8), (0.9, 10), (0.85, 10), *((0.8, 10),) * 9)
+PROGRESS = 0.93  # a level ends after a round, not the first, that leaves more than this fraction of the cells
 TOLERANCE = 1.001  # gradient ratio above which a control point is moved
 # Largest Phi of the eikonal equation, relative to that on the optimum, and in E.
 CAP_FACTOR, CAP_IN_ENERGY = 1.15, 0.75

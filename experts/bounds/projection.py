@@ -78,10 +78,10 @@ def _largest(matrix, around, points):
     """Index and square of the largest control point; fills `points` (72,)."""
     for r in range(2 * N_POINTS):
         points[r] = 0.0
-    for q in range(N_COEFFICIENTS):
-        x = around[q]
+    for q in range(0, N_COEFFICIENTS, 3):
+        x, y, z = around[q], around[q + 1], around[q + 2]
         for r in range(2 * N_POINTS):
-            points[r] += matrix[q, r] * x
+            points[r] += matrix[q, r] * x + matrix[q + 1, r] * y + matrix[q + 2, r] * z
     largest, found = float32(0.0), 0
     for r in range(N_POINTS):
         square = points[r] * points[r] + points[N_POINTS + r] * points[N_POINTS + r]

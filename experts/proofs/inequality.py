@@ -117,10 +117,10 @@ def evaluate(matrix, around, points):
     """Control points (99,) from the coefficients around a cell (27,)."""
     for r in range(2 * N_POINTS + N_LATERAL):
         points[r] = 0.0
-    for q in range(N_COEFFICIENTS):
-        x = around[q]
+    for q in range(0, N_COEFFICIENTS, 3):  # three at a time, which halves the time
+        x, y, z = around[q], around[q + 1], around[q + 2]
         for r in range(2 * N_POINTS + N_LATERAL):
-            points[r] += matrix[q, r] * x
+            points[r] += matrix[q, r] * x + matrix[q + 1, r] * y + matrix[q + 2, r] * z
 
 
 @kernel(float64(VECTOR, float64, float64))
@@ -147,7 +147,7 @@ def gradient_ratios(values, layout, mask, cost, functionals, energy, enough, rat
         cost: lower bounds of Phi.
         functionals: the control points.
         energy: E.
-        enough: cells whose bound from the cell as a whole is at most this are not divided into squares.
+        enough: where the bound from the cell as a whole is at most this, it is not improved for a cell or a square.
         ratios (m, 8, 8, 8): the result, 0 for other cells.
 
     Returns:
@@ -179,12 +179,14 @@ def gradient_ratios(values, layout, mask, cost, functionals, energy, enough, rat
                         divided += 1
                         for part in range(n * n):
                             phi = cost.squares[i0 + i, j0 + j, part // n, part % n]
-                            # Squares without a collision-free point, and those that cannot be the worst.
-                            if math.isnan(phi) or whole <= square * 2.0 * (energy + phi):
+                            if math.isnan(phi):  # no collision-free point
+                                continue
+                            right = 2.0 * (energy + phi)
+                            if whole <= max(square, enough * enough) * right:
+                                square = max(square, whole / right)
                                 continue
                             evaluate(matrices[1 + part], around, points)
-                            found = largest_square(points, functionals.excess, error)
-                            square = max(square, found / (2.0 * (energy + phi)))
+                            square = max(square, largest_square(points, functionals.excess, error) / right)
                     # Rounded up to single precision.
                     ratios[b, k, i, j] = math.sqrt(square) * (1.0 + 1e-6)
                     if not math.sqrt(square) <= worst:  # also if it is not a number

@@ -18,9 +18,9 @@ from leapnav.experts.proofs.cells import (
     control_points,
     gather,
 )
-from leapnav.experts.proofs.gauge import SOURCE, Source, gauge_minimum
+from leapnav.experts.proofs.gauge import SOURCE, Source, gauge, gauge_minimum
 
-MAX_DIVISIONS = 8  # of a cell, per axis, for the bound of the excess
+MAX_HALVINGS = 3  # of a cell, for the bound of the excess
 
 
 def cells_near(source: Source, cells: CellSet, free: np.ndarray, radius: float) -> np.ndarray:
@@ -47,7 +47,10 @@ def _mark_near(mask, layout, source, geometry, radius, near):
     """Mark the cells of a set that may meet {gauge < radius}."""
     spacing, angle = geometry.spacing, geometry.angle
     for b in range(len(mask)):
-        if not mask[b].any():
+        k0, i0, j0 = (layout.blocks[b, 0] + 0.5, layout.blocks[b, 1] + 0.5, layout.blocks[b, 2] + 0.5)
+        px, py = geometry.x + i0 * BLOCK * spacing, geometry.y + j0 * BLOCK * spacing
+        width, angle_width = BLOCK / 2 * spacing, BLOCK / 2 * angle
+        if not (gauge_minimum(px, py, k0 * BLOCK * angle, width, angle_width, source) < radius and mask[b].any()):
             continue
         for k in range(BLOCK):
             heading = (layout.blocks[b, 0] * BLOCK + k + 0.5) * angle
@@ -64,7 +67,7 @@ def _mark_near(mask, layout, source, geometry, radius, near):
 def excess(values, layout, mask, source, geometry, scale, slope, radius):
     """Upper bound of scale * S - slope * min(gauge, radius) over the cells of a set.
 
-    Cells are divided into MAX_DIVISIONS parts per axis if the bound from the whole cell exceeds the one found so far.
+    A cell is halved along all axes while its bound exceeds the largest value found so far, at most MAX_HALVINGS times.
 
     Args:
         values, layout, mask: the spline S and the set.
@@ -76,8 +79,51 @@ def excess(values, layout, mask, source, geometry, scale, slope, radius):
     """
     spacing, angle = geometry.spacing, geometry.angle
     local, points = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2)), np.empty((3, 3, 3))
-    slab, part = np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    n, best = MAX_DIVISIONS, -np.inf
+    part, stack = np.empty((3, 3, 3)), np.empty((8 * MAX_HALVINGS + 1, 4), dtype=np.int64)
+    best = _largest_at_centres(values, layout, mask, source, geometry, scale, slope, radius)
+    for b in range(len(mask)):
+        if not mask[b].any():
+            continue
+        gather(values, layout, b, local)
+        for k in range(BLOCK):
+            heading = (layout.blocks[b, 0] * BLOCK + k) * angle
+            for i in range(BLOCK):
+                x = geometry.x + (layout.blocks[b, 1] * BLOCK + i) * spacing
+                for j in range(BLOCK):
+                    if not mask[b, k, i, j]:
+                        continue
+                    y = geometry.y + (layout.blocks[b, 2] * BLOCK + j) * spacing
+                    control_points(local, k + 1, i + 1, j + 1, points)
+                    stack[0], size = 0, 1
+                    while size > 0:
+                        size -= 1
+                        # A part: its depth, and its position on the grid of parts of this depth.
+                        depth, p, q, r = stack[size, 0], stack[size, 1], stack[size, 2], stack[size, 3]
+                        width = 0.5**depth
+                        cx, cy = x + (q + 0.5) * width * spacing, y + (r + 0.5) * width * spacing
+                        middle, half = heading + (p + 0.5) * width * angle, width / 2
+                        lowest = gauge_minimum(cx, cy, middle, half * spacing, half * angle, source)
+                        _restrict(points, 0, p * width, (p + 1) * width, part)
+                        _restrict(part, 1, q * width, (q + 1) * width, part)
+                        _restrict(part, 2, r * width, (r + 1) * width, part)
+                        bound = scale * part.max() - slope * min(lowest, radius)
+                        if bound <= best:
+                            continue
+                        if depth == MAX_HALVINGS:
+                            best = bound
+                            continue
+                        for child in range(8):
+                            stack[size, 0], stack[size, 1] = depth + 1, 2 * p + child // 4
+                            stack[size, 2], stack[size, 3] = 2 * q + child // 2 % 2, 2 * r + child % 2
+                            size += 1
+    return best
+
+
+@kernel(float64(VALUES, LAYOUT, MASKS, SOURCE, GEOMETRY, float64, float64, float64))
+def _largest_at_centres(values, layout, mask, source, geometry, scale, slope, radius):
+    """The excess at the centres of the cells, from which most other cells need no division."""
+    spacing, angle = geometry.spacing, geometry.angle
+    local, points, best = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2)), np.empty((3, 3, 3)), -np.inf
     for b in range(len(mask)):
         if not mask[b].any():
             continue
@@ -87,28 +133,14 @@ def excess(values, layout, mask, source, geometry, scale, slope, radius):
             for i in range(BLOCK):
                 px = geometry.x + (layout.blocks[b, 1] * BLOCK + i + 0.5) * spacing
                 for j in range(BLOCK):
-                    if not mask[b, k, i, j]:
-                        continue
-                    py = geometry.y + (layout.blocks[b, 2] * BLOCK + j + 0.5) * spacing
-                    control_points(local, k + 1, i + 1, j + 1, points)
-                    lowest = min(gauge_minimum(px, py, heading, spacing / 2, angle / 2, source), radius)
-                    if scale * points.max() - slope * lowest <= best:
-                        continue
-                    for p in range(n):
-                        middle = heading + ((p + 0.5) / n - 0.5) * angle
-                        _restrict(points, 0, p / n, (p + 1) / n, slab)
-                        lowest = min(gauge_minimum(px, py, middle, spacing / 2, angle / 2 / n, source), radius)
-                        if scale * slab.max() - slope * lowest <= best:
-                            continue
-                        for q in range(n * n):
-                            u, v = q // n, q % n
-                            cx, cy = px + ((u + 0.5) / n - 0.5) * spacing, py + ((v + 0.5) / n - 0.5) * spacing
-                            lowest = min(gauge_minimum(cx, cy, middle, spacing / 2 / n, angle / 2 / n, source), radius)
-                            if scale * slab.max() - slope * lowest <= best:
-                                continue
-                            _restrict(slab, 1, u / n, (u + 1) / n, part)
-                            _restrict(part, 2, v / n, (v + 1) / n, part)
-                            best = max(best, scale * part.max() - slope * lowest)
+                    if mask[b, k, i, j]:
+                        py = geometry.y + (layout.blocks[b, 2] * BLOCK + j + 0.5) * spacing
+                        control_points(local, k + 1, i + 1, j + 1, points)
+                        value = 0.0
+                        for a in range(27):  # Bernstein polynomials of degree 2 at 1/2: 1/4, 1/2, 1/4
+                            u, v, w = a // 9, a // 3 % 3, a % 3
+                            value += (1 + u % 2) * (1 + v % 2) * (1 + w % 2) / 64.0 * points[u, v, w]
+                        best = max(best, scale * value - slope * min(gauge(px, py, heading, source), radius))
     return best
 
 
