@@ -142,6 +142,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `reward_parts` | see Rewards |
     | `scenario` | after a reset: the `Scenario` |
     | `index`, `reference_cost` | after a reset, with a bank: index of the scenario, and cost of its optimum |
+    | `lower_bound` | after a reset, with a bank: proved lower bound of the cost, NaN if none is known |
 
     ## Arguments
     | Argument | Default | Meaning |
@@ -283,6 +284,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         info["scenario"] = self.scenario
         if isinstance(choice, int) and self.bank is not None:
             info["index"], info["reference_cost"] = choice, float(self.bank.costs[choice])
+            info["lower_bound"] = float(self.bank.lower_bounds[choice])
         observation = self._observe()
         if self.render_mode == "human":
             self.render()

@@ -43,7 +43,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """`NavigateEnv` for many robots. The episodes of each are identical to those of a single environment.
 
     Infos are arrays with masks, as in Gymnasium; `pose` is (num_envs, 3). With a bank, the infos of a reset contain
-    `index` and `reference_cost` but not `scenario`, see the property `scenarios`.
+    `index`, `reference_cost` and `lower_bound`, but not `scenario`, see the property `scenarios`.
 
     Args:
         num_envs: number of robots.
@@ -332,9 +332,9 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return infos
 
     def _reset_infos(self, restarted: np.ndarray) -> dict[str, Any]:
-        """Return the infos that only a reset adds: the scenario, or its index in the bank and its reference cost."""
+        """Return the infos that only a reset adds: the scenario, or its index and costs in the bank."""
         indices = np.zeros(self.num_envs, dtype=np.int64)
-        costs = np.zeros(self.num_envs)
+        costs, bounds = np.zeros(self.num_envs), np.full(self.num_envs, np.nan)
         scenarios = np.full(self.num_envs, None, dtype=object)
         from_bank = np.zeros(self.num_envs, dtype=bool)
         for i in np.flatnonzero(restarted).tolist():
@@ -347,7 +347,9 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if from_bank.any():
             assert self.bank is not None  # an index always refers to a bank
             costs[from_bank] = self.bank.costs[indices[from_bank]]
-            infos.update(_add_masks({"index": indices, "reference_cost": costs}, from_bank))
+            bounds[from_bank] = self.bank.lower_bounds[indices[from_bank]]
+            found = {"index": indices, "reference_cost": costs, "lower_bound": bounds}
+            infos.update(_add_masks(found, from_bank))
         if (restarted & ~from_bank).any():
             infos.update(_add_masks({"scenario": scenarios}, restarted & ~from_bank))
         return infos

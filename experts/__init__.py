@@ -21,6 +21,7 @@ from leapnav.experts.solve import solve
 
 if TYPE_CHECKING:
     from leapnav.experts.bounds.plotting import plot_tube
+    from leapnav.experts.data.bank_bounds import prove_bank
     from leapnav.experts.data.banks import build_bank
     from leapnav.experts.data.demonstrations import load_demonstrations
     from leapnav.experts.data.rollouts import check_dataset, rollout
@@ -55,6 +56,7 @@ __all__ = [
     "minimum_time",
     "plot_extremal",
     "plot_tube",
+    "prove_bank",
     "rollout",
     "shortest_horizon",
     "solve",
@@ -70,6 +72,7 @@ _LAZY = {
     "load_demonstrations": "leapnav.experts.data.demonstrations",
     "plot_extremal": "leapnav.experts.plotting",
     "plot_tube": "leapnav.experts.bounds.plotting",
+    "prove_bank": "leapnav.experts.data.bank_bounds",
     "rollout": "leapnav.experts.data.rollouts",
 }
 

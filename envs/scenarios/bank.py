@@ -20,6 +20,7 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 | `states` | (sum of N_i, n_q) float32 | x, y (m), heading (rad, unwrapped), further states |
 | `controls` | (sum of N_i, n_u) float32 | for the unicycle speed (m/s), turn rate (rad/s) |
 | `costates` | (sum of N_i, n_q) float32 | lambda, the gradient of the cost-to-go |
+| `lower_bounds` | (n,) float64 | proved lower bounds of the cost, NaN where none is known; only after `leapnav bank prove` |
 
 Attributes of the file: `format` ("leapnav-bank"), `version` (4), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
@@ -67,9 +68,10 @@ TYPES = {
     "states": "<f4",
     "controls": "<f4",
     "costates": "<f4",
+    "lower_bounds": "<f8",
 }
-
-OPTIONAL = "horizons"  # the dataset that banks with a fixed horizon do not have
+DURATIONS, LOWER_BOUNDS = "horizons", "lower_bounds"
+OPTIONAL = (DURATIONS, LOWER_BOUNDS)  # datasets that not all banks have
 _TABLES = ("tasks", "certificates", "states", "controls", "costates")  # datasets with columns
 
 
@@ -89,6 +91,7 @@ class Reference:
         states (N, n): x, y (m), heading (rad, unwrapped) and further states, float32.
         controls (N, m): the robot's controls, float32.
         costates (N, n): gradient of the cost-to-go, float32.
+        lower_bound: no collision-free path costs less; None if nothing is proved.
 
     """
 
@@ -99,6 +102,7 @@ class Reference:
     states: np.ndarray
     controls: np.ndarray
     costates: np.ndarray
+    lower_bound: float | None = None
 
 
 class ScenarioBank(Sequence[Scenario]):
@@ -116,6 +120,7 @@ class ScenarioBank(Sequence[Scenario]):
         costs (n,): optimal costs J*.
         second_costs (n,): costs of the second-best local optima found, NaN if there is none.
         certificates (n, 4): boundary residual, defect, drift of H, clearance (m).
+        lower_bounds (n,): proved lower bounds of the cost, see `leapnav.experts.prove_bank`; NaN where none is known.
         draws (n,): indices of the random draws that produced the scenarios.
         tasks (n, K): see `leapnav.envs.scenarios.scenario`.
         horizon: kind of the horizon of all scenarios, "fixed" or "free".
@@ -136,6 +141,7 @@ class ScenarioBank(Sequence[Scenario]):
     costs: np.ndarray
     second_costs: np.ndarray
     certificates: np.ndarray
+    lower_bounds: np.ndarray
     draws: np.ndarray
     tasks: np.ndarray
     horizon: str
@@ -160,7 +166,7 @@ class ScenarioBank(Sequence[Scenario]):
                         f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads "
                         f"{VERSION}; build the bank again with `leapnav bank build`"
                     )
-                locations = {name: _locate(file[name], name) for name in TYPES if name in file or name != OPTIONAL}
+                locations = {name: _locate(file[name], name) for name in TYPES if name in file or name not in OPTIONAL}
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
             self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
             self.rejected = dict(json.loads(attributes["rejected"]))
@@ -184,8 +190,10 @@ class ScenarioBank(Sequence[Scenario]):
         self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
         self.tasks = arrays["tasks"]
-        self.horizon = "free" if OPTIONAL in arrays else "fixed"
-        self.horizons = arrays[OPTIONAL] if OPTIONAL in arrays else self.tasks[:, HORIZON]
+        self.horizon = "free" if DURATIONS in arrays else "fixed"
+        self.horizons = arrays[DURATIONS] if DURATIONS in arrays else self.tasks[:, HORIZON]
+        unknown = np.full(len(self.costs), math.nan)
+        self.lower_bounds = arrays.get(LOWER_BOUNDS, unknown)
         self._scenarios: dict[int, Scenario] = {}
         self._check_widths()
 
@@ -198,7 +206,7 @@ class ScenarioBank(Sequence[Scenario]):
         """Raise BankError unless the numbers of columns are those of the robot."""
         if len(self) and self[0].horizon_kind != self.horizon:
             raise BankError(
-                f"{self.path}: not a scenario bank, or damaged: {OPTIONAL}: expected if the horizon is free"
+                f"{self.path}: not a scenario bank, or damaged: {DURATIONS}: expected if the horizon is free"
             )
         n, m = self.robot.sizes()
         columns = len(self[0].task) if len(self) else self.tasks.shape[1]
@@ -297,7 +305,7 @@ class ScenarioBank(Sequence[Scenario]):
         """
         i = self._check_index(index)
         start, end = self._span("path_ends", i)
-        second = float(self.second_costs[i])
+        second, bound = float(self.second_costs[i]), float(self.lower_bounds[i])
         residual, defect, drift, clearance = self.certificates[i].tolist()
         return Reference(
             cost=float(self.costs[i]),
@@ -307,6 +315,7 @@ class ScenarioBank(Sequence[Scenario]):
             states=self.states(i),
             controls=self._array("controls")[start:end],
             costates=self._array("costates")[start:end],
+            lower_bound=None if math.isnan(bound) else bound,
         )
 
     def field(self, index: int) -> np.ndarray:
@@ -390,7 +399,7 @@ def _check_lengths(arrays: Mapping[str, np.ndarray]) -> None:
     for name in (
         "scenario_ends",
         "tasks",
-        OPTIONAL,
+        *OPTIONAL,
         "field_ends",
         "draws",
         "second_costs",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import Unicycle
-from leapnav.envs.scenarios.bank import FORMAT, OPTIONAL, TYPES, VERSION, attribute_bytes, digest
+from leapnav.envs.scenarios.bank import DURATIONS, FORMAT, LOWER_BOUNDS, TYPES, VERSION, attribute_bytes, digest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import atomic_path
 
@@ -95,7 +96,7 @@ def write_bank(
         "costates": np.concatenate([np.empty((0, n)), *(entry.costates for entry in entries)]),
     }
     if kinds == ["free"]:
-        columns[OPTIONAL] = [entry.horizon for entry in entries]
+        columns[DURATIONS] = [entry.horizon for entry in entries]
     arrays = {name: np.asarray(values, dtype=TYPES[name]) for name, values in columns.items()}
     attributes = {
         "format": FORMAT,
@@ -117,3 +118,31 @@ def write_bank(
         file.attrs["checksums"] = json.dumps({**checksums, "attributes": digest(attribute_bytes(attributes))})
         for name, array in arrays.items():
             file.create_dataset(name, data=array)
+
+
+def write_lower_bounds(path: str | os.PathLike[str], lower_bounds: np.ndarray) -> None:
+    """Add lower bounds to a bank, or replace them, atomically.
+
+    Args:
+        path: the file of the bank.
+        lower_bounds (n,): see `ScenarioBank`.
+
+    Raises:
+        ValueError: the number of bounds is not that of the scenarios.
+
+    """
+    import h5py
+
+    with atomic_path(path) as partial:
+        shutil.copyfile(path, partial)
+        with h5py.File(partial, "r+") as file:
+            costs: Any = file["costs"]
+            count = len(costs)
+            if lower_bounds.shape != (count,):
+                raise ValueError(f"lower_bounds: expected the shape ({count},), got {lower_bounds.shape}")
+            array = lower_bounds.astype(TYPES[LOWER_BOUNDS])
+            if LOWER_BOUNDS in file:
+                del file[LOWER_BOUNDS]
+            file.create_dataset(LOWER_BOUNDS, data=array)
+            checksums = json.loads(str(file.attrs["checksums"]))
+            file.attrs["checksums"] = json.dumps({**checksums, LOWER_BOUNDS: digest(array)})

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from joblib import Parallel
@@ -23,13 +23,9 @@ from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, check_robot
 from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
-from leapnav.experts.data.store import Arrays, ResumableStore, discard
+from leapnav.experts.data.store import ONE, Arrays, ResumableStore, discard
 from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.problem.extremal import Status
-
-# Joblib's batch size: with one task, an interruption loses only the scenarios that are being solved. Joblib declares a
-# string but accepts an integer.
-ONE = cast(str, 1)
 
 
 class Rejection(Enum):

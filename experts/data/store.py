@@ -16,6 +16,9 @@ from tqdm.std import tqdm
 from leapnav.envs.utils.files import atomic_path, exclusive, write_text
 
 Arrays = Mapping[str, np.ndarray]
+# Joblib's batch size: with one task, an interruption loses only the tasks at work. Joblib declares a string but accepts
+# an integer.
+ONE = cast(str, 1)
 DISCARDED = "-done"  # added to the name of a directory that is being removed
 
 

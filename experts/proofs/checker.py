@@ -100,13 +100,13 @@ def check_proof(proof: Proof) -> float:
     limit = length_limit(proof)
     _check_grid(proof)
     cells = CellSet.full(Grid.over(scenario.arena, proof.spacing, proof.headings))
-    level = 0
+    level, table = 0, cast(Functionals | None, None)
     for number, stage in enumerate(proof.stages):
         name = f"stage {number}"
         if not (isinstance(cast(object, stage.level), int) and level <= stage.level <= MAX_LEVEL):
             raise ProofError(f"{name}: level: expected {level} to {MAX_LEVEL}, got {stage.level}")
         while level < stage.level:
-            cells, level = cells.refined(), level + 1
+            cells, level, table = cells.refined(), level + 1, None
         full = whole(cells.grid, _stage_layout(cells.grid, stage.blocks, name))
         cost = running_cost(scenario, cells.grid, cells.columns() | full.columns())
         free = full.without(~np.isfinite(cost.lowest)).mask
@@ -114,7 +114,8 @@ def check_proof(proof: Proof) -> float:
         if placed is None:
             raise ProofError(f"{name}: blocks: some cells are neither excluded nor in a block")
         cells = placed
-        table = functionals(cells.grid, scenario.robot.metric(scenario.cost), cost.squares.shape[2])
+        if table is None:
+            table = functionals(cells.grid, scenario.robot.metric(scenario.cost), cost.squares.shape[2])
         bounds = []
         for side, spline, pose in (("start", stage.start, ends[0]), ("goal", stage.goal, ends[1])):
             try:

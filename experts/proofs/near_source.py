@@ -20,7 +20,7 @@ from leapnav.experts.proofs.cells import (
 )
 from leapnav.experts.proofs.gauge import SOURCE, Source, gauge, gauge_minimum
 
-MAX_HALVINGS = 3  # of a cell, for the bound of the excess
+MAX_HALVINGS = 2  # of a cell, for the bound of the excess
 
 
 def cells_near(source: Source, cells: CellSet, free: np.ndarray, radius: float) -> np.ndarray:

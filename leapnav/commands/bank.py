@@ -1,7 +1,8 @@
-"""`leapnav bank build` and `leapnav bank show`: scenario banks."""
+"""`leapnav bank build`, `leapnav bank show` and `leapnav bank prove`: scenario banks."""
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -75,19 +76,18 @@ class Show:
     verify: bool = False
     """Search every scenario again with about 100 times the effort (seconds each) and report lower costs."""
     json: Path | None = None
-    """JSON file of name, cost, horizon (s) and clearance (m) of every scenario, and of the results of --verify; "-" for
-    standard output."""
+    """JSON file of name, cost, horizon (s), clearance (m) and lower bound of every scenario, and of the results of
+    --verify; "-" for standard output."""
     workers: int = os.cpu_count() or 1
     """Number of processes of --verify."""
 
     def run(self) -> int:
         """Print the summary, draw the picture and, with `verify`, search again."""
-        from leapnav.envs.scenarios.bank import BANK_DIRECTORY, ScenarioBank
+        from leapnav.envs.scenarios.bank import ScenarioBank
         from leapnav.envs.utils.validation import check_at_least
         from leapnav.experts.plotting import plot_bank
 
-        shipped = BANK_DIRECTORY / f"{self.file}.bank"
-        bank = ScenarioBank(shipped if not self.file.exists() and shipped.exists() else self.file)
+        bank = ScenarioBank(_find(self.file))
         plot = self.plot or Path(bank.path.with_suffix(".png").name)
         check_at_least("count", self.count, 0)
         check_outputs(self.json, plot)
@@ -102,9 +102,10 @@ class Show:
                 "cost": float(cost),
                 "horizon": float(horizon),
                 "clearance": float(clearance),
+                "lower_bound": None if math.isnan(bound) else float(bound),
             }
-            for scenario, cost, horizon, clearance in zip(
-                bank, bank.costs, bank.horizons, bank.certificates[:, 3], strict=True
+            for scenario, cost, horizon, clearance, bound in zip(
+                bank, bank.costs, bank.horizons, bank.certificates[:, 3], bank.lower_bounds, strict=True
             )
         ]
         code = self._verify(bank, rows) if self.verify else 0
@@ -137,17 +138,59 @@ class Show:
 
 
 @dataclass(frozen=True)
+class Prove:
+    """Prove lower bounds of the cost of the scenarios of a bank, check the proofs, and store the bounds in the bank.
+
+    Scenarios with a bound of at most this gap are skipped. The same command resumes after an interruption.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Bank file."""
+    gap: float = 0.05
+    """Relative optimality gap to prove."""
+    time_limit: float = 60.0
+    """Time (s) for each scenario, after which the best bound proved so far is stored."""
+    count: int | None = None
+    """Number of scenarios, from the first of the bank; by default all."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes, each with one thread."""
+    json: Path | None = None
+    """JSON file of the results of all scenarios that were not skipped; "-" for standard output."""
+
+    def run(self) -> int:
+        """Prove, and print the distribution of the gaps."""
+        from leapnav.envs.scenarios.bank import ScenarioBank
+        from leapnav.experts.data.bank_bounds import prove_bank
+
+        check_outputs(self.json)
+        results = prove_bank(
+            self.file, gap=self.gap, time_limit=self.time_limit, count=self.count, workers=self.workers
+        )
+        for result in results:
+            if result.fault:
+                print(f"{result.name}: no lower bound: {result.fault}")
+        bank = ScenarioBank(self.file)
+        print(f"wrote {self.file}: {len(results)} scenarios examined")
+        for line in gap_summary(bank):
+            print(line)
+        write_json([asdict(result) for result in results], self.json)
+        return 0
+
+
+@dataclass(frozen=True)
 class Bank:
-    """Build and inspect scenario banks: files of scenarios with their certified optima."""
+    """Build and inspect scenario banks, files of scenarios with their certified optima, and prove lower bounds."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Show, tyro.conf.subcommand("show")]
+        Annotated[Build, tyro.conf.subcommand("build")]
+        | Annotated[Show, tyro.conf.subcommand("show")]
+        | Annotated[Prove, tyro.conf.subcommand("prove")]
     ]
 
     @property
     def resumption(self) -> str | None:
         """What to do after an interruption."""
-        return "the same command resumes where it stopped" if isinstance(self.action, Build) else None
+        return "the same command resumes where it stopped" if isinstance(self.action, Build | Prove) else None
 
     @property
     def json(self) -> Path | None:
@@ -155,8 +198,33 @@ class Bank:
         return self.action.json
 
     def run(self) -> int:
-        """Build or show a bank."""
+        """Build a bank, show it, or prove its bounds."""
         return self.action.run()
+
+
+def gap_summary(bank: ScenarioBank) -> list[str]:
+    """Return the lines that describe the proved lower bounds of a bank, none if it has no bounds."""
+    import numpy as np
+
+    gaps = 1.0 - bank.lower_bounds / bank.costs
+    gaps = 100 * gaps[np.isfinite(gaps)]
+    if not len(gaps):
+        return []
+    median, high = np.percentile(gaps, [50, 90])
+    counts = ", ".join(f"{limit} % in {(gaps < limit * (1 + 1e-6)).sum()}" for limit in (1, 2, 5, 10, 20))
+    return [
+        f"  lower bounds       proved for {len(gaps)} of {len(bank)} scenarios",
+        f"  proved gap         median {median:.2f} %, 90th percentile {high:.2f} %, maximum {gaps.max():.2f} %",
+        f"  gap at most        {counts}",
+    ]
+
+
+def _find(file: Path) -> Path:
+    """Return a file, or that of an included bank if its name is given."""
+    from leapnav.envs.scenarios.bank import BANK_DIRECTORY
+
+    shipped = BANK_DIRECTORY / f"{file}.bank"
+    return shipped if not file.exists() and shipped.exists() else file
 
 
 def _print_summary(bank: ScenarioBank) -> None:
@@ -177,6 +245,8 @@ def _print_summary(bank: ScenarioBank) -> None:
     print(f"  maximum defect     {defect:.1e}")
     print(f"  maximum drift of H {drift:.1e}")
     print(f"  with alternatives  {np.isfinite(excess).sum()}")
+    for line in gap_summary(bank):
+        print(line)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for column in ("", "minimum", "median", "maximum"):
         table.add_column(column, justify="right", no_wrap=True)

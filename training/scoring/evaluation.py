@@ -109,6 +109,7 @@ class Episode:
         reference_clearance: minimum clearance of the optimum (m).
         reversing: whether the optimum contains backward driving.
         states (K + 1, n): the states before and after each environment step.
+        lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
 
     """
 
@@ -125,6 +126,7 @@ class Episode:
     reference_clearance: float
     reversing: bool
     states: np.ndarray
+    lower_bound: float = math.nan
 
     @property
     def optimal_cost(self) -> float:
@@ -154,6 +156,17 @@ class Episode:
         slips: its path then violates the unicycle model.
         """
         return (self.cost - self.reached_reference) / self.reached_reference
+
+    @property
+    def true_regret(self) -> tuple[float, float]:
+        """Bracket of the regret with respect to the true optimal cost of the scenario, which no search need have found.
+
+        That cost is between `lower_bound` and `reference_cost`, the costs of paths to the goal itself. NaN if no lower
+        bound is known.
+        """
+        if math.isnan(self.lower_bound):
+            return math.nan, math.nan
+        return self.cost / self.reference_cost - 1.0, self.cost / self.lower_bound - 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes without the states, and SOC and regret."""
@@ -343,6 +356,7 @@ def _make_episode(
         reference_clearance=reference.certificate[3],
         reversing=bool(_speeds(reference).min() < -MIN_REVERSE_SPEED),
         states=states,
+        lower_bound=math.nan if reference.lower_bound is None else reference.lower_bound,
         **outcome,
     )
 

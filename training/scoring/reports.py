@@ -24,7 +24,7 @@ from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.comparison import Comparison
 from leapnav.training.scoring.evaluation import Episode
-from leapnav.training.scoring.scores import Interval, Score, profile
+from leapnav.training.scoring.scores import Bracket, Interval, Score, profile
 
 RATIOS = np.concatenate([np.linspace(1.0, 1.2, 81), np.linspace(1.2, 2.0, 41)[1:]])  # of the profiles
 # Columns of the table: title, attribute of `Score`, factor, decimals of the value and of its interval.
@@ -64,8 +64,19 @@ def print_scores(comparison: Comparison, console: Console | None = None) -> None
     console.print(table)
     if any(row.regret.value < 0 for row in scores):
         console.print(NEGATIVE_REGRET)
+    if any(row.true_regret.episodes for row in scores):
+        console.print("Regret with respect to the true optimum, between proved limits (medians):")
+        for row in scores:
+            console.print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
     if len(comparison.families) > 1:
         console.print(_family_table(comparison))
+
+
+def _bracket_text(bracket: Bracket) -> str:
+    if bracket.episodes == 0:
+        return "no successful episode in a scenario with a proved lower bound"
+    episodes = "1 episode" if bracket.episodes == 1 else f"{bracket.episodes} episodes"
+    return f"{100 * bracket.low:z.2f} to {100 * bracket.high:z.2f} % ({episodes})"
 
 
 def _family_table(comparison: Comparison) -> Table:

@@ -31,6 +31,21 @@ class Interval:
 
 
 @dataclass(frozen=True)
+class Bracket:
+    """The proved range of the regret with respect to the true optimal costs, see `Episode.true_regret`.
+
+    Attributes:
+        low, high: medians of both ends over the episodes; NaN if there are none.
+        episodes: number of successful episodes in scenarios with a proved lower bound, of all runs.
+
+    """
+
+    low: float
+    high: float
+    episodes: int
+
+
+@dataclass(frozen=True)
 class Score:
     """The statistics of a policy: one row of the table.
 
@@ -45,6 +60,7 @@ class Score:
         clearance: median over the episodes of the minimum clearance (m).
         mean_return: mean return.
         milliseconds: median computation time of one action (ms), mean over the runs.
+        true_regret: the range in which the regret with respect to the true optimal costs lies.
 
     """
 
@@ -59,6 +75,7 @@ class Score:
     clearance: Interval
     mean_return: Interval
     milliseconds: float
+    true_regret: Bracket
 
 
 def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> Score:
@@ -101,7 +118,18 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
         clearance=interval(lambda e: e.clearance, _median),
         mean_return=interval(lambda e: e.episode_return),
         milliseconds=float(np.mean([evaluation.milliseconds for evaluation in evaluations])),
+        true_regret=_bracket(evaluations),
     )
+
+
+def _bracket(evaluations: Sequence[Evaluation]) -> Bracket:
+    """Return the medians of both ends of the true regret."""
+    pairs = [e.true_regret for evaluation in evaluations for e in evaluation if e.success]
+    known = [pair for pair in pairs if not math.isnan(pair[0])]
+    if not known:
+        return Bracket(math.nan, math.nan, 0)
+    low, high = np.median(known, axis=0).tolist()
+    return Bracket(low, high, len(known))
 
 
 def profile(runs: Sequence[Evaluation], ratios: np.ndarray, seed: int = 0) -> np.ndarray:
