@@ -12,7 +12,7 @@ Repeated, the quantile is below 1 where the inequality has slack, so that S grow
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 from numba import float64
@@ -21,6 +21,7 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import NOTHING
 from leapnav.experts.bounds.eikonal import make_medium, solve_eikonal
 from leapnav.experts.bounds.projection import Constraints, project_once
+from leapnav.experts.bounds.prolongation import prolonged
 from leapnav.experts.proofs.cells import (
     BLOCK,
     EMPTY,
@@ -50,7 +51,9 @@ DEPTH, MAX_EXPONENT, WALL_DEPTH, WALL = 1.2, 8.0, 2.2, 50.0
 BINS_PER_SPACING = 2  # of the function of S
 SAMPLE = 2  # of the cells, one in so many along each axis determines the first function of S
 MIN_RATIO = 0.8  # of its quantile
+ACCEPTED = 1.02  # maximum ratio after projections, with a quantile of the ratios before
 ENOUGH = 1.003  # maximum ratio that is removed by a common factor
+KEPT_OFFSET = 0.7  # part of the offset of a spline by which it is lowered on the cells with half the spacing
 MORE_VISITS, FEW = 60, 0.25  # further visits while at most this fraction of the cells is pending
 
 
@@ -111,18 +114,27 @@ class Distance:
         ratios (m, 8, 8, 8): gradient ratios of `values`, 0 where they are not known.
         source: the gauge around the pose.
         radius, limit: see `leapnav.experts.proofs.proof.Spline`.
+        spline, offset: the last result, and its offset, see `Bound`.
+        lowest (m, 8, 8, 8): coefficients of a function that satisfies the inequality, which S should not be below: the
+            last result, or the last of the level before, minus infinity where it is not known; None at first.
+        cautious: whether a quantile of the ratios was too small at this level or the one before.
 
     """
 
     medium: Medium
     pose: tuple[float, float, float]
+    previous: InitVar[Distance | None] = None
     values: np.ndarray = field(init=False)
     ratios: np.ndarray = field(init=False)
     source: Source = field(init=False)
     radius: float = field(init=False)
     limit: float = field(init=False)
+    spline: Spline | None = field(init=False, default=None)
+    offset: float = field(init=False, default=0.0)
+    lowest: np.ndarray | None = field(init=False, default=None)
+    cautious: bool = field(init=False, default=False)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, previous: Distance | None) -> None:
         medium, cells = self.medium, self.medium.cells
         r_v, r_w = medium.metric
         spacing = cells.grid.spacing
@@ -131,6 +143,10 @@ class Distance:
         self.radius = min(math.sqrt(4 * SOURCE_WIDTH * spacing * math.sqrt(r_v * r_w)), largest - margin)
         self.limit = self.radius + margin
         self.source = make_source(self.pose, medium.metric, self.limit)
+        if previous is not None and previous.spline is not None:
+            self.cautious = previous.cautious
+            lowest = prolonged(previous.spline.values, previous.medium.cells.layout, cells.layout)
+            self.lowest = previous.spline.scale * lowest - KEPT_OFFSET * previous.offset
         self.solve()
 
     def solve(self) -> None:
@@ -182,13 +198,7 @@ class Distance:
         free = medium.free(cells)
         exempt = cells_near(self.source, cells, free, self.radius)
         required = cells.mask & ~exempt
-        self.values = self._rescaled(required, quantile)
-        pending = required.copy()
-        for visit in range(visits + MORE_VISITS):
-            count = project_once(self.values, cells.layout, required, pending, medium.cost, medium.constraints)
-            if count == 0 or (visit >= visits and pending.sum() > FEW * required.sum()):
-                break
-        worst = self.measure(required)
+        worst = self._project(cells, required, quantile, visits)
         kept, ratios = self.values, self.ratios
         if worst > ENOUGH:
             self.values = self._rescaled(required, 1.0)
@@ -197,8 +207,34 @@ class Distance:
         spline = Spline(self.values, scale, self.radius, self.limit)
         slope = source_slope(self.source, cells, free, medium.cost, medium.energy, self.limit)
         offset = source_offset(spline, self.source, cells, exempt, slope)
+        self.spline, self.offset, self.lowest = spline, offset, scale * spline.values
         self.values, self.ratios = kept.copy(), ratios
         return spline, Bound(spline.values, scale, offset)
+
+    def _project(self, cells: CellSet, required: np.ndarray, quantile: float, visits: int) -> float:
+        """Remove violations by the function of S and by projections; return the largest ratio that is left.
+
+        If it is too large, which happens where S must change over many cells, the maximum of the ratios replaces their
+        quantile. This is known from the level before for the first round of a level.
+        """
+        medium, values, ratios = self.medium, self.values, self.ratios
+        first = self.spline is None
+        worst = math.inf
+        for attempt in (1.0,) if first and self.cautious else (quantile, 1.0):
+            self.values, self.ratios = values, ratios
+            self.values = self._rescaled(required, attempt)
+            if self.lowest is not None:
+                np.maximum(self.values, self.lowest, out=self.values)
+            pending = required.copy()
+            for visit in range(visits + MORE_VISITS):
+                count = project_once(self.values, cells.layout, required, pending, medium.cost, medium.constraints)
+                if count == 0 or (visit >= visits and pending.sum() > FEW * required.sum()):
+                    break
+            worst = self.measure(required)
+            if worst <= ACCEPTED or self.lowest is None:
+                break
+            self.cautious = True
+        return worst
 
     def _rescaled(self, required: np.ndarray, quantile: float) -> np.ndarray:
         """Return the coefficients of a function of S whose slope is 1 / R(S), see the module."""

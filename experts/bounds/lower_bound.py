@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,10 +17,11 @@ from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts.bounds.distance import Distance, Medium
 from leapnav.experts.bounds.duality import best_energy
 from leapnav.experts.bounds.projection import make_constraints
+from leapnav.experts.bounds.tube import Tube
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import SolveError, Status
 from leapnav.experts.proofs.cells import CellSet, Grid
-from leapnav.experts.proofs.checker import Bound, is_proved, length_limit, spline_value, without_excluded
+from leapnav.experts.proofs.checker import length_limit, shortest_lengths, spline_value
 from leapnav.experts.proofs.inequality import functionals
 from leapnav.experts.proofs.proof import Pose, Proof, Spline, Stage, find_ends
 from leapnav.experts.proofs.running_cost import running_cost
@@ -28,12 +30,14 @@ from leapnav.experts.proofs.running_cost import running_cost
 SPACING_IN_RADII, SPACING_IN_ARENAS = 0.8, 1 / 24
 MAX_CELLS = 8_000_000  # of the first level
 MAX_LEVEL = 5
-# Quantile of the ratios and visits of the pending cells, per round of a level.
-ROUNDS = ((0.95, 8), (0.9, 10), (0.85, 10), *((0.8, 10),) * 9)
-PROGRESS = 0.93  # a level ends after a round, not the first, that leaves more than this fraction of the cells
+# Quantile of the ratios and visits of the pending cells, per round of a level; further rounds are as the last.
+ROUNDS = ((0.95, 8), (0.9, 10), (0.85, 10), (0.8, 10))
+# A level ends after a round, not the first, that leaves more than a fraction of the cells: the first fraction if there
+# is time for the next level, otherwise the second. If there is time, it ends after MAX_ROUNDS.
+PROGRESS, STALLED, MAX_ROUNDS = 0.93, 0.99, 12
 TOLERANCE = 1.001  # gradient ratio above which a control point is moved
-# Largest Phi of the eikonal equation, relative to that on the optimum, and in E.
-CAP_FACTOR, CAP_IN_ENERGY = 1.15, 0.75
+# Largest Phi of the eikonal equation, relative to that on the optimum, and in E: of the first level and of all others.
+CAP_FACTOR, FIRST_CAP_IN_ENERGY, CAP_IN_ENERGY = 1.15, 0.75, 1.2
 SLACK = 1e-6  # by which a proved value is smaller than what the functions give, relative
 
 
@@ -147,8 +151,37 @@ def lower_bound(
     return _Producer(scenario, ends, optimum, gap, threads).run(start, time_limit)
 
 
+@dataclass(frozen=True)
+class _Pace:
+    """How fast a level is computed.
+
+    Attributes:
+        end: when the time is over (s).
+        count: number of cells of the level.
+        begun: when the level began (s).
+
+    """
+
+    end: float
+    count: int
+    begun: float = field(default_factory=time.perf_counter)
+
+    def is_over(self) -> bool:
+        """Whether the time is over."""
+        return time.perf_counter() > self.end
+
+    def affordable(self) -> float:
+        """Return the number of cells of a level that the time left allows, as fast as this level until now."""
+        now = time.perf_counter()
+        return (self.end - now) * self.count / (now - self.begun)
+
+
 class _Producer:
-    """The construction of a proof: its stages, and the cells that are left."""
+    """The construction of a proof: its stages, and the cells that are left.
+
+    What the stages exclude is known for each smaller L as well, see `Tube`: when the time is over, or too short for the
+    next level, a smaller L is chosen.
+    """
 
     def __init__(
         self, scenario: Scenario, ends: tuple[Pose, Pose], optimum: Reference, gap: float, threads: int
@@ -169,73 +202,88 @@ class _Producer:
                 f"horizon: lower bounds need a positive kinetic energy minus proximity cost on the optimum, got "
                 f"{self.energy:.4g}; the horizon is too long"
             )
-        self.highest = max(CAP_IN_ENERGY * self.energy, CAP_FACTOR * float(proximity.max()))
+        self.highest = CAP_FACTOR * float(proximity.max())
         grid = first_grid(scenario)
         if gap < self.duality_gap + 1e-3:
             gap = min(gap + self.duality_gap, 0.999)
-        empty = Proof(scenario, (1.0 - gap) * self.cost, self.energy, grid.spacing, grid.headings, ())
-        self.proof, self.cells, self.stages = empty, CellSet.full(grid), list[Stage]()
-        self.limit = length_limit(empty)
-        self.best, self.free_cells, self.tubes = -math.inf, 0, list[CellSet]()
+        target = Proof(scenario, (1.0 - gap) * self.cost, self.energy, grid.spacing, grid.headings, ())
+        limit = length_limit(target)
+        # Larger by the slack, which a proved value is smaller by.
+        self.shift, self.limit = limit - target.value, limit + SLACK * max(1.0, abs(limit))
+        self.tube = Tube.full(grid)
+        self.stages, self.levels, self.free_cells = list[Stage](), list[CellSet](), 0
+        self.distances: list[Distance | None] = [None, None]
+        self.proved = -math.inf  # the largest L that is proved
 
     def run(self, start: float, time_limit: float) -> LowerBound:
         """Add stages until the value is proved or the time is over."""
-        proved, level = False, 0
-        while not proved:
-            proved = self._level(level, start + time_limit)
-            self.tubes.append(self.cells)
-            elapsed = time.perf_counter() - start
-            if proved or level == MAX_LEVEL or elapsed > time_limit:
+        for level in range(MAX_LEVEL + 1):
+            pace = _Pace(start + time_limit, len(self.tube.cells))
+            self._level(level, pace)
+            self.levels.append(self.tube.cells)
+            if self.proved == self.limit or level == MAX_LEVEL or not self._refine(pace.affordable()):
                 break
-            level += 1
-            self.cells = self.cells.refined()
-        value = self.proof.value if proved else self.best
-        proof = Proof(self.scenario, value, self.energy, self.proof.spacing, self.proof.headings, tuple(self.stages))
-        left = len(self.cells) / 8**level / self.free_cells
+        if self.proved < self.limit:
+            self.proved = self.tube.separating_length(self.ends, self.proved, self.limit)
+        left = len(self.tube.below(self.proved, self.ends[0]).cells) / 8 ** (len(self.levels) - 1)
+        value = self.proved - self.shift - SLACK * max(1.0, abs(self.proved))
+        first, last = self.levels[0].grid, self.levels[-1].grid
+        proof = Proof(self.scenario, value, self.energy, first.spacing, first.headings, tuple(self.stages))
         return LowerBound(
             value=value,
             gap=1.0 - value / self.cost,
             seconds=time.perf_counter() - start,
-            resolution=self.cells.grid.spacing,
+            resolution=last.spacing,
             duality_gap=self.duality_gap,
-            excluded=1.0 - left,
+            excluded=1.0 - left / self.free_cells,
             proof=proof,
-            tubes=tuple(self.tubes),
+            tubes=tuple(self.levels),
             free_cells=self.free_cells,
         )
 
-    def _level(self, level: int, end: float) -> bool:
-        """Add the stages of a level; return whether the value is proved."""
-        scenario, grid = self.scenario, self.cells.grid
-        cost = running_cost(scenario, grid, self.cells.columns())
-        cells = self.cells.without(~np.isfinite(cost.lowest)).with_margin()
-        cost = running_cost(scenario, grid, cells.columns())
+    def _level(self, level: int, pace: _Pace) -> None:
+        """Add the stages of a level."""
+        scenario, cells = self.scenario, self.tube.cells.with_margin()
+        cost = running_cost(scenario, cells.grid, cells.columns())
+        cells = cells.without(~np.isfinite(cost.lowest)).with_margin()
+        self.tube = self.tube.on(cells)
         if level == 0:
             self.free_cells = len(cells)
         metric = scenario.robot.metric(scenario.cost)
-        table = functionals(grid, metric, cost.squares.shape[2])
+        table = functionals(cells.grid, metric, cost.squares.shape[2])
         constraints = make_constraints(table, cost.squares, self.energy, TOLERANCE)
-        medium = Medium(cells, cost, table, constraints, metric, self.energy, self.highest)
-        distances = self._both(lambda pose: Distance(medium, pose), self.ends)
-        for number, (quantile, visits) in enumerate(ROUNDS):
-            current = cells
-            found = self._both(lambda distance: distance.improve(current, quantile, visits), distances)  # noqa: B023
+        highest = max((CAP_IN_ENERGY if level else FIRST_CAP_IN_ENERGY) * self.energy, self.highest)
+        medium = Medium(cells, cost, table, constraints, metric, self.energy, highest)
+        self.distances = self._both(lambda side: Distance(medium, self.ends[side], self.distances[side]), (0, 1))
+        for number in itertools.count():
+            quantile, visits = ROUNDS[min(number, len(ROUNDS) - 1)]
+            before = self.tube.cells
+            found = self._both(lambda distance: distance.improve(before, quantile, visits), self.distances)  # noqa: B023
             (first, start), (second, goal) = found
-            self.stages.append(_stage(level, cells, first, second))
-            before, cells = len(cells), without_excluded(cells, start, goal, self.limit)
-            if is_proved(cells, self.ends, start, self.limit):
-                self.cells = cells
-                return True
-            self.best = max(self.best, self._value(cells, start))
-            if time.perf_counter() > end or (number > 0 and len(cells) > PROGRESS * before):
-                break
-        self.cells = cells
-        return False
+            self.stages.append(_stage(level, before, first, second))
+            self.tube = self.tube.raised(shortest_lengths(before, start, goal)).below(self.limit, self.ends[0])
+            cells = self.tube.cells
+            if not cells.contains(self.ends[1]):
+                self.proved = self.limit
+                return
+            length = start.scale * spline_value(start.values, cells, self.ends[1]) - start.offset
+            self.proved = min(max(self.proved, length), self.limit)
+            if self.proved == self.limit or pace.is_over() or (number > 0 and len(cells) > STALLED * len(before)):
+                return
+            next_fits = level < MAX_LEVEL and 8 * len(cells) <= pace.affordable()
+            if next_fits and number > 0 and (len(cells) > PROGRESS * len(before) or number == MAX_ROUNDS - 1):
+                return
 
-    def _value(self, cells: CellSet, start: Bound) -> float:
-        """Return the bound that the function of the start proves at the goal."""
-        length = start.scale * spline_value(start.values, cells, self.ends[1]) - start.offset
-        return length - (self.limit - self.proof.value) - SLACK * max(1.0, abs(length))
+    def _refine(self, affordable: float) -> bool:
+        """Halve the spacing, with a smaller L if the next level had too many cells; return False if that is useless."""
+        largest = self.tube.length_with(int(affordable / 8))
+        if largest < self.limit:
+            tube = self.tube.below(largest, self.ends[0])
+            if not tube.cells.contains(self.ends[1]):
+                return False
+            self.limit, self.tube = largest, tube
+        self.tube = self.tube.refined()
+        return True
 
     def _both(self, function: Callable[[Any], Any], arguments: Sequence[Any]) -> list[Any]:
         """Apply a function to both arguments, in two threads if there are two."""

@@ -142,13 +142,9 @@ class CellSet:
     def refined(self) -> CellSet:
         """Return the set of the cells into which halving the spacing divides the cells of this set."""
         grid, used = self.grid.refined(), self.mask.any(axis=(1, 2, 3))
-        blocks, mask = self.layout.blocks[used], self.mask[used]
-        for axis in (1, 2, 3):
-            mask = mask.repeat(2, axis=axis)
-        mask = mask.reshape(-1, 2, BLOCK, 2, BLOCK, 2, BLOCK).transpose(0, 1, 3, 5, 2, 4, 6)
         offsets = np.argwhere(np.ones((2, 2, 2)))
-        children = (2 * blocks[:, None] + offsets).reshape(-1, 3)
-        return _in_order(grid, children, mask.reshape(-1, BLOCK, BLOCK, BLOCK))
+        layout = make_layout(grid, (2 * self.layout.blocks[used][:, None] + offsets).reshape(-1, 3))
+        return CellSet(grid, layout, divided(self.mask, self.layout, layout))
 
     def on(self, layout: Layout) -> CellSet | None:
         """Return the set on the blocks of another layout, or None if that does not contain all cells of the set."""
@@ -180,6 +176,13 @@ class CellSet:
         used[self.layout.blocks[:, 1], self.layout.blocks[:, 2]] = True
         return used.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
 
+    def connected_with(self, pose: tuple[float, float, float]) -> CellSet:
+        """Return the cells that are connected, by faces, edges or corners, with the cell of a pose."""
+        mask = np.zeros_like(self.mask)
+        if self.contains(pose):
+            connected(self.mask, self.layout, *self.grid.cell(pose), mask)
+        return CellSet(self.grid, self.layout, mask)
+
     def contains(self, pose: tuple[float, float, float]) -> bool:
         """Whether the cell of a pose belongs to the set."""
         k, i, j = self.grid.cell(pose)
@@ -192,12 +195,19 @@ def whole(grid: Grid, layout: Layout) -> CellSet:
     return CellSet(grid, layout, np.ones((len(layout.blocks), BLOCK, BLOCK, BLOCK), dtype=bool))
 
 
-def _in_order(grid: Grid, blocks: np.ndarray, mask: np.ndarray) -> CellSet:
-    """Return the set with masks of blocks in any order."""
-    layout = make_layout(grid, blocks)
-    ordered = np.empty_like(mask)
-    ordered[layout.slots[tuple(blocks.T)]] = mask
-    return CellSet(grid, layout, ordered)
+def divided(array: np.ndarray, layout: Layout, finer: Layout) -> np.ndarray:
+    """Return the numbers of cells (m, 8, 8, 8) for the cells into which halving the spacing divides them.
+
+    Args:
+        array: one number for each cell of the layout.
+        layout: the layout.
+        finer: a layout of the grid with half the spacing, whose blocks are parts of those of the layout.
+
+    """
+    parents, parts = layout.slots[tuple((finer.blocks // 2).T)], finer.blocks % 2 * (BLOCK // 2)
+    indices = np.arange(BLOCK) // 2 + parts[:, :, None]  # (m, 3, 8)
+    k, i, j = indices[:, 0, :, None, None], indices[:, 1, None, :, None], indices[:, 2, None, None, :]
+    return array[parents[:, None, None, None], k, i, j]
 
 
 @kernel(NOTHING(MASKS, LAYOUT, types.Array(boolean, 3, "C")))

@@ -28,9 +28,10 @@ goal, since (1) does not change with the sign of S.
 
 **Exclusion.** Let S_0 and S_1 be such functions for the start and the goal. A path in A with J < V through q satisfies
 S_0(q) + S_1(q) < L. So if s_0 + s_1 - k_0 - k_1 >= L on a cell, or s_0 - k_0 >= L, or s_1 - k_1 >= L, no path with
-J < V that stays in A meets the cell: all of them stay in the set without it. A proof consists of stages. The first has
-for A all cells that contain a collision-free point, each further one the cells that are left, after the spacing was
-halved or not. J >= V is proved once the cell of the start or of the goal is excluded, or s_0(q_1) - k_0 >= L.
+J < V that stays in A meets the cell: all of them stay in the cells that are left, and among these in those that are
+connected with the cell of q_0 by faces, edges or corners. A proof consists of stages. The first has for A all cells
+that contain a collision-free point, each further one the cells that are left, after the spacing was halved or not.
+J >= V is proved once the cell of the start or of the goal is not left, or s_0(q_1) - k_0 >= L.
 
 **Rounding.** Functions of cells are bounded by their control points, whose rounding errors are bounded by
 `Functionals.rounding`. Other errors are covered by margins: `ROUNDING` of the modules used, and of this one for L.
@@ -122,7 +123,7 @@ def check_proof(proof: Proof) -> float:
                 bounds.append(prove_bound(proof, spline, pose, cells, free, cost, table))
             except ProofError as error:
                 raise ProofError(f"{name}: {side}: {error}") from None
-        cells = without_excluded(cells, bounds[0], bounds[1], limit)
+        cells = without_excluded(cells, bounds[0], bounds[1], limit, ends[0])
         if is_proved(cells, ends, bounds[0], limit):
             return proof.value
     raise ProofError(f"value: the stages do not prove {proof.value!r}")
@@ -255,31 +256,35 @@ def worst_cell(cells: CellSet, ratios: np.ndarray) -> tuple[int, int, int]:
     return int(block[0] * BLOCK + k), int(block[1] * BLOCK + i), int(block[2] * BLOCK + j)
 
 
-def without_excluded(cells: CellSet, start: Bound, goal: Bound, limit: float) -> CellSet:
-    """Return the cells that are not excluded."""
-    mask = cells.mask.copy()
-    total = limit + start.offset + goal.offset
-    limits = Limits(start.scale, goal.scale, limit + start.offset, limit + goal.offset, total)
-    _exclude(start.values, goal.values, cells.layout, limits, mask)
-    return CellSet(cells.grid, cells.layout, mask)
+def without_excluded(cells: CellSet, start: Bound, goal: Bound, limit: float, pose: Pose) -> CellSet:
+    """Return the cells that are not excluded and are connected with the cell of the start, whose pose is given."""
+    left = CellSet(cells.grid, cells.layout, cells.mask & ~(shortest_lengths(cells, start, goal) >= limit))
+    return left.connected_with(pose)
 
 
-class Limits(NamedTuple):
-    """Factors of both splines, and what excludes a cell: a smallest value of the first, of the second or of the sum."""
+def shortest_lengths(cells: CellSet, start: Bound, goal: Bound) -> np.ndarray:
+    """Return the smallest value of L with which each cell is excluded (m, 8, 8, 8), 0 for other cells."""
+    lengths = np.zeros(cells.mask.shape)
+    shifts = Shifts(start.scale, goal.scale, start.offset, goal.offset)
+    _shortest(start.values, goal.values, cells.layout, cells.mask, shifts, lengths)
+    return lengths
+
+
+class Shifts(NamedTuple):
+    """Factors and offsets of both splines."""
 
     start_scale: float
     goal_scale: float
     start: float
     goal: float
-    total: float
 
 
-LIMITS = record_type(Limits, **dict.fromkeys(Limits._fields, float64))
+SHIFTS = record_type(Shifts, **dict.fromkeys(Shifts._fields, float64))
 
 
-@kernel(NOTHING(VALUES, VALUES, LAYOUT, LIMITS, MASKS))
-def _exclude(start, goal, layout, limits, mask):
-    """Remove the cells from a set that the smallest control points exclude."""
+@kernel(NOTHING(VALUES, VALUES, LAYOUT, MASKS, SHIFTS, float64[:, :, :, ::1]))
+def _shortest(start, goal, layout, mask, shifts, lengths):
+    """See `shortest_lengths`."""
     shape = (BLOCK + 2, BLOCK + 2, BLOCK + 2)
     first, second, total = np.empty(shape), np.empty(shape), np.empty(shape)
     points = np.empty((3, 3, 3))
@@ -288,17 +293,17 @@ def _exclude(start, goal, layout, limits, mask):
             continue
         gather(start, layout, b, first)
         gather(goal, layout, b, second)
-        first *= limits.start_scale
-        second *= limits.goal_scale
+        first *= shifts.start_scale
+        second *= shifts.goal_scale
         total[:] = first + second
         for k in range(BLOCK):
             for i in range(BLOCK):
                 for j in range(BLOCK):
                     if mask[b, k, i, j]:
-                        mask[b, k, i, j] = not (
-                            control_points(total, k + 1, i + 1, j + 1, points) >= limits.total
-                            or control_points(first, k + 1, i + 1, j + 1, points) >= limits.start
-                            or control_points(second, k + 1, i + 1, j + 1, points) >= limits.goal
+                        lengths[b, k, i, j] = max(
+                            control_points(total, k + 1, i + 1, j + 1, points) - shifts.start - shifts.goal,
+                            control_points(first, k + 1, i + 1, j + 1, points) - shifts.start,
+                            control_points(second, k + 1, i + 1, j + 1, points) - shifts.goal,
                         )
 
 

@@ -169,8 +169,11 @@ class Prove:
         for result in results:
             if result.fault:
                 print(f"{result.name}: no lower bound: {result.fault}")
+        if results:
+            print(f"wrote {self.file}; scenarios examined: {len(results)}")
+        else:
+            print(f"{self.file}: a gap of at most {100 * self.gap:g} % is already proved for all of these scenarios")
         bank = ScenarioBank(self.file)
-        print(f"wrote {self.file}: {len(results)} scenarios examined")
         for line in gap_summary(bank):
             print(line)
         write_json([asdict(result) for result in results], self.json)
