@@ -15,7 +15,7 @@ import pytest
 from leapnav.cli import main
 from leapnav.envs import BankError, NavigateEnv, NavigateVectorEnv, ScenarioBank
 from leapnav.envs.scenarios.bank_writing import write_lower_bounds
-from leapnav.experts import build_bank, prove_bank
+from leapnav.experts import ProofError, build_bank, prove_bank
 from leapnav.experts.data import bank_bounds
 from leapnav.training import GoToGoal, compare, evaluate, score
 from leapnav.training.scoring.reports import print_scores
@@ -111,10 +111,10 @@ def test_a_scenario_without_a_bound_is_reported(bank_file: Path, monkeypatch: py
 
 def test_a_bound_whose_proof_is_refused_is_not_stored(bank_file: Path, monkeypatch: pytest.MonkeyPatch):
     def refuse(_: Any) -> float:
-        raise bank_bounds.ProofError("stage 0: start: the gradient")
+        raise ProofError("stage 0: start: the gradient")
 
     monkeypatch.setattr(bank_bounds, "check_proof", refuse)
-    with pytest.raises(bank_bounds.ProofError):
+    with pytest.raises(ProofError):
         prove(bank_file, count=1)
     assert np.isnan(ScenarioBank(bank_file).lower_bounds).all()
 
@@ -170,7 +170,7 @@ def test_an_evaluation_brackets_the_true_regret(proved: Path, built: Path, capsy
         low, high = episode.true_regret
         assert low == episode.cost / episode.reference_cost - 1
         assert high == pytest.approx((1 + low) / (1 - GAP) - 1)
-    assert all(math.isnan(end) for end in result[2].true_regret)
+    assert all(math.isnan(end) for end in list(result)[2].true_regret)
     row = score("go-to-goal", result)
     chosen = [episode.true_regret for episode in known if episode.success]
     assert row.true_regret.episodes == len(chosen) > 0

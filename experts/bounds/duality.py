@@ -38,7 +38,7 @@ def best_energy(scenario: Scenario, cost: float, energy: float) -> Dual:
     Args:
         scenario: a scenario with a fixed horizon.
         cost: cost of its optimum.
-        energy: Hamiltonian of its optimum plus the time weight, positive.
+        energy: kinetic energy minus proximity cost on its optimum, positive.
 
     """
     assert scenario.horizon is not None

@@ -14,6 +14,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.bounds.distance import Distance, Medium
 from leapnav.experts.bounds.duality import best_energy
 from leapnav.experts.bounds.projection import make_constraints
@@ -38,6 +39,7 @@ PROGRESS, STALLED, MAX_ROUNDS = 0.93, 0.99, 12
 TOLERANCE = 1.001  # gradient ratio above which a control point is moved
 # Largest Phi of the eikonal equation, relative to that on the optimum, and in E: of the first level and of all others.
 CAP_FACTOR, FIRST_CAP_IN_ENERGY, CAP_IN_ENERGY = 1.15, 0.75, 1.2
+MIN_GAP = 1e-3  # apart from the duality gap
 SLACK = 1e-6  # by which a proved value is smaller than what the functions give, relative
 
 
@@ -125,9 +127,9 @@ def lower_bound(
         scenario: the scenario, with a unicycle or a differential drive, and fixed or free horizon.
         optimum: the best known path; None computes it with `find_optimum`.
         gap: the relative optimality gap to prove; if that is impossible because of the duality gap, their sum.
-        time_limit: time after which the best bound that is proved so far is returned (s); a level that has begun is
+        time_limit: time after which the best bound that is proved so far is returned (s); a step that has begun is
             finished first.
-        threads: 2 computes the distances from the start and from the goal at the same time.
+        threads: 1, or 2 to compute the distances from the start and from the goal at the same time.
 
     Returns:
         The lower bound. Its gap is larger than the argument if the time was not sufficient.
@@ -142,6 +144,7 @@ def lower_bound(
         raise ValueError(f"gap: expected a number between 0 and 1, got {gap!r}")
     if not time_limit > 0:
         raise ValueError(f"time_limit: expected a positive number (s), got {time_limit!r}")
+    check_at_least("threads", threads, 1)
     start = time.perf_counter()
     if optimum is None:
         found = find_optimum(scenario)
@@ -204,7 +207,7 @@ class _Producer:
             )
         self.highest = CAP_FACTOR * float(proximity.max())
         grid = first_grid(scenario)
-        if gap < self.duality_gap + 1e-3:
+        if gap < self.duality_gap + MIN_GAP:
             gap = min(gap + self.duality_gap, 0.999)
         target = Proof(scenario, (1.0 - gap) * self.cost, self.energy, grid.spacing, grid.headings, ())
         limit = length_limit(target)
