@@ -19,13 +19,14 @@ from leapnav.envs import (
     sample_scenario,
 )
 from leapnav.envs.utils.colors import OPTIMUM
-from leapnav.experts import ExpertPolicy, find_optimum, plot_extremal, solve
+from leapnav.experts import ExpertPolicy, find_optimum, lower_bound, plot_extremal, plot_tube, solve
 from leapnav.experts.plotting import draw_robot, draw_scenario
 from leapnav.training import evaluate, load_policy, plot_episodes, policy_environment
 
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 ROBOT_SCENARIOS = (("clutter", 11), ("rooms", 12), ("open", 4))  # families and seeds
 FAMILY_ROWS, FAMILY_INDICES = 3, (0, 1, 2)
+TUBE = 1  # index in the test bank of clutter
 # Family, index in the test bank, and number of steps of the expert, of the three frames.
 FRAMES = (("clutter", 7, 124), ("polygons", 0, 110), ("slalom", 0, 364))
 
@@ -85,6 +86,8 @@ def main() -> None:
     scenario = sample_scenario("clutter", 9)
     plot_extremal(solve(scenario, method="leapfrog", polish=False), IMAGES / "leapfrog.png", scenario)
     bank = ScenarioBank.shipped("clutter", "test")
+    optimum = find_optimum(bank[TUBE])
+    plot_tube(lower_bound(bank[TUBE], optimum, time_limit=600.0), IMAGES / "tube.png", optimum)
     evaluation = evaluate(load_policy("clutter"), bank, environment=policy_environment("clutter"), timed=False)
     plot_episodes([bank], evaluation.episodes, IMAGES / "episodes.png")
 

@@ -56,7 +56,7 @@ def bound(optimum: Optimum) -> LowerBound:
 def test_the_gap_is_proved_and_the_proof_is_accepted(bound: LowerBound, optimum: Optimum):
     assert bound.gap == pytest.approx(0.06, abs=1e-9)
     assert bound.value == pytest.approx(0.94 * optimum.cost)
-    assert 0.9 < bound.excluded <= 1.0
+    assert 0.9 < bound.excluded < 1.0
     assert check_proof(bound.proof) == bound.value
 
 

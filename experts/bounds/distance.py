@@ -3,8 +3,10 @@
 `Distance` solves the eikonal equation, and `improve` turns the solution into a spline that satisfies the inequality:
 
 1. A function of S, with slope 1 / R(S), where R is a quantile of the gradient ratios of the cells at this value of S.
-2. Projections onto the inequality of the cells that still violate it.
-3. The same function with R the maximum, or a common factor, for what is left.
+2. The maximum of this and the last result, that of the level before with half the spacing at first.
+3. Projections onto the inequality of the cells that still violate it. If violations remain that are large, 1 to 3 are
+   repeated with R the maximum of the ratios.
+4. The same function with R the maximum, or a common factor, for what is left.
 
 Repeated, the quantile is below 1 where the inequality has slack, so that S grows from round to round.
 """

@@ -74,9 +74,10 @@ class LowerBound:
         duality_gap: estimate of the gap that remains because the horizon is fixed, however fine the cells are: the
             distance of the optimum from the convex envelope of the optimal cost over the horizon, see
             `leapnav.experts.bounds.duality`; 0 with a free horizon.
-        excluded: fraction of the collision-free configuration space in which no path cheaper than `value` can run.
+        excluded: fraction of the collision-free configuration space that is outside of the last of `tubes`.
         proof: the proof, see `check_proof`.
-        tubes: for each spacing, the cells that a path cheaper than (1 - requested gap) times the cost may meet.
+        tubes: for each spacing, the cells that its stages leave for paths cheaper than `value`. If the last of them do
+            not connect start and goal, this completes the proof.
         free_cells: number of cells of the first level that contain a collision-free point.
 
     """
@@ -228,7 +229,7 @@ class _Producer:
                 break
         if self.proved < self.limit:
             self.proved = self.tube.separating_length(self.ends, self.proved, self.limit)
-        left = len(self.tube.below(self.proved, self.ends[0]).cells) / 8 ** (len(self.levels) - 1)
+        left = len(self.levels[-1]) / 8 ** (len(self.levels) - 1)
         value = self.proved - self.shift - SLACK * max(1.0, abs(self.proved))
         first, last = self.levels[0].grid, self.levels[-1].grid
         proof = Proof(self.scenario, value, self.energy, first.spacing, first.headings, tuple(self.stages))
@@ -264,11 +265,13 @@ class _Producer:
             found = self._both(lambda distance: distance.improve(before, quantile, visits), self.distances)  # noqa: B023
             (first, start), (second, goal) = found
             self.stages.append(_stage(level, before, first, second))
-            self.tube = self.tube.raised(shortest_lengths(before, start, goal)).below(self.limit, self.ends[0])
-            cells = self.tube.cells
+            self.tube = self.tube.raised(shortest_lengths(before, start, goal)).below(self.limit)
+            connected = self.tube.below(self.limit, self.ends[0])
+            cells = connected.cells
             if not cells.contains(self.ends[1]):
                 self.proved = self.limit
                 return
+            self.tube = connected
             length = start.scale * spline_value(start.values, cells, self.ends[1]) - start.offset
             self.proved = min(max(self.proved, length), self.limit)
             if self.proved == self.limit or pace.is_over() or (number > 0 and len(cells) > STALLED * len(before)):

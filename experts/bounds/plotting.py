@@ -23,8 +23,8 @@ N_POINTS = 400  # points of a path
 def plot_tube(bound: LowerBound, path: str | os.PathLike[str] | None = None, optimum: Optimum | None = None) -> Figure:
     """Plot, for each spacing of the cells, where a path cheaper than the lower bound has not been excluded.
 
-    The darker a position, the more headings are left. The optimum is drawn, and its alternatives: dashed if the proof
-    excludes them, since they leave the cells.
+    The darker a position, the more headings are left. The optimum is drawn, and its alternatives: dashed if they leave
+    the cells, so that they cost more than the lower bound.
 
     Args:
         bound: the lower bound.

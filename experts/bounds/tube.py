@@ -44,10 +44,10 @@ class Tube:
         """Return the tube after a further stage."""
         return Tube(self.cells, np.maximum(self.lengths, lengths.astype(np.float32)))
 
-    def below(self, limit: float, start: Pose) -> Tube:
-        """Return the cells that are left with some L, and connected with the start."""
-        mask = self.cells.mask & (self.lengths < limit)
-        return Tube(CellSet(self.cells.grid, self.cells.layout, mask).connected_with(start), self.lengths)
+    def below(self, limit: float, start: Pose | None = None) -> Tube:
+        """Return the cells that are left with some L, if a start is given those that are connected with it."""
+        left = CellSet(self.cells.grid, self.cells.layout, self.cells.mask & (self.lengths < limit))
+        return Tube(left if start is None else left.connected_with(start), self.lengths)
 
     def refined(self) -> Tube:
         """Return the tube with half the spacing."""
