@@ -72,6 +72,10 @@ def test_a_saved_proof_is_the_same(bound: LowerBound, tmp_path: Path):
     assert check_proof(loaded) == bound.value
 
 
+def test_the_time_may_be_unlimited(optimum: Optimum):
+    assert lower_bound(SCENARIO, optimum, gap=0.2, time_limit=math.inf).gap == pytest.approx(0.2, abs=1e-12)
+
+
 @pytest.mark.parametrize("time_limit", [1e-3, 0.5, 2.0])
 def test_an_early_answer_is_proved(optimum: Optimum, time_limit: float):
     early = lower_bound(SCENARIO, optimum, gap=0.001, time_limit=time_limit)
@@ -247,6 +251,7 @@ def test_other_false_claims_are_refused(bound: LowerBound, optimum: Optimum):
         (replace(proof, headings=proof.headings + 4), "headings"),
         (replace(proof, spacing=math.nan), "spacing"),
         (replace(proof, spacing=-0.2), "spacing"),
+        (replace(proof, spacing=1e-5), "cells"),
         (replace(proof, energy=1e300), "energy"),
         (changed(proof, 0, start=replace(first.start, scale=math.inf)), "finite values, scale"),
         (replace(proof, stages=()), "do not prove"),
@@ -259,6 +264,7 @@ def test_other_false_claims_are_refused(bound: LowerBound, optimum: Optimum):
         (changed(proof, 0, start=replace(first.start, values=first.start.values.astype(float))), "float32"),
         (changed(proof, 0, start=replace(first.start, scale=-1.0)), "positive scale"),
         (changed(proof, 0, start=replace(first.start, radius=first.start.limit * 2)), "radius"),
+        (changed(proof, 0, start=replace(first.start, radius=1e-9, limit=1e-9)), "limit: radius"),
     ):
         with pytest.raises(ProofError, match=message):
             check_proof(false)

@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from leapnav.envs.scenarios.families import sample_scenario
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts.bounds.lower_bound import first_grid
-from leapnav.experts.proofs.cells import Grid
+from leapnav.experts.proofs.cells import CellSet, Grid
+from leapnav.experts.proofs.checker import check_proof
 from leapnav.experts.proofs.gauge import gauge, gauge_minimum, gradient_bound, make_source
 from leapnav.experts.proofs.inequality import functionals, largest_square
 from leapnav.experts.proofs.intervals import Interval
+from leapnav.experts.proofs.proof import Proof, ProofError, Spline, Stage
 from leapnav.experts.proofs.running_cost import running_cost
 
 
@@ -61,7 +64,7 @@ def test_the_bound_of_the_gauge_gradient_holds_and_is_close(radius: float, rng: 
     assert largest <= 1.0 + 1e-6
     assert largest > 0.95
     assert gradient_bound(radius) >= 1.0
-    with pytest.raises(ValueError, match="radius: expected a number in"):
+    with pytest.raises(ValueError, match="radius: expected a number from"):
         gradient_bound(3.0)
 
 
@@ -106,3 +109,26 @@ def test_control_points_bound_the_gradient(rng: np.random.Generator):
         heading = (k + t[0]) * grid.angle
         forward = math.cos(heading) * s_x + math.sin(heading) * s_y
         assert forward**2 + turn**2 / 0.5 <= highest
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_functionals_that_overflow_are_refused():
+    """In an arena of 1e-175 m the control points of a step in the heading are infinite, or no numbers."""
+    width, headings = 1e-175, 64
+    angle = 2 * math.pi / headings
+    scenario = Scenario(
+        arena=(0.0, 0.0, width, width),
+        start=(0.3 * width, 0.5 * width, 4.5 * angle),
+        goal=(0.7 * width, 0.5 * width, 36.5 * angle),
+        horizon=None,
+        cost={"time_weight": 0.5, "speed_weight": 1e-300, "turn_weight": 1.0, "proximity_weight": 0.0},
+        robot={"radius": 0.05 * width},
+    )
+    cells = CellSet.full(Grid.over(scenario.arena, width / 10, headings))
+    step = np.full(cells.mask.shape, 1e6, dtype=np.float32)
+    first = np.flatnonzero(cells.layout.blocks[:, 0] == 0)
+    step[first, 2:7] = 0.0
+    start, goal = Spline(step, 1.0, 1e-3, 1e-3), Spline(np.zeros_like(step), 1.0, 1e-3, 1e-3)
+    proof = Proof(scenario, 5e5, 0.5, width / 10, headings, (Stage(0, cells.layout.blocks, start, goal),))
+    with pytest.raises(ProofError, match="the cells are too small"):
+        check_proof(proof)

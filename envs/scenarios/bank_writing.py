@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -124,18 +125,22 @@ def write_lower_bounds(path: str | os.PathLike[str], lower_bounds: np.ndarray) -
     """Add lower bounds to a bank, or replace them, atomically.
 
     Args:
-        path: the file of the bank.
+        path: the file of the bank, or a link to it.
         lower_bounds (n,): see `ScenarioBank`.
 
     Raises:
         ValueError: the number of bounds is not that of the scenarios.
+        OSError: the file cannot be written.
 
     """
     import h5py
 
-    with atomic_path(path) as partial:
-        shutil.copyfile(path, partial)
-        with h5py.File(partial, "r+") as file:
+    target = Path(path).resolve()
+    if not os.access(target, os.W_OK):
+        raise PermissionError(f"{target}: cannot be written")
+    with atomic_path(target) as partial:
+        shutil.copy(target, partial)
+        with h5py.File(partial, "r+", alignment_threshold=1, alignment_interval=64) as file:
             costs: Any = file["costs"]
             count = len(costs)
             if lower_bounds.shape != (count,):

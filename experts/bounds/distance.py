@@ -4,8 +4,8 @@
 
 1. A function of S, with slope 1 / R(S), where R is a quantile of the gradient ratios of the cells at this value of S.
 2. The maximum of this and the last result, that of the level before with half the spacing at first.
-3. Projections onto the inequality of the cells that still violate it. If violations remain that are large, 1 to 3 are
-   repeated with R the maximum of the ratios.
+3. Projections onto the inequality of the cells that still violate it. If large violations remain, except in the first
+   round of the first level, 1 to 3 are repeated with R the maximum of the ratios.
 4. The same function with R the maximum, or a common factor, for what is left.
 
 Repeated, the quantile is below 1 where the inequality has slack, so that S grows from round to round.
@@ -51,7 +51,7 @@ CORRECTIONS, TOLERANCE = 3, 3e-3  # of the eikonal equation; in n times the spac
 # n in obstacles grows by exp(depth / (1.2 spacings)), and is constant from 2.2 spacings on.
 DEPTH, MAX_EXPONENT, WALL_DEPTH, WALL = 1.2, 8.0, 2.2, 50.0
 BINS_PER_SPACING = 2  # of the function of S
-SAMPLE = 2  # of the cells, one in so many along each axis determines the first function of S
+SAMPLE = 2  # the first function of S is determined by every second cell along each axis
 MIN_RATIO = 0.8  # of its quantile
 ACCEPTED = 1.02  # maximum ratio after projections, with a quantile of the ratios before
 ENOUGH = 1.003  # maximum ratio that is removed by a common factor

@@ -39,7 +39,7 @@ PROGRESS, STALLED, MAX_ROUNDS = 0.93, 0.99, 12
 TOLERANCE = 1.001  # gradient ratio above which a control point is moved
 # Largest Phi of the eikonal equation, relative to that on the optimum, and in E: of the first level and of all others.
 CAP_FACTOR, FIRST_CAP_IN_ENERGY, CAP_IN_ENERGY = 1.15, 0.75, 1.2
-MIN_GAP = 1e-3  # apart from the duality gap
+MIN_GAP, MAX_GAP = 1e-3, 0.999  # apart from the duality gap, and with it
 SLACK = 1e-6  # by which a proved value is smaller than what the functions give, relative
 
 
@@ -77,7 +77,8 @@ class LowerBound:
         excluded: fraction of the collision-free configuration space that is outside of the last of `tubes`.
         proof: the proof, see `check_proof`.
         tubes: for each spacing, the cells that its stages leave for paths cheaper than `value`. If the last of them do
-            not connect start and goal, this completes the proof.
+            not connect start and goal, this completes the proof. If the time was not sufficient, the cells left for
+            paths cheaper than the present target, which is larger than `value`.
         free_cells: number of cells of the first level that contain a collision-free point.
 
     """
@@ -175,7 +176,7 @@ class _Pace:
         return time.perf_counter() > self.end
 
     def affordable(self) -> float:
-        """Return the number of cells of a level that the time left allows, as fast as this level until now."""
+        """Return the number of cells of a next level for which the time is sufficient, at the rate of this level."""
         now = time.perf_counter()
         return (self.end - now) * self.count / (now - self.begun)
 
@@ -208,12 +209,13 @@ class _Producer:
             )
         self.highest = CAP_FACTOR * float(proximity.max())
         grid = first_grid(scenario)
-        if gap < self.duality_gap + MIN_GAP:
-            gap = min(gap + self.duality_gap, 0.999)
+        if gap < min(self.duality_gap + MIN_GAP, MAX_GAP):
+            gap = min(gap + self.duality_gap, MAX_GAP)
         target = Proof(scenario, (1.0 - gap) * self.cost, self.energy, grid.spacing, grid.headings, ())
         limit = length_limit(target)
-        # Larger by the slack, which a proved value is smaller by.
-        self.shift, self.limit = limit - target.value, limit + SLACK * max(1.0, abs(limit))
+        self.target, self.shift = target.value, limit - target.value
+        # Larger by the slack, by which a proved value is smaller.
+        self.limit = self.first_limit = limit + SLACK * max(1.0, abs(limit))
         self.tube = Tube.full(grid)
         self.stages, self.levels, self.free_cells = list[Stage](), list[CellSet](), 0
         self.distances: list[Distance | None] = [None, None]
@@ -230,7 +232,9 @@ class _Producer:
         if self.proved < self.limit:
             self.proved = self.tube.separating_length(self.ends, self.proved, self.limit)
         left = len(self.levels[-1]) / 8 ** (len(self.levels) - 1)
-        value = self.proved - self.shift - SLACK * max(1.0, abs(self.proved))
+        value = self.target
+        if self.proved < self.first_limit:
+            value = self.proved - self.shift - SLACK * max(1.0, abs(self.proved))
         first, last = self.levels[0].grid, self.levels[-1].grid
         proof = Proof(self.scenario, value, self.energy, first.spacing, first.headings, tuple(self.stages))
         return LowerBound(
@@ -282,10 +286,10 @@ class _Producer:
 
     def _refine(self, affordable: float) -> bool:
         """Halve the spacing, with a smaller L if the next level had too many cells; return False if that is useless."""
-        largest = self.tube.length_with(int(affordable / 8))
+        largest = self.tube.length_with(int(min(affordable / 8, len(self.tube.cells))))
         if largest < self.limit:
             tube = self.tube.below(largest, self.ends[0])
-            if not tube.cells.contains(self.ends[1]):
+            if largest <= self.proved or not tube.cells.contains(self.ends[1]):
                 return False
             self.limit, self.tube = largest, tube
         self.tube = self.tube.refined()

@@ -55,7 +55,7 @@ class Tube:
         return Tube(cells, divided(self.lengths, self.cells.layout, cells.layout))
 
     def length_with(self, count: int) -> float:
-        """Return the largest L with which at most so many cells are left, infinity for all cells."""
+        """Return the largest L with which at most this number of cells is left, infinity for all cells."""
         lengths = np.sort(self.lengths[self.cells.mask])
         return float(lengths[max(count, 0)]) if count < len(lengths) else math.inf
 

@@ -36,7 +36,7 @@ class BankBound:
         seconds, check_seconds: duration of the proof and of its check (s).
         resolution: spacing of the finest cells (m).
         duality_gap: estimate of the gap that remains because the horizon is fixed.
-        fault: why there is no bound, empty if there is one.
+        fault: why there is no bound, or why the checker refused its proof; empty if there is one.
 
     """
 
@@ -62,9 +62,10 @@ def prove_bank(
 ) -> list[BankBound]:
     """Prove lower bounds for the scenarios of a bank, and store them in the bank.
 
-    Scenarios with a bound of at most this gap are skipped. A bound is stored after its proof was checked with
-    `check_proof`, and only if it is better than the present one. The results of finished scenarios are in the directory
-    `<path>.bounds` until the bank is written. After any interruption, including SIGKILL, the same call resumes.
+    Scenarios with a bound of at most this gap are skipped, others are computed again. A bound is stored after its proof
+    was checked with `check_proof`, and only if it is better than the present one. The results of finished scenarios are
+    in the directory `<path>.bounds` until the bank is written. After any interruption, including SIGKILL, the same call
+    resumes.
 
     Args:
         path: the file of the bank.
@@ -90,47 +91,62 @@ def prove_bank(
     if count is not None:
         check_at_least("count", count, 1)
     check_at_least("workers", workers, 1)
-    bank = ScenarioBank(path)
-    bank.verify_checksums()
-    for scenario in bank:
-        find_ends(scenario)
-    settings = {
-        "software": leapnav.__version__,
-        "bank": digest(bank.costs),
-        "gap": gap,
-        "time_limit": time_limit,
-    }
-    chosen = np.arange(len(bank) if count is None else min(count, len(bank)))
-    known = bank.lower_bounds[chosen] >= (1.0 - gap * (1.0 + ROUNDING)) * bank.costs[chosen]
-    missing = chosen[~known].tolist()
+    path = Path(path).resolve()
+    if not os.access(path, os.W_OK):
+        ScenarioBank(path)  # raises an error if it is no bank
+        raise PermissionError(f"{path}: cannot be written")
+    identity = _identity(ScenarioBank(path))
+    settings = {"software": leapnav.__version__, "bank": identity, "gap": gap, "time_limit": time_limit}
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="2 * n_jobs")
-    compute = partial(prove, path=bank.path, gap=gap, time_limit=time_limit)
-    with ResumableStore(_directory(bank.path), "bounds", settings, BankError) as store:
+    compute = partial(prove, path=path, identity=identity, gap=gap, time_limit=time_limit)
+    with ResumableStore(path.with_name(f"{path.name}.bounds"), "bank-proof", settings, BankError) as store:
+        bank = _open(path, identity)
+        bank.verify_checksums()
+        chosen = np.arange(len(bank) if count is None else min(count, len(bank)))
+        for index in chosen.tolist():
+            find_ends(bank[index])
+        proved = bank.lower_bounds >= (1.0 - gap * (1.0 + ROUNDING)) * bank.costs
+        finished = [index for index in range(len(bank)) if index in store]  # also of a run with a larger count
+        missing = sorted({*chosen[~proved[chosen]].tolist(), *finished})
         found: dict[int, BankBound] = {}
         with progress_bar(total=len(missing), label="Proving", unit="scenarios", show=progress) as bar:
             for index, arrays in store.complete(missing, compute, pool, bar):
                 found[index] = _result(bank, index, arrays)
                 advance(bar, True)
-        bounds = bank.lower_bounds.copy()
-        for index, bound in found.items():
-            bounds[index] = np.fmax(bounds[index], bound.value)
         if found:
-            write_lower_bounds(bank.path, bounds)
+            bounds = _open(path, identity).lower_bounds.copy()
+            for index, bound in found.items():
+                bounds[index] = np.fmax(bounds[index], bound.value)
+            write_lower_bounds(path, bounds)
     discard(store.directory)
     return [found[index] for index in sorted(found)]
 
 
-def prove(index: int, path: Path, gap: float, time_limit: float) -> Arrays:
+def prove(index: int, path: Path, identity: str, gap: float, time_limit: float) -> Arrays:
     """Prove a lower bound for a scenario of a bank, as arrays of a shard; "fault" is empty if there is one."""
-    bank = ScenarioBank(path)
+    bank = _open(path, identity)
+    scenario, reference = bank[index], bank.reference(index)
     try:
-        bound = lower_bound(bank[index], bank.reference(index), gap, time_limit, threads=1)
-    except ValueError as error:  # the horizon is too long, or the arena too large
+        bound = lower_bound(scenario, reference, gap, time_limit, threads=1)
+        start = perf_counter()
+        value = check_proof(bound.proof)
+    except ValueError as error:  # the horizon is too long, the arena too large, or the checker refuses the proof
         return {"fault": np.array(str(error))}
-    start = perf_counter()
-    value = check_proof(bound.proof)
     numbers = [value, bound.seconds, perf_counter() - start, bound.resolution, bound.duality_gap]
     return {"fault": np.array(""), "numbers": np.array(numbers)}
+
+
+def _open(path: Path, identity: str) -> ScenarioBank:
+    """Open the bank.
+
+    Raises:
+        BankError: the file does not contain the same scenarios any more.
+
+    """
+    bank = ScenarioBank(path)
+    if _identity(bank) != identity:
+        raise BankError(f"{path}: the file was replaced by a bank with other scenarios")
+    return bank
 
 
 def _result(bank: ScenarioBank, index: int, arrays: Arrays) -> BankBound:
@@ -142,5 +158,6 @@ def _result(bank: ScenarioBank, index: int, arrays: Arrays) -> BankBound:
     return BankBound(index, name, value, gap, seconds, check_seconds, resolution, duality_gap, "")
 
 
-def _directory(path: Path) -> Path:
-    return path.with_name(f"{path.name}.bounds")
+def _identity(bank: ScenarioBank) -> str:
+    """Return a checksum of the tasks and their optimal costs."""
+    return digest(np.append(bank.tasks, bank.costs))

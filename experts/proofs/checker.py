@@ -71,6 +71,8 @@ ROUNDING = 1e-9  # relative to L and its terms, or to 1 if that is larger
 SPLINE_ROUNDING = 1e-14  # of sums of coefficients, relative to the largest coefficient: 90 units
 MAX_LEVEL = 8
 MAX_NUMBER = 1e12  # of V, E and the coefficients, so that nothing overflows
+MAX_PRODUCT = 1e100  # of rounding errors of control points, for the same reason
+MAX_CELLS = 1e9  # of level 0
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,8 @@ def _check_grid(proof: Proof) -> None:
         raise ProofError(f"spacing: expected a positive number, at most the size of the arena, got {spacing!r}")
     if not (isinstance(cast(object, headings), int) and headings > 0 and headings % BLOCK == 0):
         raise ProofError(f"headings: expected a multiple of {BLOCK}, got {headings!r}")
+    if not headings * ((x_max - x_min) / spacing) * ((y_max - y_min) / spacing) <= MAX_CELLS:
+        raise ProofError(f"spacing, headings: expected at most {MAX_CELLS:g} cells, got {spacing!r} and {headings!r}")
 
 
 def length_limit(proof: Proof) -> float:
@@ -212,7 +216,13 @@ def prove_bound(
         raise ProofError(f"expected coefficients of at most {MAX_NUMBER:g}")
     spline = replace(spline, values=np.ascontiguousarray(spline.values))
     values = spline.values
-    source = make_source(pose, proof.scenario.robot.metric(proof.scenario.cost), spline.limit)
+    # Products of coefficients and functionals are finite, and so are the squares of their sums.
+    if not table.rounding * max(EMPTY, float(np.abs(values).max())) <= MAX_PRODUCT:
+        raise ProofError("the cells are too small, or the weights of the cost too different")
+    try:
+        source = make_source(pose, proof.scenario.robot.metric(proof.scenario.cost), spline.limit)
+    except ValueError as error:
+        raise ProofError(f"limit: {error}") from None
     exempt = cells_near(source, cells, free, spline.radius)
     if not CellSet(cells.grid, cells.layout, exempt).contains(pose):
         raise ProofError("the cell of the pose is not in the set")
@@ -263,7 +273,10 @@ def without_excluded(cells: CellSet, start: Bound, goal: Bound, limit: float, po
 
 
 def shortest_lengths(cells: CellSet, start: Bound, goal: Bound) -> np.ndarray:
-    """Return the smallest value of L with which each cell is excluded (m, 8, 8, 8), 0 for other cells."""
+    """Return a lower bound of the length of paths through each cell (m, 8, 8, 8), 0 for other cells.
+
+    It is the largest L with which the cell is excluded.
+    """
     lengths = np.zeros(cells.mask.shape)
     shifts = Shifts(start.scale, goal.scale, start.offset, goal.offset)
     _shortest(start.values, goal.values, cells.layout, cells.mask, shifts, lengths)

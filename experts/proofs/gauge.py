@@ -52,6 +52,7 @@ from numba import float64
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.experts.proofs.intervals import Interval, tangent
 
+MIN_RADIUS = 1e-4  # below, rounding errors spoil the bound
 MAX_RADIUS = 2.0  # largest K / sqrt(r_w) for which `gradient_bound` is used; there kappa < 1.1 and |theta| < 2
 N_PARTS = 2000  # intervals of t
 SMALL_ANGLE = 1e-3  # rad, below which a = 1 - theta^2 / 12 is correct to 2e-15
@@ -66,11 +67,11 @@ def gradient_bound(radius: float) -> float:
         radius: K at most, in units of sqrt(r_w).
 
     Raises:
-        ValueError: the radius is not in (0, MAX_RADIUS].
+        ValueError: the radius is not in [MIN_RADIUS, MAX_RADIUS].
 
     """
-    if not 0.0 < radius <= MAX_RADIUS:
-        raise ValueError(f"radius: expected a number in (0, {MAX_RADIUS:g}], got {radius:g}")
+    if not MIN_RADIUS <= radius <= MAX_RADIUS:
+        raise ValueError(f"radius: expected a number from {MIN_RADIUS:g} to {MAX_RADIUS:g}, got {radius:g}")
     square = Interval.of(radius) * radius
     half = radius / 2
     kappa = 12.0 * (1.0 - Interval.of(half) / tangent(half)) / square
@@ -94,7 +95,7 @@ class Source(NamedTuple):
     Attributes:
         x, y, heading: the pose (m, rad).
         speed_weight, turn_weight: r_v and r_w, both positive.
-        limit: B, at most MAX_RADIUS sqrt(r_w).
+        limit: B, from MIN_RADIUS sqrt(r_w) to MAX_RADIUS sqrt(r_w).
         gradient: G, `gradient_bound(B / sqrt(r_w))`.
 
     """

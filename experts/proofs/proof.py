@@ -130,12 +130,16 @@ class Proof:
                     )
                     for number, stage in enumerate(header["stages"])
                 )
+            numbers: dict[str, Any] = {name: header[name] for name in ("value", "energy", "spacing", "headings")}
+            for fields in (numbers, *(stage[side] for stage in header["stages"] for side in ("start", "goal"))):
+                for name, number in fields.items():
+                    if isinstance(number, bool) or not isinstance(number, int | float):
+                        raise ProofError(f"{path}: {name}: expected a number, got {number!r}")
         except (zipfile.BadZipFile, KeyError, TypeError, EOFError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise ProofError(f"{path}: not a proof ({type(error).__name__}: {error})") from None
         except ValueError as error:
             raise error if isinstance(error, ProofError) else ProofError(f"{path}: not a proof ({error})") from None
         scenario = Scenario.from_dict(header["scenario"])
-        numbers: dict[str, Any] = {name: header[name] for name in ("value", "energy", "spacing", "headings")}
         return cls(scenario, stages=stages, **numbers)
 
 

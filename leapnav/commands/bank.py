@@ -141,7 +141,8 @@ class Show:
 class Prove:
     """Prove lower bounds of the cost of the scenarios of a bank, check the proofs, and store the bounds in the bank.
 
-    Scenarios with a bound of at most this gap are skipped. The same command resumes after an interruption.
+    Scenarios with a bound of at most this gap are skipped, others are computed again. The same command resumes after an
+    interruption.
     """
 
     file: tyro.conf.Positional[Path]

@@ -159,14 +159,16 @@ class Episode:
 
     @property
     def true_regret(self) -> tuple[float, float]:
-        """Bracket of the regret with respect to the true optimal cost of the scenario, which no search need have found.
+        """Proved limits of J / J_0 - 1, where J_0 is the infimum of the cost of collision-free paths to the goal pose.
 
-        That cost is between `lower_bound` and `reference_cost`, the costs of paths to the goal itself. NaN if no lower
-        bound is known.
+        J_0 is between `lower_bound` and `reference_cost`. A robot may stop within the tolerances of the goal, so the
+        limits can be negative and need not contain `regret`, which refers to the pose reached. NaN if no lower bound is
+        known or the episode is no success; the upper limit is infinite if the lower bound is not positive.
         """
-        if math.isnan(self.lower_bound):
+        if math.isnan(self.lower_bound) or not self.success:
             return math.nan, math.nan
-        return self.cost / self.reference_cost - 1.0, self.cost / self.lower_bound - 1.0
+        high = self.cost / self.lower_bound - 1.0 if self.lower_bound > 0 else math.inf
+        return self.cost / self.reference_cost - 1.0, high
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes without the states, and SOC and regret."""

@@ -65,7 +65,7 @@ def print_scores(comparison: Comparison, console: Console | None = None) -> None
     if any(row.regret.value < 0 for row in scores):
         console.print(NEGATIVE_REGRET)
     if any(row.true_regret.episodes for row in scores):
-        console.print("Regret with respect to the true optimum, between proved limits (medians):")
+        console.print("Cost above the true optimal cost of the scenario, between proved limits (medians):")
         for row in scores:
             console.print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
     if len(comparison.families) > 1:

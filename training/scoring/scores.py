@@ -32,10 +32,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Bracket:
-    """The proved range of the regret with respect to the true optimal costs, see `Episode.true_regret`.
+    """The proved limits of a median over episodes, see `Episode.true_regret`.
 
     Attributes:
-        low, high: medians of both ends over the episodes; NaN if there are none.
+        low, high: medians of both limits over the episodes; NaN if there are none.
         episodes: number of successful episodes in scenarios with a proved lower bound, of all runs.
 
     """
@@ -60,7 +60,7 @@ class Score:
         clearance: median over the episodes of the minimum clearance (m).
         mean_return: mean return.
         milliseconds: median computation time of one action (ms), mean over the runs.
-        true_regret: the range in which the regret with respect to the true optimal costs lies.
+        true_regret: limits of the median of J / J_0 - 1, with J_0 the true optimal cost, see `Episode.true_regret`.
 
     """
 
@@ -123,7 +123,7 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
 
 
 def _bracket(evaluations: Sequence[Evaluation]) -> Bracket:
-    """Return the medians of both ends of the true regret."""
+    """Return the medians of both limits of the true regret."""
     pairs = [e.true_regret for evaluation in evaluations for e in evaluation if e.success]
     known = [pair for pair in pairs if not math.isnan(pair[0])]
     if not known:
