@@ -83,7 +83,7 @@ def measure(name: str, cases: list[tuple[Scenario, Optimum]], gap: float, time_l
         checks.append((middle - start) / bound.seconds)
         ratios.append(bound.seconds / (end - middle))
     proved = sum(value <= 100 * gap * (1 + 1e-6) for value in gaps)
-    cells = [f"{np.median(values):.2f}, {np.percentile(values, 90):.2f}" for values in (gaps, times, checks, ratios)]
+    cells = [f"{np.median(values):.3g}, {np.percentile(values, 90):.3g}" for values in (gaps, times, checks, ratios)]
     return [name, f"{proved} of {len(cases)}", *cells]
 
 

@@ -104,7 +104,10 @@ def prove_bank(
         bank.verify_checksums()
         chosen = np.arange(len(bank) if count is None else min(count, len(bank)))
         for index in chosen.tolist():
-            find_ends(bank[index])
+            try:
+                find_ends(bank[index])
+            except ValueError as error:
+                raise ValueError(f"{path}: scenario {index}: {error}") from None
         proved = bank.lower_bounds >= (1.0 - gap * (1.0 + ROUNDING)) * bank.costs
         finished = [index for index in range(len(bank)) if index in store]  # also of a run with a larger count
         missing = sorted({*chosen[~proved[chosen]].tolist(), *finished})
