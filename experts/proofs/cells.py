@@ -283,9 +283,9 @@ def scatter(local, layout, block, values):
                             values[slot, a - k0 + k_from, b - i0 + i_from, c - j0 + j_from] = local[a, b, c]
 
 
-@kernel(int64(MASKS, LAYOUT, int64, int64, int64, MASKS))
+@kernel(NOTHING(MASKS, LAYOUT, int64, int64, int64, MASKS))
 def connected(mask, layout, k, i, j, found):
-    """Mark the cells of a set that are connected to cell (k, i, j) by faces, edges or corners; return their number.
+    """Mark the cells of a set that are connected to cell (k, i, j) by faces, edges or corners.
 
     Cell (k, i, j) itself must be stored.
     """
@@ -293,7 +293,7 @@ def connected(mask, layout, k, i, j, found):
     stack = np.empty((len(mask) * BLOCK**3, 3), dtype=np.int32)
     stack[0, 0], stack[0, 1], stack[0, 2] = k, i, j
     found[layout.slots[k // BLOCK, i // BLOCK, j // BLOCK], k % BLOCK, i % BLOCK, j % BLOCK] = True
-    size, count = 1, 1
+    size = 1
     while size > 0:
         size -= 1
         k0, i0, j0 = stack[size, 0], stack[size, 1], stack[size, 2]
@@ -310,8 +310,6 @@ def connected(mask, layout, k, i, j, found):
                         found[slot, a % BLOCK, b % BLOCK, c % BLOCK] = True
                         stack[size, 0], stack[size, 1], stack[size, 2] = a, b, c
                         size += 1
-                        count += 1
-    return count
 
 
 @kernel(float64(CUBE, int64, int64, int64, CUBE))
