@@ -105,6 +105,7 @@ def test_a_scenario_without_a_bound_is_reported(bank_file: Path, monkeypatch: py
     monkeypatch.setattr(bank_bounds, "lower_bound", refuse)
     (result,) = prove(bank_file, count=1)
     assert result.fault == "horizon: too long"
+    assert main(["bank", "prove", str(bank_file), "--count", "1", "--workers", "1"]) == 1
     assert math.isnan(result.value)
     assert np.isnan(ScenarioBank(bank_file).lower_bounds).all()
 
@@ -115,7 +116,7 @@ def test_a_bound_whose_proof_is_refused_is_not_stored(bank_file: Path, monkeypat
 
     monkeypatch.setattr(bank_bounds, "check_proof", refuse)
     (result,) = prove(bank_file, count=1)
-    assert result.fault == "stage 0: start: the gradient"
+    assert result.fault == "the checker refuses the proof: stage 0: start: the gradient"
     assert np.isnan(ScenarioBank(bank_file).lower_bounds).all()
 
 

@@ -20,7 +20,7 @@ from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.bounds.lower_bound import lower_bound
 from leapnav.experts.data.store import ONE, Arrays, ResumableStore, discard
 from leapnav.experts.proofs.checker import check_proof
-from leapnav.experts.proofs.proof import find_ends
+from leapnav.experts.proofs.proof import ProofError, find_ends
 
 ROUNDING = 1e-9  # relative error with which a gap counts as proved
 
@@ -92,10 +92,9 @@ def prove_bank(
         check_at_least("count", count, 1)
     check_at_least("workers", workers, 1)
     path = Path(path).resolve()
-    if not os.access(path, os.W_OK):
-        ScenarioBank(path)  # raises an error if it is no bank
-        raise PermissionError(f"{path}: cannot be written")
     identity = _identity(ScenarioBank(path))
+    if not os.access(path, os.W_OK):  # before hours of work
+        raise PermissionError(f"{path}: cannot be written")
     settings = {"software": leapnav.__version__, "bank": identity, "gap": gap, "time_limit": time_limit}
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="2 * n_jobs")
     compute = partial(prove, path=path, identity=identity, gap=gap, time_limit=time_limit)
@@ -131,10 +130,13 @@ def prove(index: int, path: Path, identity: str, gap: float, time_limit: float) 
     scenario, reference = bank[index], bank.reference(index)
     try:
         bound = lower_bound(scenario, reference, gap, time_limit, threads=1)
-        start = perf_counter()
-        value = check_proof(bound.proof)
-    except ValueError as error:  # the horizon is too long, the arena too large, or the checker refuses the proof
+    except ValueError as error:  # the horizon is too long, or the arena too large
         return {"fault": np.array(str(error))}
+    start = perf_counter()
+    try:
+        value = check_proof(bound.proof)
+    except ProofError as error:
+        return {"fault": np.array(f"the checker refuses the proof: {error}")}
     numbers = [value, bound.seconds, perf_counter() - start, bound.resolution, bound.duality_gap]
     return {"fault": np.array(""), "numbers": np.array(numbers)}
 

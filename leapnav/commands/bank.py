@@ -143,6 +143,8 @@ class Prove:
 
     Scenarios with a bound of at most this gap are skipped, others are computed again. The same command resumes after an
     interruption.
+
+    Exit code 1: there is no bound of a scenario, for a reason that is printed.
     """
 
     file: tyro.conf.Positional[Path]
@@ -178,7 +180,7 @@ class Prove:
         for line in gap_summary(bank):
             print(line)
         write_json([asdict(result) for result in results], self.json)
-        return 0
+        return FAILED if any(result.fault for result in results) else 0
 
 
 @dataclass(frozen=True)
