@@ -75,7 +75,9 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `motion` (robots with further states) | k | further state k of the robot's model, such as speed and turn rate; a heading relative to that of the robot | | -20 to 20 |
     | `motion` (`"motor"` only) | 0, 1 | velocity in the robot's frame: ahead, to the left | m/s | -20 to 20 |
     | | 2 | turn rate | rad/s | -20 to 20 |
-    | `lidar` (`"lidar"` only) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
+    | `lidar` (`"lidar"` and `"geodesic"`) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
+    | `detours` (`"geodesic"` only) | k | how much longer than the shortest path to the goal a path is that starts along beam k | m | 0 to 3 |
+    | `distance` (`"geodesic"` only) | 0 | geodesic distance: length of the shortest path among the obstacles to the goal position | m | 0 to 2000 |
     | `walls` (`"map"` only) | 0 to 3 | distances to the left, bottom, right and top wall of the arena | m | -1000 to 1000 |
     | | 4, 5 | cosine and sine of the heading | 1 | -1 to 1 |
     | `obstacles` (`"map"` only) | per obstacle: 0 | 1; in a row without an obstacle, all entries are 0 | 1 | 0 to 1 |
@@ -85,6 +87,11 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     `observation="lidar"` contains `lidar_beams` ranges. `"map"` contains the `map_obstacles` nearest obstacles, in
     order of distance, with `map_vertices` vertices each. `"state"` contains neither; it suits scenarios without
     obstacles.
+
+    `"geodesic"` contains, in addition to the ranges, what a global planner on the complete map provides: the distance to
+    the goal among the obstacles, and the detour in the direction of each beam. Both are lengths in a metric that
+    increases with the proximity cost, see `leapnav.envs.geodesics`. With lidar alone, an obstacle behind another one
+    cannot be observed.
 
     ## Rewards
     With `reward="cost"`, the return is `-J` minus the penalties. `info["reward_parts"]` contains the parts of each
@@ -153,7 +160,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
     | `horizon` | None | `"fixed"` or `"free"`; None for that of the scenario or the bank, otherwise `"fixed"` |
     | `robot` | None | name of the robot's model, a dict of its fields with `model`, or a `RobotModel`; None for that of the scenario or the bank, otherwise the unicycle. Without an included bank for the robot, scenarios are fresh |
-    | `observation` | `"lidar"` | `"lidar"`, `"state"` or `"map"` |
+    | `observation` | `"lidar"` | `"lidar"`, `"state"`, `"map"` or `"geodesic"` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |
     | `actuation` | `"velocity"` | `"velocity"` or `"motor"` |
     | `disturbance` | None | noise on actuation and sensing: a `Disturbance` or a dict of its attributes; a number d means `actuation` d, `slip` d and `sensing` d / 10 |

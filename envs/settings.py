@@ -22,7 +22,8 @@ from leapnav.envs.utils.validation import (
     is_number,
 )
 
-OBSERVATIONS, REWARDS, ACTUATIONS = ("lidar", "state", "map"), ("cost", "shaped"), ("velocity", "motor")
+OBSERVATIONS = "lidar", "state", "map", "geodesic"
+REWARDS, ACTUATIONS = ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS, HORIZONS = ("sparse", "cost"), ("fixed", "free")
 # Arguments that determine what is observed.
 SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")
@@ -181,6 +182,11 @@ class EnvironmentSettings:
             raise ValueError(
                 "observation: with a free horizon, a goal-conditioned environment needs 'lidar' or 'map', got 'state'"
             )
+        if self.goal_conditioned and self.observation == "geodesic":
+            raise ValueError(
+                "observation: geodesic distances depend on the goal, which a goal-conditioned learner replaces; "
+                "expected 'lidar', 'state' or 'map', got 'geodesic'"
+            )
         object.__setattr__(self, "disturbance", _as_disturbance(self.disturbance))
         object.__setattr__(self, "motor", _as_dataclass("motor", Motor, self.motor))
 
@@ -188,6 +194,11 @@ class EnvironmentSettings:
     def model(self) -> type[RobotModel]:
         """The class of the robot's model."""
         return MODELS[self.robot]
+
+    @property
+    def has_lidar(self) -> bool:
+        """Whether lidar ranges are observed."""
+        return self.observation in ("lidar", "geodesic")
 
     @property
     def free_horizon(self) -> bool:

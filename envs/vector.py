@@ -261,6 +261,11 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._source.family
 
     @property
+    def source(self) -> ScenarioSource:
+        """The source of the scenarios, from which workers in other processes can draw."""
+        return self._source
+
+    @property
     def bank(self) -> ScenarioBank | None:
         """The bank of the scenarios, or None."""
         return self._source.bank

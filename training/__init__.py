@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from leapnav.training.runs.imitation import train_bc, train_dagger
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
     from leapnav.training.scoring.comparison import Comparison, compare
+    from leapnav.training.scoring.decisions import Decisions, PolicyRegret, regret
     from leapnav.training.scoring.evaluation import Episode, Evaluation, Policy, evaluate
     from leapnav.training.scoring.html_report import write_report
     from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores
@@ -39,6 +40,7 @@ __all__ = [
     "DAggerConfig",
     "DAggerRunConfig",
     "Dataset",
+    "Decisions",
     "DemonstrationReplayBuffer",
     "Episode",
     "EpochLoss",
@@ -49,6 +51,7 @@ __all__ = [
     "NavigationFeatures",
     "PPOConfig",
     "Policy",
+    "PolicyRegret",
     "RandomPolicy",
     "SACConfig",
     "Score",
@@ -67,6 +70,7 @@ __all__ = [
     "policy_environment",
     "print_scores",
     "profile",
+    "regret",
     "save_policy",
     "score",
     "shipped_policies",
@@ -93,6 +97,7 @@ _LAZY = {
     "runs.imitation": ("train_bc", "train_dagger"),
     "runs.reinforcement": ("train_ppo", "train_sac"),
     "scoring.comparison": ("Comparison", "compare"),
+    "scoring.decisions": ("Decisions", "PolicyRegret", "regret"),
     "scoring.evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
     "scoring.html_report": ("write_report",),
     "scoring.reports": ("plot_episodes", "plot_scores", "print_scores"),

@@ -12,7 +12,8 @@ from typing import Any, Literal, Self, cast
 from leapnav.deprecated import renamed_fields
 
 # Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start, "-free" those
-# for a free horizon; a sub-table with the name of a family contains the changes for this family.
+# for a free horizon, "-lidar" those for lidar alone; a sub-table with the name of a family contains the changes for
+# this family.
 _DEFAULTS: dict[str, Any] = tomllib.loads(
     files("leapnav.training").joinpath("defaults.toml").read_text(encoding="utf-8")
 )
@@ -23,6 +24,7 @@ FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
 # A literal, so that the help texts show the choices; a robot registered by the user is text as well.
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
+ObservationName = Literal["lidar", "geodesic"]
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 
@@ -66,6 +68,12 @@ class DAggerConfig:
     """Maximum number of episodes per round."""
     successes: float = 1.0
     """Successful episodes with one takeover each, per failed episode."""
+    takeovers: Literal["schedule", "regret"] = "schedule"
+    """Where the expert takes over: "schedule": at fixed times before a failure and at random times of successful
+    episodes; "regret": where the cost so far plus the optimal cost to go has increased by more than the threshold, or
+    will within 3 s, in failed episodes and in successful ones that were near misses."""
+    regret_threshold: float = 0.3
+    """Regret that is large enough for a takeover, in the unit of the cost."""
     lead: float = 3.0
     """Time that the expert drives after a takeover (s)."""
     epochs: int = 2
@@ -121,6 +129,8 @@ class RunConfig:
     """Continuation of the run in the directory."""
     hidden: tuple[int, ...] = (256, 256, 256)
     """Widths of the hidden layers of the actor and the critic."""
+    observation: ObservationName = "lidar"
+    """Lidar alone, or with the geodesic distance to the goal and the detour along each beam, from the complete map."""
     lidar_beams: int = 128
     """Number of lidar beams, an even number. Demonstrations are observed again with these beams; a policy to start from
     must have the same number. With 32 beams, narrow passages cannot be distinguished from wide ones."""
@@ -132,7 +142,8 @@ class RunConfig:
         """Arguments of the environment that determine the observation."""
         robot = {} if self.robot == "unicycle" else {"robot": self.robot}
         horizon = {} if self.horizon == "fixed" else {"horizon": self.horizon}
-        return {"lidar_beams": self.lidar_beams, **robot, **horizon}
+        observation = {} if self.observation == "lidar" else {"observation": self.observation}
+        return {**observation, "lidar_beams": self.lidar_beams, **robot, **horizon}
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, **changes: Any) -> Self:
@@ -157,6 +168,8 @@ class RunConfig:
         sections = ["RunConfig", cls.__name__, *([f"{cls.__name__}-warm"] if warm else [])]
         if changes.get("horizon") == "free":
             sections.append(f"{cls.__name__}-free")
+        if changes.get("observation") == "lidar":
+            sections.append(f"{cls.__name__}-lidar")
         for section in sections:
             table = _DEFAULTS.get(section, {})
             names = {setting.name for setting in fields(config)}

@@ -57,9 +57,13 @@ def observation_entries(settings: EnvironmentSettings) -> list[Entry]:
     names = list(_GOAL[: goal_entries(settings)])
     if settings.motors:
         names += _MOTION
-    if settings.observation == "lidar":
+    if settings.has_lidar:
         beams = settings.lidar_beams
-        names += [(f"lidar[{k}], {360 * k / beams:g} deg counter-clockwise from ahead", "m") for k in range(beams)]
+        angles = [f"{360 * k / beams:g} deg counter-clockwise from ahead" for k in range(beams)]
+        names += [(f"lidar[{k}], {angle}", "m") for k, angle in enumerate(angles)]
+        if settings.observation == "geodesic":
+            names += [(f"detours[{k}], {angle}", "m") for k, angle in enumerate(angles)]
+            names.append(("distance", "m"))
     elif settings.observation == "map":
         names += _WALLS
         for k in range(settings.map_obstacles):

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numba import float32, types
 
+from leapnav.envs.geodesics import MAX_DETOUR, geodesic_detours, geodesic_distance
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
 from leapnav.envs.scenarios.scenario import GOAL, HORIZON
@@ -37,7 +38,8 @@ GOAL_ENTRIES, FREE_GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 4, 3, 4
 TIME_LEFT = 4  # index in the goal part of a fixed horizon
 # Bounds of the observation spaces (m, s, m/s or rad/s), which scenarios of realistic size do not reach.
 MAX_DISTANCE, MAX_TIME, MAX_RATE = 1000.0, 10_000.0, 20.0
-LIDAR, MAP = OBSERVATIONS.index("lidar"), OBSERVATIONS.index("map")
+MAX_GEODESIC = 2000.0  # bound of the geodesic distance (m), by which the observation is recognised
+LIDAR, MAP, GEODESIC = (OBSERVATIONS.index(name) for name in ("lidar", "map", "geodesic"))
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,12 @@ def _parts(settings: EnvironmentSettings) -> list[Part]:
     entries = motion_entries(settings)
     if entries:
         parts.append(Part("motion", (-MAX_RATE,) * entries, (MAX_RATE,) * entries))
-    if settings.observation == "lidar":
+    if settings.has_lidar:
         beams = settings.lidar_beams
         parts.append(Part("lidar", (0.0,) * beams, (settings.lidar_range,) * beams))
+        if settings.observation == "geodesic":
+            parts.append(Part("detours", (0.0,) * beams, (MAX_DETOUR,) * beams))
+            parts.append(Part("distance", (0.0,), (MAX_GEODESIC,)))
     elif settings.observation == "map":
         low = (-MAX_DISTANCE,) * 4 + (-1.0, -1.0)
         parts.append(Part("walls", low, (MAX_DISTANCE,) * 4 + (1.0, 1.0)))
@@ -87,6 +92,11 @@ def has_time_left(high: np.ndarray) -> bool:
     return len(high) >= GOAL_ENTRIES and tuple(high[TIME_LEFT : TIME_LEFT + 2].tolist()) == (MAX_TIME, MAX_RATE)
 
 
+def has_geodesics(high: np.ndarray) -> bool:
+    """Return whether flat observations with the upper bounds `high` end with detours and the geodesic distance."""
+    return float(high[-1]) == MAX_GEODESIC
+
+
 def motion_entries(settings: EnvironmentSettings) -> int:
     """Return the number of entries of the part `motion`."""
     return MOTION_ENTRIES if settings.motors else settings.model.sizes()[0] - 3
@@ -97,6 +107,7 @@ class ObservationBuffers(NamedTuple):
 
     Attributes:
         beams (2, n), scratch (5, n): see `leapnav.envs.simulation.sensing.scan`.
+        detours (n,): output of `leapnav.envs.geodesics.geodesic_detours`.
         surroundings: output of `leapnav.envs.simulation.sensing.map_surroundings`; empty without a map.
         row (size,): an observation before it is rounded to float32.
         bounds (2, size): lower and upper bounds, float32.
@@ -106,6 +117,7 @@ class ObservationBuffers(NamedTuple):
 
     beams: np.ndarray
     scratch: np.ndarray
+    detours: np.ndarray
     surroundings: np.ndarray
     row: np.ndarray
     bounds: np.ndarray
@@ -116,6 +128,7 @@ OBSERVATION_BUFFERS = record_type(
     ObservationBuffers,
     beams=MATRIX,
     scratch=MATRIX,
+    detours=VECTOR,
     surroundings=VECTOR,
     row=VECTOR,
     bounds=float32[:, ::1],
@@ -149,6 +162,7 @@ class ObservationLayout:
         self._buffers = ObservationBuffers(
             beams=np.stack([np.cos(angles), np.sin(angles)]),
             scratch=np.zeros((5, settings.lidar_beams)),
+            detours=np.zeros(settings.lidar_beams),
             surroundings=np.zeros(map_entries if settings.observation == "map" else 0),
             row=np.zeros(self.size),
             bounds=self.bounds,
@@ -185,7 +199,7 @@ class ObservationLayout:
 
     def scan(self, pose: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Return the lidar ranges (m) at a pose; empty without a lidar."""
-        if self._settings.observation != "lidar":
+        if not self._settings.has_lidar:
             return np.empty(0)
         x, y, heading = pose[:3].tolist()
         buffers = self._buffers
@@ -211,17 +225,13 @@ def observe_robots(robots, packed, packed_buffers, out):
     """
     sim, buffers = SimulationState(*packed), ObservationBuffers(*packed_buffers)
     bodies, state, tasks, settings, noise = sim.bodies, sim.state, sim.tasks, sim.settings, sim.noise
-    beams, scratch, surroundings, row, bounds = (
-        buffers.beams,
-        buffers.scratch,
-        buffers.surroundings,
-        buffers.row,
-        buffers.bounds,
-    )
+    beams, scratch, surroundings = buffers.beams, buffers.scratch, buffers.surroundings
+    row, bounds = buffers.row, buffers.bounds
     deviation = settings[SENSING_NOISE]
     goal_conditioned, motors = settings[GOAL_CONDITIONED] != 0.0, settings[MOTORS] != 0.0
     free_horizon = settings[FREE_HORIZON] != 0.0
-    has_lidar, has_map = settings[OBSERVATION] == LIDAR, settings[OBSERVATION] == MAP
+    has_map, has_geodesics = settings[OBSERVATION] == MAP, settings[OBSERVATION] == GEODESIC
+    has_lidar = settings[OBSERVATION] == LIDAR or has_geodesics
     count = beams.shape[1]
     sensing = 2 * int(settings[N_CONTROLS])  # first column of the sensing noise, after that of the actuation
     for i in robots:
@@ -280,6 +290,12 @@ def observe_robots(robots, packed, packed_buffers, out):
             if deviation != 0.0:
                 for k in range(count):
                     row[at + k] += deviation * noise[i, sim.noise_rows[i], sensing + 3 + k]
+            at += count
+        if has_geodesics:
+            geodesic_detours(x, y, cos, sin, sim.maps[i], sim.fields[i, 2], beams, scratch[2], buffers.detours)
+            for k in range(count):
+                row[at + k] = buffers.detours[k]
+            row[at + count] = geodesic_distance(x, y, sim.maps[i])
         elif has_map:
             obstacles, vertices = int(settings[OBSTACLES]), int(settings[VERTICES])
             map_surroundings(x, y, cos, sin, sim.fields[i], obstacles, vertices, surroundings)

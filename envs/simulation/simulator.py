@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.robots.base import ARCS, GENERAL
@@ -36,6 +37,7 @@ from leapnav.envs.simulation.state import (
     TURN_RATE,
     VX,
     SimulationState,
+    guide_points,
 )
 from leapnav.envs.utils.validation import in_words
 
@@ -80,7 +82,8 @@ class BatchSimulator:
         self._record: tuple[np.ndarray, ...] | None = None
         self._free_horizon = settings.free_horizon
         self._disturbed, self._motors = settings.disturbed, settings.motors
-        self._maps = settings.observation == "map"
+        self._maps, self._geodesic = settings.observation == "map", settings.observation == "geodesic"
+        self._geodesic_maps = np.zeros((count, 0), np.float32)
         self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
         self._lengths = np.zeros(count, dtype=int)
         self._guides = np.zeros((count, N_GUIDE_POINTS, 3))
@@ -120,6 +123,7 @@ class BatchSimulator:
                     guides=self._guides,
                     noise=self._noise,
                     noise_rows=self._noise_rows,
+                    maps=self._geodesic_maps,
                     settings=self._packed,
                 )
             )
@@ -178,8 +182,11 @@ class BatchSimulator:
                 else:
                     scenario = get_scenario(choice, bank)
                     row[first - 3 : first - 1] = scenario.robot.metric(scenario.cost)
-                self._guides[i] = self._guide(choice, bank, self.tasks[i])
+                reference = None if isinstance(choice, Scenario) else _require(bank).states(choice)
+                self._guides[i] = guide_points(task[GOAL : GOAL + 2], reference)
             self._contacts.pop(i, None)
+        if self._geodesic:
+            self._store_maps(indices, fields)
         stepping.start_episodes(indices, self._arrays)
         if self._disturbed:
             for i, generator in zip(indices.tolist(), generators, strict=True):
@@ -252,16 +259,14 @@ class BatchSimulator:
                 f"got {self.settings.map_vertices}"
             )
 
-    def _guide(self, choice: Scenario | int, bank: ScenarioBank | None, task: np.ndarray) -> np.ndarray:
-        """Return the guide points of the reference path, see `SimulationState`; without a reference, only the goal."""
-        guides = np.zeros((N_GUIDE_POINTS, 3))
-        guides[:, :2] = task[GOAL : GOAL + 2]
-        if not isinstance(choice, Scenario):
-            path = _require(bank).states(choice)[:, :2].astype(float)
-            length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-            selected = np.linspace(0, len(path) - 1, N_GUIDE_POINTS).round().astype(int)
-            guides[:, :2], guides[:, 2] = path[selected], length[-1] - length[selected]
-        return guides
+    def _store_maps(self, robots: np.ndarray, fields: Sequence[np.ndarray]) -> None:
+        """Store the geodesic maps of robots whose tasks are stored, with given obstacle fields."""
+        maps = [geodesic_map(f, *self.tasks[i, GOAL : GOAL + 2].tolist()) for i, f in zip(robots, fields, strict=True)]
+        missing = max(map(len, maps)) - self._geodesic_maps.shape[1]
+        if missing > 0:
+            self._geodesic_maps, self._record = np.pad(self._geodesic_maps, ((0, 0), (0, missing))), None
+        for i, packed in zip(robots.tolist(), maps, strict=True):
+            self._geodesic_maps[i, : len(packed)] = packed
 
     def _draw_noise(self, i: int) -> None:
         generator = self._generators[i]
@@ -445,4 +450,5 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
             settings.model.advance,
             settings.model.state_cost or no_state_cost,
         )
-    return stepping.start_episodes, *moving, stepping.end_periods, observe_robots
+    mapping = (solve_eikonal,) if settings.observation == "geodesic" else ()
+    return stepping.start_episodes, *moving, stepping.end_periods, observe_robots, *mapping

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import types
+from numba import float32, types
 
 from leapnav.envs.kernels import record_type
 from leapnav.envs.kernels.types import CUBE, INTEGERS, MATRIX, VECTOR
@@ -51,6 +51,18 @@ _TIMED_PARTS = {**PARTS, "time": TIME_COST}
 N_GUIDE_POINTS = 17  # points along the reference path, for the potential
 
 
+def guide_points(goal: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
+    """Return the guide points of a reference path (K, >= 2), see `SimulationState`; without one, only the goal."""
+    guides = np.zeros((N_GUIDE_POINTS, 3))
+    guides[:, :2] = goal
+    if reference is not None:
+        path = reference[:, :2].astype(float)
+        length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        selected = np.linspace(0, len(path) - 1, N_GUIDE_POINTS).round().astype(int)
+        guides[:, :2], guides[:, 2] = path[selected], length[-1] - length[selected]
+    return guides
+
+
 def parts(free_horizon: bool) -> dict[str, int]:
     """Return the columns of the parts of the reward."""
     return _TIMED_PARTS if free_horizon else PARTS
@@ -71,6 +83,7 @@ class SimulationState(NamedTuple):
             each to the goal.
         noise (count, rows, columns): standard normal numbers.
         noise_rows (count,): the row of `noise` that each robot uses.
+        maps (count, M): packed geodesic maps, see `leapnav.envs.geodesics`, float32; empty unless they are observed.
         settings (PACKED,): see `leapnav.envs.settings`.
 
     """
@@ -83,6 +96,7 @@ class SimulationState(NamedTuple):
     guides: np.ndarray
     noise: np.ndarray
     noise_rows: np.ndarray
+    maps: np.ndarray
     settings: np.ndarray
 
 
@@ -96,6 +110,7 @@ SIMULATION_STATE = record_type(
     guides=CUBE,
     noise=CUBE,
     noise_rows=INTEGERS,
+    maps=float32[:, ::1],
     settings=VECTOR,
 )
 # The same as a plain tuple, which Numba receives from Python in less time than a named one.

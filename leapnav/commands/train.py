@@ -89,9 +89,10 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
         if not following or following[0].startswith("--"):
             raise ValueError("warm_start: expected demonstrations or a policy, got none")
     warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
-    free = {"horizon": "free"} if is_train and _option(arguments, "--horizon") == "free" else {}
+    given = {name: _option(arguments, f"--{name}") for name in ("horizon", "observation")} if is_train else {}
+    changes = {name: value for name, value in given.items() if value in ("free", "lidar")}  # those with other defaults
     defaults: dict[str, Any] = {
-        name: replace(kind.tuned(family, warm=warm, **free), out=tyro.MISSING) for name, kind in ALGORITHMS.items()
+        name: replace(kind.tuned(family, warm=warm, **changes), out=tyro.MISSING) for name, kind in ALGORITHMS.items()
     }
     if is_train and "--resume" in arguments and out is not None:
         algorithm, config = read_config(Path(out))

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from torch.optim.lr_scheduler import LambdaLR
 
-from leapnav.envs.simulation.observations import goal_entries, motion_entries
+from leapnav.envs.simulation.observations import goal_entries
 from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -132,11 +132,13 @@ class Cloning:
         check_observations(policy, dataset)
         model = dataset.settings.model
         n_goal = goal_entries(dataset.settings)
-        beams = dataset.observations.shape[1] - n_goal - motion_entries(dataset.settings)
+        settings = dataset.settings
+        beams = settings.lidar_beams if settings.has_lidar else 0
+        geodesic = settings.observation == "geodesic"
         can_reverse = model.reversal is not None and dataset.is_reversible
         self._symmetries = [
-            *([partial(mirror, model=model, n_goal=n_goal)] if model.mirror is not None else []),
-            *([partial(time_reverse, model=model, n_goal=n_goal)] if can_reverse else []),
+            *([partial(mirror, model=model, n_goal=n_goal, geodesic=geodesic)] if model.mirror is not None else []),
+            *([partial(time_reverse, model=model, n_goal=n_goal, geodesic=geodesic)] if can_reverse else []),
         ]
         if config.augment and can_reverse and beams % 2:
             raise ValueError(f"augment: expected an even number of lidar beams, got {beams}; set augment=False")

@@ -23,29 +23,21 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from leapnav.envs.episodes import play_episode
-from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.progress import advance, progress_bar, stop_early
-from leapnav.envs.utils.validation import check_at_least, check_not_negative, check_positive
-from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
-from leapnav.experts.data.demonstrations import state_of
+from leapnav.envs.utils.validation import check_at_least, check_choice, check_not_negative, check_positive
+from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.learning.cloning import Cloning, check_observations
 from leapnav.training.learning.dataset import Dataset
+from leapnav.training.learning.driving import DrivenEpisode, drive_episodes
+from leapnav.training.learning.takeovers import TAKEOVERS, label_episodes
 from leapnav.training.policies.actors import policy_of
-from leapnav.training.robots.vec_env import NavigateVecEnv, environment_seed
+from leapnav.training.robots.vec_env import NavigateVecEnv
 from leapnav.training.threads import limit_threads
 
 EPISODES_PER_TASK = 16  # episodes labelled in one task of a worker
-# Times of the takeovers before a collision (s), denser shortly before it. In an episode that misses its goal the number
-# of takeovers is the same, at uniformly distributed times. With a free horizon, a robot that misses its goal has mostly
-# stopped, between two paths of similar cost: the times are then those before a time shortly after the stop.
-TAKEOVER_TIMES = np.array([8.0, 6.5, 5.0, 4.0, 3.25, 2.5, 2.0, 1.5, 1.1, 0.8, 0.5, 0.3])
-STOP_DISTANCE, AFTER_STOP = 0.1, 0.6  # m (and rad) from the last state; s
-RELATIVE_SPREAD = 0.2  # half-width of the random factor of these times around 1
-MIN_TIME_LEFT = 1.0  # s before the horizon, after which the expert does not take over
+SCENARIO_STREAM, TAKEOVER_STREAM = 1, 2  # streams of the seed of a round
 # Properties of the environment's settings that DAgger does not support, as named in the error message.
 _UNSUPPORTED = {
     "disturbed": "disturbances",
@@ -165,11 +157,10 @@ class DAgger:
         number, config = len(self.rounds), self.config
         rng = np.random.default_rng([config.seed, number])
         name = f"Round {number + 1} of {config.rounds}"
-        self._venv.seed(environment_seed(config.seed, number))
         episodes = self._drive(name, progress)
-        takeovers = self._choose_takeovers(episodes, rng)
-        with progress_bar(total=len(takeovers), label=f"{name}: labelling", unit="episodes", show=progress) as bar:
-            samples = self._label(takeovers, bar)
+        chosen = self._choose_episodes(episodes, rng)
+        with progress_bar(total=len(chosen), label=f"{name}: labelling", unit="episodes", show=progress) as bar:
+            samples = self._label(chosen, bar)
         if samples is not None:
             if self._folder is not None:
                 samples.save(self._folder / f"round-{number + 1:03d}.npz")
@@ -204,50 +195,43 @@ class DAgger:
                 continue
             self._parts.append(Dataset.load(self._folder / f"round-{done.number:03d}.npz"))
 
-    def _drive(self, name: str, progress: bool) -> list[_Episode]:
+    def _drive(self, name: str, progress: bool) -> list[DrivenEpisode]:
         """Return the episodes that the learner drives in a round."""
-        count = self._venv.num_envs
-        observations = np.asarray(self._venv.reset())
-        playing = self._venv.get_attr("scenario")
-        paths: list[list[np.ndarray]] = [[] for _ in range(count)]
-        episodes: list[_Episode] = []
-        failures = 0
-        driving = f"{name}: driving"
-        memory, starts = None, np.ones(count, dtype=bool)
-        with progress_bar(total=self.config.max_failures, label=driving, unit="failures", show=progress) as bar:
-            while failures < self.config.max_failures and len(episodes) < self.config.max_episodes:
-                for path, state in zip(paths, self._venv.venv.states, strict=True):
-                    path.append(state)
-                actions, memory = self._policy.predict(observations, memory, starts, deterministic=True)
-                stepped, _, starts, infos = self._venv.step(actions)
-                observations = np.asarray(stepped)
-                for i in np.flatnonzero(starts).tolist():
-                    success, collision = bool(infos[i]["is_success"]), bool(infos[i]["collision"])
-                    episodes.append(_Episode(playing[i], np.array(paths[i]), success, collision))
-                    paths[i] = []
-                    failures += not success
-                    advance(bar, not success)
-                if starts.any():
-                    playing = self._venv.get_attr("scenario")
-            if failures < self.config.max_failures:
+        config, robots = self.config, self._venv.venv
+        episodes: list[DrivenEpisode] = []
+        failures, seed = 0, (config.seed, len(self.rounds), SCENARIO_STREAM)
+        driving = drive_episodes(
+            self._policy, robots.source, robots.settings, seed, robots=robots.num_envs, workers=self._workers
+        )
+        label = f"{name}: driving"
+        with progress_bar(total=config.max_failures, label=label, unit="failures", show=progress) as bar:
+            while failures < config.max_failures and len(episodes) < config.max_episodes:
+                episodes.append(next(driving))
+                failures += not episodes[-1].success
+                advance(bar, not episodes[-1].success)
+            if failures < config.max_failures:
                 stop_early(bar, f"{len(episodes)} episodes with {failures} failures")
+        driving.close()
         return episodes
 
-    def _choose_takeovers(self, episodes: Sequence[_Episode], rng: np.random.Generator) -> list[list[Scenario]]:
-        """Return the scenarios that start at the takeovers, for all failed and some of the successful episodes."""
+    def _choose_episodes(self, episodes: Sequence[DrivenEpisode], rng: np.random.Generator) -> list[DrivenEpisode]:
+        """Return all failed and some of the successful episodes, in random order."""
         failed = [episode for episode in episodes if not episode.success]
         succeeded = [episode for episode in episodes if episode.success]
         count = round(self.config.successes * max(1, len(failed)))
         chosen = failed + [succeeded[i] for i in rng.permutation(len(succeeded))[:count]]
-        takeovers = [_takeovers(episode, self._venv.venv.settings.control_period, rng) for episode in chosen]
-        return [takeovers[i] for i in rng.permutation(len(takeovers)) if takeovers[i]]
+        return [chosen[i] for i in rng.permutation(len(chosen))]
 
-    def _label(self, takeovers: Sequence[Sequence[Scenario]], bar: Any) -> Dataset | None:
+    def _label(self, episodes: Sequence[DrivenEpisode], bar: Any) -> Dataset | None:
         """Return the samples of the expert after the takeovers; None if it has no optimum in any of them."""
         # The division into tasks does not depend on the number of workers, and neither do the samples.
-        portions = [takeovers[k : k + EPISODES_PER_TASK] for k in range(0, len(takeovers), EPISODES_PER_TASK)]
-        settings, run = self._venv.venv.settings, delayed(_label)
-        tasks = (run(settings, self._expert.settings, portion, self.config.lead) for portion in portions)
+        portions = [episodes[k : k + EPISODES_PER_TASK] for k in range(0, len(episodes), EPISODES_PER_TASK)]
+        settings, quick = self._venv.venv.settings, bool(self._expert.settings["quick"])
+        seed = self.config.seed, len(self.rounds), TAKEOVER_STREAM
+        tasks = (
+            delayed(label_episodes)(settings, self.config, quick, portion, (*seed, number))
+            for number, portion in enumerate(portions)
+        )
         labelled = cast(Iterator[list[Dataset]], Parallel(self._workers, return_as="generator")(tasks))
         parts: list[Dataset] = []
         for datasets, portion in zip(labelled, portions, strict=True):
@@ -268,103 +252,6 @@ class DAgger:
         return min(loss.validation for loss in fit.losses)
 
 
-@dataclass(frozen=True)
-class _Episode:
-    """An episode of the learner: its scenario, the states (K, n) before its K actions, and its outcome."""
-
-    scenario: Scenario
-    states: np.ndarray
-    success: bool
-    collision: bool
-
-
-def _takeovers(episode: _Episode, period: float, rng: np.random.Generator) -> list[Scenario]:
-    """Return scenarios for the rest of an episode, each from a takeover, with decreasing times left."""
-    end, horizon = len(episode.states) * period, episode.scenario.horizon
-    if episode.success:
-        times = rng.uniform(0.0, end, 1)
-    elif episode.collision or horizon is None:
-        n_takeovers = len(TAKEOVER_TIMES)
-        decision = end if episode.collision else min(_stop_time(episode.states, period) + AFTER_STOP, end)
-        times = decision - TAKEOVER_TIMES * rng.uniform(1 - RELATIVE_SPREAD, 1 + RELATIVE_SPREAD, n_takeovers)
-    else:
-        times = np.sort(rng.uniform(0.0, end, len(TAKEOVER_TIMES)))
-    steps = np.unique((times / period).round().astype(int))
-    scenarios = []
-    for step in steps[(steps > 0) & (steps < len(episode.states))].tolist():
-        if horizon is not None and horizon - step * period < MIN_TIME_LEFT:
-            break
-        x, y, heading, *motion = episode.states[step].tolist()
-        rest: dict[str, Any] = {"start": (x, y, heading)}
-        if horizon is not None:
-            rest["horizon"] = round(horizon - step * period, 9)
-        if motion:
-            rest["start_motion"] = tuple(motion)
-        scenarios.append(episode.scenario.model_copy(update=rest))
-    return scenarios
-
-
-def _stop_time(states: np.ndarray, period: float) -> float:
-    """Return the time (s) from which the robot stays where the episode ends."""
-    distances = np.linalg.norm(states[:, :3] - states[-1, :3], axis=1)
-    moving = np.flatnonzero(distances > STOP_DISTANCE)
-    return period * (int(moving[-1]) + 1 if len(moving) else 0)
-
-
-def _label(
-    settings: EnvironmentSettings, expert: dict[str, Any], takeovers: Sequence[Sequence[Scenario]], lead: float
-) -> list[Dataset]:
-    """Return the samples of the first `lead` seconds after takeovers, grouped by episode in order of time.
-
-    After the first takeover of an episode without an optimum the later ones are skipped.
-    """
-    arguments = {name: value for name, value in vars(settings).items() if name != "goal_conditioned"}
-    env = NavigateEnv(split="fresh", **arguments)
-    policy = ExpertPolicy(env, workers=1, **expert)
-    datasets = []
-    for scenarios in takeovers:
-        for scenario in scenarios:
-            samples = _demonstrated(env, policy, scenario, lead)
-            if samples is None:
-                break
-            datasets.append(samples)
-    return datasets
-
-
-def _demonstrated(env: NavigateEnv, expert: ExpertPolicy, scenario: Scenario, lead: float) -> Dataset | None:
-    """Return the samples of the first `lead` seconds of an episode of the expert; None if it has no optimum."""
-    rows: list[tuple[Any, ...]] = []
-
-    def act(observation: Any, info: dict[str, Any]) -> np.ndarray | None:
-        if info["time"] >= lead - 1e-9:
-            return None
-        action, _ = expert.predict(observation)
-        cost, costate = expert.labels()
-        if not np.isfinite(cost[0]):  # the goal cannot be reached any more, so the action is not a label
-            return None
-        rows.append((observation, action, -cost[0], costate[0], state_of(info), info["time"], action))
-        return action
-
-    try:
-        _, _, steps = play_episode(env, act, options={"scenario": scenario})
-        rewards = [step.reward for step in steps]
-    except NoOptimumError:
-        return None
-    if not rows:
-        return None
-    names = "observations", "actions", "returns", "costates", "states", "times", "executed"
-    columns: dict[str, Any] = {
-        name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
-    }
-    return Dataset(
-        **columns,
-        rewards=np.array(rewards),
-        episodes=np.zeros(len(rows), dtype=int),
-        scenarios=(scenario.to_json(),),
-        settings=env.settings,
-    )
-
-
 def _check_environment(settings: EnvironmentSettings) -> None:
     """Raise ValueError unless an episode can be continued from a state and a time alone."""
     for name, feature in _UNSUPPORTED.items():
@@ -378,6 +265,7 @@ def check_dagger(config: DAggerConfig) -> None:
     """Raise ValueError unless the settings of DAgger are valid; the message names the setting and its value."""
     for name in ("rounds", "max_failures", "max_episodes", "epochs", "last_epochs"):
         check_at_least(name, getattr(config, name), 1)
+    check_choice("takeovers", config.takeovers, TAKEOVERS)
     check_not_negative("successes", config.successes)
-    for name in ("learning_rate", "lead"):
+    for name in ("learning_rate", "lead", "regret_threshold"):
         check_positive(name, getattr(config, name))

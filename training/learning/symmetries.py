@@ -8,6 +8,8 @@ optimal in the scenario with the start and goal headings rotated by 180 degrees,
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch as th
 
 from leapnav.envs.robots import RobotModel, Symmetry, Unicycle
@@ -19,7 +21,12 @@ _TIME_REVERSE_SIGNS = th.tensor([-1.0, -1, 1, 1, 1, -1, -1, 1, 1])
 
 
 def mirror(
-    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle, n_goal: int = GOAL_ENTRIES
+    observations: th.Tensor,
+    actions: th.Tensor,
+    model: type[RobotModel] = Unicycle,
+    n_goal: int = GOAL_ENTRIES,
+    *,
+    geodesic: bool = False,
 ) -> tuple[th.Tensor, th.Tensor]:
     """Exchange left and right.
 
@@ -28,6 +35,7 @@ def mirror(
         actions (B, m): actions.
         model: the robot's model.
         n_goal: number of entries of the observation's part `goal`.
+        geodesic: whether the observations contain detours and the geodesic distance.
 
     Returns:
         The mirrored observations and actions.
@@ -37,14 +45,20 @@ def mirror(
 
     """
     symmetry = _require(model, "mirror", model.mirror)
-    first = n_goal + len(symmetry.motion)
-    ranges = observations[:, first:]
-    ranges = th.cat([ranges[:, :1], ranges[:, 1:].flip(1)], dim=1)
-    return _transformed(observations, actions, _MIRROR_SIGNS[:n_goal], symmetry, ranges)
+
+    def reflected(values: th.Tensor) -> th.Tensor:
+        return th.cat([values[:, :1], values[:, 1:].flip(1)], dim=1)
+
+    return _transformed(observations, actions, _MIRROR_SIGNS[:n_goal], symmetry, reflected, geodesic)
 
 
 def time_reverse(
-    observations: th.Tensor, actions: th.Tensor, model: type[RobotModel] = Unicycle, n_goal: int = GOAL_ENTRIES
+    observations: th.Tensor,
+    actions: th.Tensor,
+    model: type[RobotModel] = Unicycle,
+    n_goal: int = GOAL_ENTRIES,
+    *,
+    geodesic: bool = False,
 ) -> tuple[th.Tensor, th.Tensor]:
     """Exchange forwards and backwards: rotate the robot and the goal heading by 180 degrees, and negate the speed.
 
@@ -53,6 +67,7 @@ def time_reverse(
         actions (B, m): actions.
         model: the robot's model.
         n_goal: number of entries of the observation's part `goal`.
+        geodesic: whether the observations contain detours and the geodesic distance.
 
     Returns:
         The transformed observations and actions.
@@ -62,11 +77,13 @@ def time_reverse(
 
     """
     symmetry = _require(model, "reversal", model.reversal)
-    ranges = observations[:, n_goal + len(symmetry.motion) :]
-    if ranges.shape[1] % 2:
-        raise ValueError(f"time reversal needs an even number of lidar beams, got {ranges.shape[1]}")
-    ranges = ranges.roll(ranges.shape[1] // 2, dims=1)
-    return _transformed(observations, actions, _TIME_REVERSE_SIGNS[:n_goal], symmetry, ranges)
+
+    def rotated(values: th.Tensor) -> th.Tensor:
+        if values.shape[1] % 2:
+            raise ValueError(f"time reversal needs an even number of lidar beams, got {values.shape[1]}")
+        return values.roll(values.shape[1] // 2, dims=1)
+
+    return _transformed(observations, actions, _TIME_REVERSE_SIGNS[:n_goal], symmetry, rotated, geodesic)
 
 
 def _require(model: type[RobotModel], name: str, symmetry: Symmetry | None) -> Symmetry:
@@ -76,10 +93,21 @@ def _require(model: type[RobotModel], name: str, symmetry: Symmetry | None) -> S
 
 
 def _transformed(
-    observations: th.Tensor, actions: th.Tensor, signs: th.Tensor, symmetry: Symmetry, ranges: th.Tensor
+    observations: th.Tensor,
+    actions: th.Tensor,
+    signs: th.Tensor,
+    symmetry: Symmetry,
+    moved: Callable[[th.Tensor], th.Tensor],
+    geodesic: bool,
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Return observations with other signs of the first entries and other lidar ranges, and transformed actions."""
+    """Return observations with other signs of the first entries and moved values of the beams, and the actions."""
     device = observations.device
     signs = th.cat([signs, th.tensor(symmetry.motion, dtype=signs.dtype)]).to(device)
     matrix = th.tensor(symmetry.controls, dtype=actions.dtype, device=device)
-    return th.cat([observations[:, : len(signs)] * signs, ranges], dim=1), actions @ matrix.T
+    beams = observations[:, len(signs) :]
+    if geodesic:
+        count = beams.shape[1] // 2
+        parts = [moved(beams[:, :count]), moved(beams[:, count:-1]), beams[:, -1:]]
+    else:
+        parts = [moved(beams)]
+    return th.cat([observations[:, : len(signs)] * signs, *parts], dim=1), actions @ matrix.T

@@ -11,7 +11,12 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, has_time_left
+from leapnav.envs.simulation.observations import (
+    FREE_GOAL_ENTRIES,
+    GOAL_ENTRIES,
+    has_geodesics,
+    has_time_left,
+)
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.training.policies.momentum import MomentumPolicy
 
@@ -32,26 +37,46 @@ class NavigationFeatures(BaseFeaturesExtractor):
     # Features of the goal part and of each entry of the motion part, with a fixed and with a free horizon
     POSE_FEATURES, FREE_POSE_FEATURES = 23, 14
     MOTION_FEATURES, FREE_MOTION_FEATURES = 7, 3
-    BEAM_FEATURES = 3  # features of each lidar beam
+    BEAM_FEATURES = 3  # features of each lidar beam, and of each detour
+    DISTANCE_FEATURES, FREE_DISTANCE_FEATURES = 5, 3  # features of the geodesic distance
 
     def __init__(self, observation_space: spaces.Box) -> None:
         self._is_timed = has_time_left(observation_space.high)
         goal = GOAL_ENTRIES if self._is_timed else FREE_GOAL_ENTRIES
         # Ranges are not negative; the entries of the motion part, which is before them, can be.
         motion = int((observation_space.low[goal:] < 0.0).sum())
-        beams = observation_space.shape[0] - goal - motion
+        beams = observation_space.shape[0] - goal - motion  # the detours count as beams
+        is_geodesic = has_geodesics(observation_space.high)
+        beams -= is_geodesic  # the last entry is the geodesic distance
+        self._beams = beams // 2 if is_geodesic else beams
         if self._is_timed:
             features = self.POSE_FEATURES + self.MOTION_FEATURES * motion
         else:
             features = self.FREE_POSE_FEATURES + self.FREE_MOTION_FEATURES * motion
+        if is_geodesic:
+            features += self.DISTANCE_FEATURES if self._is_timed else self.FREE_DISTANCE_FEATURES
         super().__init__(observation_space, features + self.BEAM_FEATURES * beams)
         self._first_motion, self._first_beam = goal, goal + motion
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features (B, features_dim) of observations (B, d)."""
         features = self._timed_features if self._is_timed else self._free_features
-        motion, ranges = observations[:, self._first_motion : self._first_beam], observations[:, self._first_beam :]
-        return th.cat([*features(observations, motion), *_range_features(ranges)], dim=1)
+        motion, sensed = observations[:, self._first_motion : self._first_beam], observations[:, self._first_beam :]
+        ranges, geodesics = sensed[:, : self._beams], sensed[:, self._beams :]
+        parts = [*features(observations, motion), *_range_features(ranges)]
+        if geodesics.shape[1]:
+            parts += _detour_features(geodesics[:, :-1])
+            parts += self._distance_features(observations, geodesics[:, -1:])
+        return th.cat(parts, dim=1)
+
+    def _distance_features(self, observations: th.Tensor, distance: th.Tensor) -> list[th.Tensor]:
+        """Return the features of the geodesic distance (B, 1)."""
+        around = distance - observations[:, 0:2].norm(dim=1, keepdim=True)
+        parts = [distance / 10, th.log(distance + 0.05), around]
+        if self._is_timed:
+            needed_speed = distance / observations[:, 4:5].clamp(min=CONTROL_PERIOD)
+            parts += [needed_speed.clamp(0, 3), th.tanh(needed_speed)]
+        return parts
 
     def _free_features(self, observations: th.Tensor, motion: th.Tensor) -> list[th.Tensor]:
         """Return the features of the pose and of the motion with a free horizon."""
@@ -114,6 +139,11 @@ class NavigationFeatures(BaseFeaturesExtractor):
 def _range_features(ranges: th.Tensor) -> list[th.Tensor]:
     """Return the features of the lidar ranges (B, beams)."""
     return [ranges / 5, th.exp(-(ranges - ROBOT_RADIUS) / 0.3), ROBOT_RADIUS / ranges.clamp(min=0.1)]
+
+
+def _detour_features(detours: th.Tensor) -> list[th.Tensor]:
+    """Return the features of the detours (B, beams)."""
+    return [detours, th.exp(-detours / 0.5), th.exp(-detours / 0.1)]
 
 
 def _acceleration_to_rest(rates: th.Tensor, needed: th.Tensor, time_left: th.Tensor) -> th.Tensor:

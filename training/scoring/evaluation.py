@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 BATCH_SIZE = 256  # episodes simulated in parallel
 MAX_TIMED_ACTIONS = 100
+_UNLISTED = ("states", "costs", "episode_return")  # not in the record of an episode
 MIN_REVERSE_SPEED = 0.05  # m/s; an optimum that reaches this speed backwards counts as reversing
 
 
@@ -109,6 +110,7 @@ class Episode:
         reference_clearance: minimum clearance of the optimum (m).
         reversing: whether the optimum contains backward driving.
         states (K + 1, n): the states before and after each environment step.
+        costs (K + 1,): the cost J so far at these states.
         lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
 
     """
@@ -126,6 +128,7 @@ class Episode:
     reference_clearance: float
     reversing: bool
     states: np.ndarray
+    costs: np.ndarray
     lower_bound: float = math.nan
 
     @property
@@ -171,8 +174,8 @@ class Episode:
         return self.cost / self.reference_cost - 1.0, high
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes without the states, and SOC and regret."""
-        record = {name: value for name, value in vars(self).items() if name not in ("states", "episode_return")}
+        """Return the attributes without the states and their costs, and SOC and regret."""
+        record = {name: value for name, value in vars(self).items() if name not in _UNLISTED}
         return {**record, "return": self.episode_return, "soc": self.soc, "regret": self.regret}
 
 
@@ -308,7 +311,8 @@ def _play_batch(
     venv = NavigateVectorEnv(count, bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
     policy = _policy_for(policy_or_factory, venv, venv.single_observation_space)
     observations, _ = venv.reset(seed=seed, options={"index": list(indices)})
-    states, returns, clearances = [venv.states], np.zeros(count), np.full(count, np.inf)
+    states, costs = [venv.states], [np.zeros(count)]
+    returns, clearances = np.zeros(count), np.full(count, np.inf)
     episodes: list[Episode | None] = [None] * count
     state, starts = None, np.ones(count, dtype=bool)
     while any(episode is None for episode in episodes):
@@ -320,15 +324,16 @@ def _play_batch(
         # Robots whose episode has ended are already in the next one; their last step is in `final_info`.
         last = infos.get("final_info", infos)
         states.append(np.where(starts[:, None], _states(last), _states(infos)))
+        costs.append(np.where(starts, last["cost"], infos["cost"]))
         clearances = np.minimum(clearances, np.where(starts, last["clearance"], infos["clearance"]))
         for i in np.flatnonzero(starts & playing).tolist():
             episodes[i] = _make_episode(
                 bank,
                 indices[i],
                 np.array([row[i] for row in states]),
+                np.array([row[i] for row in costs]),
                 success=bool(last["is_success"][i]),
                 collision=bool(last["collision"][i]),
-                cost=float(last["cost"][i]),
                 episode_return=float(returns[i]),
                 clearance=float(clearances[i]),
             )
@@ -343,10 +348,10 @@ def _states(infos: Mapping[str, Any]) -> np.ndarray:
 
 
 def _make_episode(
-    bank: ScenarioBank, index: int, states: np.ndarray, *, success: bool, cost: float, **outcome: Any
+    bank: ScenarioBank, index: int, states: np.ndarray, costs: np.ndarray, *, success: bool, **outcome: Any
 ) -> Episode:
     """Combine the outcome of an episode with the reference of its scenario."""
-    scenario, reference = bank[index], bank.reference(index)
+    scenario, reference, cost = bank[index], bank.reference(index), float(costs[-1])
     return Episode(
         family=bank.family,
         index=index,
@@ -358,6 +363,7 @@ def _make_episode(
         reference_clearance=reference.certificate[3],
         reversing=bool(_speeds(reference).min() < -MIN_REVERSE_SPEED),
         states=states,
+        costs=costs,
         lower_bound=math.nan if reference.lower_bound is None else reference.lower_bound,
         **outcome,
     )

@@ -1,0 +1,148 @@
+"""Geodesic distances to the goal: the length of the shortest path among the obstacles, and how much each beam adds.
+
+The length is measured in the metric m(x) ds with m = sqrt(1 + Phi(x) / E), in which the path of an optimum is nearly a
+shortest path: at constant energy E = 1/2 v^2 - Phi, the integral of 1/2 v^2 + Phi along a path is proportional to that
+of sqrt(E + Phi) (Jacobi's form of the principle of least action; V. I. Arnold, Mathematical Methods of Classical
+Mechanics, 1989, section 45). Far from obstacles it is the length in metres. The distances solve the eikonal equation
+|grad D| = m, D(goal) = 0, on a grid, by fast sweeping (H. Zhao, "A fast sweeping method for eikonal equations",
+Mathematics of Computation 74, 2005). The robot's position may lie anywhere in the arena: in obstacles the metric is
+large, but finite.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+
+import numpy as np
+from numba import float32, float64
+
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.field import ARENA
+from leapnav.envs.shapes.proximity import proximity_value
+
+SPACING = 0.1  # m, of the grid; larger in an arena in which the grid would have more than MAX_POINTS points
+MAX_POINTS = 40_000
+REFERENCE_SPEED = 0.8  # m/s; E is half its square
+OBSTACLE_METRIC = 20.0  # lower bound of the metric in obstacles
+SOURCE_RADIUS = 2.5  # spacings around the goal in which the distance is that of a straight line
+TOLERANCE = 1e-3  # m; largest change in the last iteration of the sweeps
+MAX_SWEEPS = 60
+BEAM_STEP = 0.25  # m between the points of a beam at which a detour is evaluated
+MAX_BEAM = 5.0  # m; more distant points are not evaluated
+MAX_DETOUR = 3.0  # m; upper bound of an observed detour
+CACHE_SIZE = 512  # maps; each has 41 kB in an arena of 10 m x 10 m
+
+# Layout of a packed map: the first point (m), spacing (m), number of points in x and in y, then the distances.
+X_MIN, Y_MIN, STEP, NX, NY, VALUES = range(6)
+FAR = 1e6
+
+_cache: OrderedDict[tuple[bytes, float, float], np.ndarray] = OrderedDict()
+
+
+def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
+    """Return the distances to a goal on a grid over the arena, as a packed map for the kernels of this module, float32.
+
+    The most recently used maps are kept, so that the episodes of a scenario share one.
+
+    Args:
+        field: packed obstacle field.
+        goal_x, goal_y: position of the goal (m).
+
+    """
+    key = field.tobytes(), goal_x, goal_y
+    found = _cache.get(key)
+    if found is None:
+        width, height = field[ARENA + 2] - field[ARENA], field[ARENA + 3] - field[ARENA + 1]
+        spacing = max(SPACING, math.sqrt(width * height / MAX_POINTS))
+        size = math.ceil(width / spacing - 1e-9) + 1, math.ceil(height / spacing - 1e-9) + 1
+        distances = np.empty(size)
+        solve_eikonal(field, goal_x, goal_y, spacing, distances)
+        header = field[ARENA], field[ARENA + 1], spacing, *size
+        found = np.concatenate([header, distances.ravel()]).astype(np.float32)
+        _cache[key] = found
+        if len(_cache) > CACHE_SIZE:
+            _cache.popitem(last=False)
+    else:
+        _cache.move_to_end(key)
+    return found
+
+
+@kernel(NOTHING(CONSTANT, float64, float64, float64, MATRIX))
+def solve_eikonal(field, goal_x, goal_y, spacing, distances):
+    """Write the distances to a goal (nx, ny) on a grid that starts at the lower left corner of the arena."""
+    nx, ny = distances.shape
+    metric = np.empty((nx, ny))
+    energy = 0.5 * REFERENCE_SPEED**2
+    for i in range(nx):
+        for j in range(ny):
+            x, y = field[ARENA] + spacing * i, field[ARENA + 1] + spacing * j
+            factor = math.sqrt(1.0 + proximity_value(x, y, field[2], field) / energy)
+            if clearance(x, y, field)[0] <= 0.0:
+                factor = OBSTACLE_METRIC
+            metric[i, j] = spacing * min(factor, OBSTACLE_METRIC)
+            away = math.sqrt((x - goal_x) ** 2 + (y - goal_y) ** 2) / spacing
+            distances[i, j] = away * metric[i, j] if away <= SOURCE_RADIUS else FAR
+    for _ in range(MAX_SWEEPS):
+        largest = 0.0
+        for order in range(4):
+            for row in range(nx):
+                i = row if order % 2 == 0 else nx - 1 - row
+                for column in range(ny):
+                    j = column if order < 2 else ny - 1 - column
+                    a = min(distances[i - 1, j] if i > 0 else FAR, distances[i + 1, j] if i < nx - 1 else FAR)
+                    b = min(distances[i, j - 1] if j > 0 else FAR, distances[i, j + 1] if j < ny - 1 else FAR)
+                    step, low = metric[i, j], min(a, b)
+                    if low >= FAR:
+                        continue
+                    new = low + step  # from one neighbour, or from two
+                    if abs(a - b) < step:
+                        new = 0.5 * (a + b + math.sqrt(2.0 * step * step - (a - b) ** 2))
+                    if new < distances[i, j] - 1e-9:
+                        largest = max(largest, distances[i, j] - new)
+                        distances[i, j] = new
+        if largest < TOLERANCE:
+            break
+
+
+@kernel(float64(float64, float64, float32[::1]))
+def geodesic_distance(x, y, packed):
+    """Return the distance (m) from a point to the goal, by bilinear interpolation in a packed map."""
+    nx, ny = int(packed[NX]), int(packed[NY])
+    u = min(max((x - packed[X_MIN]) / packed[STEP], 0.0), nx - 1.0)
+    v = min(max((y - packed[Y_MIN]) / packed[STEP], 0.0), ny - 1.0)
+    i, j = min(int(u), nx - 2), min(int(v), ny - 2)
+    a, b = u - i, v - j
+    at = VALUES + i * ny + j
+    near = (1.0 - b) * packed[at] + b * packed[at + 1]
+    return (1.0 - a) * near + a * ((1.0 - b) * packed[at + ny] + b * packed[at + ny + 1])
+
+
+@kernel(NOTHING(float64, float64, float64, float64, float32[::1], float64, MATRIX, VECTOR, VECTOR))
+def geodesic_detours(x, y, cos, sin, packed, radius, beams, ranges, out):
+    """Write the detour of each lidar beam: what a path along the beam and then to the goal is longer than the shortest.
+
+    It is the minimum of s + D(p + s e) - D(p) over points of the beam at the distances s that the robot can reach,
+    at least 0 and at most `MAX_DETOUR`.
+
+    Args:
+        x, y: position p of the robot (m).
+        cos, sin: of its heading.
+        packed: see `geodesic_map`.
+        radius: radius of the robot (m).
+        beams (2, n): cosine and sine of the angle of each beam, relative to the heading.
+        ranges (n,): lidar ranges (m).
+        out (n,): overwritten.
+
+    """
+    here = geodesic_distance(x, y, packed)
+    for k in range(beams.shape[1]):
+        ex, ey = cos * beams[0, k] - sin * beams[1, k], sin * beams[0, k] + cos * beams[1, k]
+        reach = min(max(ranges[k] - radius, 0.0), MAX_BEAM)
+        best = MAX_DETOUR
+        for number in range(1, int(reach / BEAM_STEP) + 2):
+            s = min(BEAM_STEP * number, reach)
+            best = min(best, s + geodesic_distance(x + s * ex, y + s * ey, packed) - here)
+        out[k] = max(best, 0.0)

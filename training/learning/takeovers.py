@@ -1,0 +1,178 @@
+"""Takeovers: the states of a learner's episodes from which the expert drives, and the samples that it provides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from leapnav.envs.scenarios.faults import ScenarioError
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.simulation.observer import Observer
+from leapnav.experts.acting.policy import plan_actions
+from leapnav.experts.optimum import find_optimum
+from leapnav.experts.problem.extremal import Extremal
+from leapnav.training.config import DAggerConfig
+from leapnav.training.learning.dataset import Dataset
+from leapnav.training.learning.driving import DrivenEpisode
+
+TAKEOVERS = ("schedule", "regret")
+# Times of the scheduled takeovers before a collision (s), denser shortly before it. In an episode that misses its goal
+# the number of takeovers is the same, at uniformly distributed times. With a free horizon, a robot that misses its goal
+# has mostly stopped, between two paths of similar cost: the times are then those before a time shortly after the stop.
+TAKEOVER_TIMES = np.array([8.0, 6.5, 5.0, 4.0, 3.25, 2.5, 2.0, 1.5, 1.1, 0.8, 0.5, 0.3])
+STOP_DISTANCE, AFTER_STOP = 0.1, 0.6  # m (and rad) from the last state; s
+RELATIVE_SPREAD = 0.2  # half-width of the random factor of these times around 1
+MIN_TIME_LEFT = 1.0  # s before the horizon, after which the expert does not take over
+SEARCH_INTERVAL = 0.75  # s between the states at which the regret is computed
+REGRET_WINDOW = 3.0  # s in which the regret is accumulated
+
+
+class Labeller:
+    """Choose takeovers in the episodes of a learner, and label them.
+
+    Args:
+        settings: settings of the environment.
+        config: settings of DAgger.
+        quick: whether the searches examine only the most promising candidates, see `find_optimum`.
+
+    """
+
+    def __init__(self, settings: EnvironmentSettings, config: DAggerConfig, *, quick: bool) -> None:
+        self._settings, self._config, self._quick = settings, config, quick
+        self._observer = Observer(settings)
+
+    def label(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Dataset]:
+        """Return the samples of the takeovers of an episode, in order of time."""
+        choose = self._by_regret if self._config.takeovers == "regret" else self._by_schedule
+        lead = self._config.lead
+        return [samples_of(self._observer, self._settings, *taken, lead) for taken in choose(episode, rng)]
+
+    def _search(self, episode: DrivenEpisode, step: int) -> tuple[Scenario, Extremal] | None:
+        """Return the rest of an episode from a step on, and its optimum; None without one."""
+        scenario = rest_of(episode, step, self._settings.control_period)
+        if scenario is None:
+            return None
+        optimum = find_optimum(scenario, thorough=not self._quick)
+        return (scenario, optimum) if optimum.success else None
+
+    def _by_schedule(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[tuple[Scenario, Extremal]]:
+        """Return the takeovers at the scheduled times, until the first one without an optimum."""
+        chosen = []
+        for step in scheduled_steps(episode, self._settings.control_period, rng):
+            found = self._search(episode, step)
+            if found is None:
+                break
+            chosen.append(found)
+        return chosen
+
+    def _by_regret(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[tuple[Scenario, Extremal]]:
+        """Return the takeovers where the regret of the following or the previous decisions exceeds the threshold.
+
+        In a failed episode without such regret, they are those shortly before its end.
+        """
+        period, threshold = self._settings.control_period, self._config.regret_threshold
+        every = max(1, round(SEARCH_INTERVAL / period))
+        steps = range(int(rng.integers(1, every + 1)), len(episode.states) - 1, every)
+        if episode.success:  # a near miss, or not: the regret of the whole episode
+            first = self._search(episode, 0)
+            if first is None or episode.costs[-1] - first[1].cost <= threshold:
+                return []
+        found: list[tuple[int, tuple[Scenario, Extremal]]] = []
+        for step in steps:
+            searched = self._search(episode, step)
+            if searched is None:
+                break
+            found.append((step, searched))
+        values = np.array([episode.costs[step] + optimum.cost for step, (_, optimum) in found])
+        window = max(1, round(REGRET_WINDOW / SEARCH_INTERVAL))
+        chosen = []
+        # The cost so far plus the optimal cost to go increases by the regret. If the goal cannot be reached any more,
+        # the last decisions have an infinite regret.
+        lost = math.inf if not episode.success else episode.costs[-1]
+        following = np.append(values, [lost] * window)
+        for k, (_, searched) in enumerate(found):
+            ahead = following[k + 1 : k + 1 + window].max() - values[k]
+            behind = values[k] - values[max(0, k - window) : k + 1].min()
+            if max(ahead, behind) > threshold:
+                chosen.append(searched)
+        return chosen
+
+
+def scheduled_steps(episode: DrivenEpisode, period: float, rng: np.random.Generator) -> list[int]:
+    """Return the steps of an episode at which the expert takes over, in increasing order."""
+    count = len(episode.states) - 1
+    end, horizon = count * period, episode.scenario.horizon
+    if episode.success:
+        times = rng.uniform(0.0, end, 1)
+    elif episode.collision or horizon is None:
+        n_takeovers = len(TAKEOVER_TIMES)
+        decision = end if episode.collision else min(_stop_time(episode.states, period) + AFTER_STOP, end)
+        times = decision - TAKEOVER_TIMES * rng.uniform(1 - RELATIVE_SPREAD, 1 + RELATIVE_SPREAD, n_takeovers)
+    else:
+        times = np.sort(rng.uniform(0.0, end, len(TAKEOVER_TIMES)))
+    steps = np.unique((times / period).round().astype(int))
+    return steps[(steps > 0) & (steps < count)].tolist()
+
+
+def rest_of(episode: DrivenEpisode, step: int, period: float) -> Scenario | None:
+    """Return the scenario that starts at a state of an episode; None in collision or with little time left."""
+    horizon = episode.scenario.horizon
+    x, y, heading, *motion = episode.states[step].tolist()
+    rest: dict[str, Any] = {"start": (x, y, heading)}
+    if horizon is not None:
+        left = round(horizon - step * period, 9)
+        if left < MIN_TIME_LEFT:
+            return None
+        rest["horizon"] = left
+    if motion:
+        rest["start_motion"] = tuple(motion)
+    try:
+        return episode.scenario.model_copy(update=rest)
+    except ScenarioError:
+        return None
+
+
+def _stop_time(states: np.ndarray, period: float) -> float:
+    """Return the time (s) from which the robot stays where the episode ends."""
+    distances = np.linalg.norm(states[:, :3] - states[-1, :3], axis=1)
+    moving = np.flatnonzero(distances > STOP_DISTANCE)
+    return period * (int(moving[-1]) + 1 if len(moving) else 0)
+
+
+def samples_of(
+    observer: Observer, settings: EnvironmentSettings, scenario: Scenario, optimum: Extremal, lead: float
+) -> Dataset:
+    """Return the samples along the first `lead` seconds of an optimum, one per control period.
+
+    The states are those of the optimum, so neither a simulation nor further solves are necessary.
+    """
+    actions = plan_actions(optimum, scenario, settings.control_period)
+    actions = actions[: max(1, round(lead / settings.control_period))]
+    times = np.minimum(settings.control_period * np.arange(len(actions) + 1), optimum.horizon)
+    states, _, costates = optimum.evaluate(times[:-1])
+    costs = np.asarray(optimum.cost_to_go(times))
+    return Dataset(
+        observations=observer.observe([scenario] * len(actions), states, times[:-1]),
+        actions=actions,
+        returns=-costs[:-1],
+        costates=costates,
+        states=states,
+        times=times[:-1],
+        executed=actions,
+        rewards=np.diff(costs),
+        episodes=np.zeros(len(actions), dtype=int),
+        scenarios=(scenario.to_json(),),
+        settings=settings,
+    )
+
+
+def label_episodes(
+    settings: EnvironmentSettings, config: DAggerConfig, quick: bool, episodes: Sequence[DrivenEpisode], seed: Any
+) -> list[Dataset]:
+    """Return the samples of the takeovers of several episodes."""
+    labeller, rng = Labeller(settings, config, quick=quick), np.random.default_rng(seed)
+    return [samples for episode in episodes for samples in labeller.label(episode, rng)]
