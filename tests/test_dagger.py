@@ -4,9 +4,10 @@ from helpers import QUICK, fresh
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.experts import ExpertPolicy
+from leapnav.experts import ExpertPolicy, find_optimum
 from leapnav.training import DAgger, DAggerConfig, Dataset, behaviour_clone, make_vec_env
-from leapnav.training.learning.dagger import _Episode, _label, _takeovers
+from leapnav.training.learning.driving import DrivenEpisode
+from leapnav.training.learning.takeovers import Labeller, rest_of, scheduled_steps
 from leapnav.training.robots.rewards import ScaledReward
 
 
@@ -46,47 +47,81 @@ def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tm
         assert expert.costate() == pytest.approx(kept.costates[i], abs=1e-2 * max(1, np.abs(kept.costates[i]).max()))
 
 
+def driven(scenario, states, *, success=False, collision=False, costs=None):
+    """An episode with given states."""
+    costs = np.zeros(len(states)) if costs is None else costs
+    return DrivenEpisode(scenario, np.asarray(states, dtype=float), costs, success, collision)
+
+
 def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
     scenario = sample_scenario("clutter", 7)
-    poses = np.linspace(scenario.start, scenario.goal, 100)
+    poses = np.linspace(scenario.start, scenario.goal, 101)
     rng = np.random.default_rng(0)
-    crash = _takeovers(_Episode(scenario, poses, success=False, collision=True), 0.05, rng)
-    assert len(crash) > 5
-    left = [rest.horizon for rest in crash]
-    assert left == sorted(left, reverse=True)
-    for rest in crash:
-        step = round((scenario.horizon - rest.horizon) / 0.05)
-        assert rest.start == tuple(poses[step])
+    crash = driven(scenario, poses, collision=True)
+    steps = scheduled_steps(crash, 0.05, rng)
+    assert len(steps) > 5 and steps == sorted(steps)
+    for step in steps:
         assert 0.2 <= 5.0 - step * 0.05 <= 10.0
+        rest = rest_of(crash, step, 0.05)
+        assert rest.start == tuple(poses[step]) and rest.horizon == pytest.approx(scenario.horizon - step * 0.05)
         assert (rest.goal, rest.obstacles) == (scenario.goal, scenario.obstacles)
-    assert len(_takeovers(_Episode(scenario, poses, success=True, collision=False), 0.05, rng)) == 1
-    late = np.linspace(scenario.start, scenario.goal, round(scenario.horizon / 0.05))
-    for rest in _takeovers(_Episode(scenario, late, success=False, collision=True), 0.05, rng):
-        assert rest.horizon >= 1.0
+    assert len(scheduled_steps(driven(scenario, poses, success=True), 0.05, rng)) == 1
+    late = driven(scenario, np.linspace(scenario.start, scenario.goal, round(scenario.horizon / 0.05) + 1))
+    assert rest_of(late, len(late.states) - 15, 0.05) is None  # less than 1 s before the horizon
 
 
 def test_with_a_free_horizon_the_expert_takes_over_where_the_robot_stops():
     scenario = sample_scenario("clutter", 7, horizon="free")
     moving, still = np.linspace(scenario.start, scenario.goal, 100), np.tile(scenario.goal, (300, 1))
-    episode = _Episode(scenario, np.concatenate([moving, still]).astype(float), success=False, collision=False)
-    starts = [rest.start for rest in _takeovers(episode, 0.05, np.random.default_rng(0))]
-    assert len(starts) > 5 and all(rest in map(tuple, moving) for rest in starts[:-2])
-    assert scenario.goal in starts  # where it has stopped
-    assert _takeovers(episode, 0.05, np.random.default_rng(0))[0].time_limit == scenario.time_limit
+    episode = driven(scenario, np.concatenate([moving, still]))
+    starts = [rest_of(episode, step, 0.05) for step in scheduled_steps(episode, 0.05, np.random.default_rng(0))]
+    assert len(starts) > 5 and all(rest.start in map(tuple, moving) for rest in starts[:-2])
+    assert scenario.goal in [rest.start for rest in starts]  # where it has stopped
+    assert starts[0].time_limit == scenario.time_limit
 
 
 def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
-    """Takeovers after the first one without an optimum are skipped."""
-    solvable = sample_scenario("open", 7)
-    hopeless = solvable.model_copy(update={"horizon": 1.0})
-    settings = EnvironmentSettings()
-    found = _label(settings, {"quick": True}, [[solvable, hopeless, solvable], [solvable]], 0.5)
-    assert [len(part) for part in found] == [10, 10]
-    assert _label(settings, {"quick": True}, [[hopeless, solvable]], 0.5) == []
+    """A robot that drives away from the goal until it is too late to return."""
+    scenario = sample_scenario("open", 7)
+    steps = np.arange(round(scenario.horizon / 0.05) + 1)
+    states = np.array(scenario.start) * np.ones((len(steps), 1))
+    left = [
+        rest.horizon
+        for rest, _ in Labeller(EnvironmentSettings(), DAggerConfig(), quick=True)._by_schedule(
+            driven(scenario, states), np.random.default_rng(0)
+        )
+    ]
+    assert left and left == sorted(left, reverse=True)
+    assert not find_optimum(rest_of(driven(scenario, states), len(steps) - 25, 0.05)).success
+    assert left[-1] > find_optimum(scenario).horizon / 4
+
+
+def test_takeovers_by_regret_are_where_the_cost_increases():
+    """No takeover along the optimum, some where the robot waits for seconds, and none without a near miss."""
+    scenario = sample_scenario("clutter", 7)
+    optimum = find_optimum(scenario)
+    times = np.arange(0.0, optimum.horizon + 1e-9, 0.05)
+    settings, config = EnvironmentSettings(), DAggerConfig(takeovers="regret", lead=0.5)
+    labeller, rng = Labeller(settings, config, quick=True), np.random.default_rng(0)
+    costs = optimum.cost - optimum.cost_to_go(times)
+    along = driven(scenario, optimum.evaluate(times)[0], success=True, costs=costs)
+    assert labeller.label(along, rng) == []
+    # The robot follows the optimum for 3 s, waits for 4 s, and misses the goal.
+    moved = np.minimum(times, np.where(times < 7.0, 3.0, times - 4.0))
+    waiting = driven(scenario, optimum.evaluate(moved)[0], costs=optimum.cost - optimum.cost_to_go(moved))
+    taken = labeller.label(waiting, rng)
+    assert taken and all(len(samples) == 10 for samples in taken)
+    starts = [Scenario.from_json(samples.scenarios[0]).horizon for samples in taken]
+    assert scenario.horizon - max(starts) > 0.0
+    for samples in taken:
+        rest = Scenario.from_json(samples.scenarios[0])
+        assert find_optimum(rest).cost == pytest.approx(-samples.returns[0], rel=1e-6)
+        assert samples.rewards.sum() == pytest.approx(samples.returns[0] + find_optimum(rest).cost_to_go(0.5), rel=1e-6)
 
 
 def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, monkeypatch):
-    monkeypatch.setattr("leapnav.training.learning.dagger.EPISODES_PER_TASK", 1)
+    monkeypatch.setattr("leapnav.training.learning.dagger.LABELLED_PER_TASK", 1)
+    monkeypatch.setattr("leapnav.training.learning.dagger.DRIVEN_PER_TASK", 2)
     found = []
     for workers in (1, 1, 2):
         policy = fresh(env)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
     from leapnav.envs.scenarios.bank import ScenarioBank
+    from leapnav.training.scoring.comparison import Comparison
     from leapnav.training.scoring.policy_specs import PolicySpec
 
 POLICIES = """Policies: "expert", "random", "go-to-goal", an included policy (the name of its family), the directory
@@ -52,6 +54,9 @@ class Evaluate:
     """Picture of the scores and the performance profiles (.png, .pdf or .svg)."""
     episodes_plot: Path | None = None
     """Picture of the first policy's best, median and worst episodes, with their optima (.png, .pdf or .svg)."""
+    decisions: Path | None = None
+    """Picture of the first policy's episodes with the highest regret, coloured by where it was incurred (.png, .pdf or
+    .svg), and a table of its most expensive decisions."""
 
     def run(self) -> int:
         """Play the episodes and report the scores."""
@@ -64,7 +69,7 @@ class Evaluate:
             raise ValueError("policies: expected at least one: expert, random, go-to-goal or a directory; got none")
         if self.count is not None:
             check_at_least("count", self.count, 1)
-        for plot in (self.plot, self.episodes_plot):
+        for plot in (self.plot, self.episodes_plot, self.decisions):
             check_outputs(self.json, plot)
         # All are loaded before the first episode, so that a damaged file is reported at once.
         environment = parse_environment(self.env)
@@ -85,7 +90,20 @@ class Evaluate:
             first = next(iter(comparison.runs.values()))
             plot_episodes(comparison.banks, first[0].episodes, self.episodes_plot)
             print(f"wrote {self.episodes_plot}")
+        if self.decisions is not None:
+            self._write_decisions(comparison)
         return 0
+
+    def _write_decisions(self, comparison: Comparison) -> None:
+        """Write the picture of the most expensive decisions of the first policy, and print a table of them."""
+        from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions, print_decisions
+
+        assert self.decisions is not None  # checked by `run`
+        first = next(iter(comparison.runs.values()))[0]
+        found = costliest_decisions(first, comparison.banks, workers=os.cpu_count() or 1)
+        print_decisions(found)
+        plot_decisions(found, comparison.banks, self.decisions)
+        print(f"wrote {self.decisions}")
 
     def _banks(self, specs: Sequence[PolicySpec]) -> list[ScenarioBank]:
         from leapnav.envs.scenarios.bank import ScenarioBank

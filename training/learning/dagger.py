@@ -36,7 +36,7 @@ from leapnav.training.policies.actors import policy_of
 from leapnav.training.robots.vec_env import NavigateVecEnv
 from leapnav.training.threads import limit_threads
 
-EPISODES_PER_TASK = 16  # episodes labelled in one task of a worker
+DRIVEN_PER_TASK, LABELLED_PER_TASK = 256, 16  # episodes in one task of a worker
 SCENARIO_STREAM, TAKEOVER_STREAM = 1, 2  # streams of the seed of a round
 # Properties of the environment's settings that DAgger does not support, as named in the error message.
 _UNSUPPORTED = {
@@ -201,7 +201,13 @@ class DAgger:
         episodes: list[DrivenEpisode] = []
         failures, seed = 0, (config.seed, len(self.rounds), SCENARIO_STREAM)
         driving = drive_episodes(
-            self._policy, robots.source, robots.settings, seed, robots=robots.num_envs, workers=self._workers
+            self._policy,
+            robots.source,
+            robots.settings,
+            seed,
+            robots=robots.num_envs,
+            per_task=min(DRIVEN_PER_TASK, config.max_episodes),
+            workers=self._workers,
         )
         label = f"{name}: driving"
         with progress_bar(total=config.max_failures, label=label, unit="failures", show=progress) as bar:
@@ -225,7 +231,7 @@ class DAgger:
     def _label(self, episodes: Sequence[DrivenEpisode], bar: Any) -> Dataset | None:
         """Return the samples of the expert after the takeovers; None if it has no optimum in any of them."""
         # The division into tasks does not depend on the number of workers, and neither do the samples.
-        portions = [episodes[k : k + EPISODES_PER_TASK] for k in range(0, len(episodes), EPISODES_PER_TASK)]
+        portions = [episodes[k : k + LABELLED_PER_TASK] for k in range(0, len(episodes), LABELLED_PER_TASK)]
         settings, quick = self._venv.venv.settings, bool(self._expert.settings["quick"])
         seed = self.config.seed, len(self.rounds), TAKEOVER_STREAM
         tasks = (

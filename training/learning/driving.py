@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -17,8 +18,6 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.simulation.state import COLLIDED, COST, SUCCESS, TERMINATED, TRUNCATED
 from leapnav.training.threads import limit_threads
-
-EPISODES_PER_TASK = 256  # episodes of one task of a process
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +46,7 @@ def drive_episodes(
     seed: tuple[int, ...],
     *,
     robots: int,
+    per_task: int,
     workers: int,
 ) -> Generator[DrivenEpisode]:
     """Yield episodes of a policy with deterministic actions, without end.
@@ -57,25 +57,33 @@ def drive_episodes(
         settings: settings of the environment, without disturbances.
         seed: seed of the scenarios; the episodes do not depend on the number of workers.
         robots: number of robots that a process simulates together.
+        per_task: number of episodes of one task of a process, on which the scenarios depend.
         workers: number of processes.
 
     """
-    tasks = (delayed(_drive)(policy, source, settings, (*seed, number), robots) for number in count())
+    tasks = (delayed(_drive)(policy, source, settings, (*seed, number), robots, per_task) for number in count())
     portions = Parallel(workers, return_as="generator")(tasks)
     try:
         for portion in cast(Iterator[list[DrivenEpisode]], portions):
             yield from portion
     finally:
-        cast(Any, portions).close()
+        with warnings.catch_warnings():  # joblib warns of tasks that were computed in vain
+            warnings.simplefilter("ignore", UserWarning)
+            cast(Any, portions).close()
 
 
 @limit_threads
 def _drive(
-    policy: BasePolicy, source: ScenarioSource, settings: EnvironmentSettings, seed: tuple[int, ...], robots: int
+    policy: BasePolicy,
+    source: ScenarioSource,
+    settings: EnvironmentSettings,
+    seed: tuple[int, ...],
+    robots: int,
+    per_task: int,
 ) -> list[DrivenEpisode]:
     """Return the episodes of one task, in the order of their scenarios."""
     rng = np.random.default_rng(seed)
-    choices = [source.draw(rng) for _ in range(EPISODES_PER_TASK)]
+    choices = [source.draw(rng) for _ in range(per_task)]
     robots = min(robots, len(choices))
     simulator = BatchSimulator(robots, settings)
     episodes: list[DrivenEpisode | None] = [None] * len(choices)

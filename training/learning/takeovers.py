@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -166,7 +167,7 @@ def samples_of(
         rewards=np.diff(costs),
         episodes=np.zeros(len(actions), dtype=int),
         scenarios=(scenario.to_json(),),
-        settings=settings,
+        settings=replace(settings, reward="cost"),
     )
 
 

@@ -68,7 +68,7 @@ class Comparison:
     def of(self, family: str) -> Comparison:
         """Return the comparison restricted to one family."""
         runs = {
-            name: [Evaluation(tuple(e for e in run if e.family == family), run.milliseconds) for run in evaluations]
+            name: [replace(run, episodes=tuple(e for e in run if e.family == family)) for run in evaluations]
             for name, evaluations in self.runs.items()
         }
         return Comparison(tuple(bank for bank in self.banks if bank.family == family), runs, self.seed)
@@ -220,5 +220,5 @@ def compare_policies(
             ]
             episodes = tuple(episode for evaluation in evaluations for episode in evaluation)
             milliseconds = float(np.mean([evaluation.milliseconds for evaluation in evaluations]))
-            runs[row].append(Evaluation(episodes, milliseconds))
+            runs[row].append(Evaluation(episodes, milliseconds, evaluations[0].settings))
     return Comparison(tuple(banks), runs, seed)

@@ -118,35 +118,23 @@ def regret(
     check_at_least("workers", workers, 1)
     evaluation = evaluate(policy, bank, count=count, environment=environment, seed=seed, timed=False, progress=progress)
     if not isinstance(bank, ScenarioBank):
-        settings = EnvironmentSettings(**dict(environment or {}))
-        bank = ScenarioBank.shipped(bank, "test", settings.robot, settings.horizon)
-    return regret_of(
-        evaluation,
-        bank,
-        decisions=decisions,
-        resolution=resolution,
-        environment=environment,
-        workers=workers,
-        progress=progress,
-    )
+        bank = ScenarioBank.shipped(bank, "test", evaluation.settings.robot, evaluation.settings.horizon)
+    if not decisions:
+        return PolicyRegret(evaluation, level_regrets(evaluation))
+    found = decisions_of(evaluation, bank, resolution=resolution, workers=workers, progress=progress)
+    return PolicyRegret(evaluation, np.array([one.regrets.sum() for one in found]), tuple(found))
 
 
-def regret_of(
+def decisions_of(
     evaluation: Evaluation,
     bank: ScenarioBank,
     *,
-    decisions: bool = False,
     resolution: float = RESOLUTION,
-    environment: Mapping[str, Any] | None = None,
     workers: int = 1,
     progress: bool = True,
-) -> PolicyRegret:
-    """Compute the regret of an evaluation on one bank; arguments as for `regret`."""
-    arguments = {name: value for name, value in (environment or {}).items() if name not in ("robot", "horizon")}
-    settings = EnvironmentSettings(**arguments, robot=bank.robot.model, horizon=bank.horizon)
-    levels = np.array([level_regret(episode, settings) for episode in evaluation])
-    if not decisions:
-        return PolicyRegret(evaluation, levels)
+) -> list[Decisions]:
+    """Return the regret of the decisions in each episode of an evaluation on one bank, see `regret`."""
+    levels, settings = level_regrets(evaluation), evaluation.settings
     every = max(1, round(resolution / settings.control_period))
     tasks = (
         delayed(_decide)(bank[episode.index], episode, level, every, settings.control_period)
@@ -157,11 +145,15 @@ def regret_of(
         for one in cast(Iterator[Decisions], Parallel(workers, return_as="generator")(tasks)):
             found.append(one)
             bar.update()
-    return PolicyRegret(evaluation, np.array([one.regrets.sum() for one in found]), tuple(found))
+    return found
 
 
-def level_regret(episode: Episode, settings: EnvironmentSettings) -> float:
-    """Return the return of the optimum minus that of an episode, without a shaped reward."""
+def level_regrets(evaluation: Evaluation) -> np.ndarray:
+    """Return the regret of each level (N,): the return of the optimum minus that of the episode, with reward "cost"."""
+    return np.array([_level_regret(episode, evaluation.settings) for episode in evaluation])
+
+
+def _level_regret(episode: Episode, settings: EnvironmentSettings) -> float:
     if episode.success:
         return max(0.0, episode.cost - episode.optimal_cost)
     truncated = settings.free_horizon and not episode.collision  # without a penalty

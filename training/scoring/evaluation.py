@@ -6,7 +6,7 @@ import inspect
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,6 +18,7 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import Reference, ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
+from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_choice, in_words
@@ -186,11 +187,13 @@ class Evaluation:
     Attributes:
         episodes: the episodes, in the order of the bank.
         milliseconds: median computation time of one action (ms).
+        settings: settings of the environment.
 
     """
 
     episodes: tuple[Episode, ...]
     milliseconds: float
+    settings: EnvironmentSettings = field(default_factory=EnvironmentSettings)
 
     def __repr__(self) -> str:
         families = ", ".join(dict.fromkeys(episode.family for episode in self.episodes))
@@ -295,7 +298,9 @@ def evaluate(
         for first in range(0, len(indices), BATCH_SIZE):
             batch = indices[first : first + BATCH_SIZE]
             episodes += _play_batch(policy, bank, batch, arguments, seed, bar.update)
-    return Evaluation(tuple(episodes), _median_milliseconds(policy, bank, arguments) if timed else math.nan)
+    milliseconds = _median_milliseconds(policy, bank, arguments) if timed else math.nan
+    task = {"robot": bank.robot.model, "horizon": bank.horizon}
+    return Evaluation(tuple(episodes), milliseconds, EnvironmentSettings(**{**arguments, **task}))
 
 
 def _play_batch(

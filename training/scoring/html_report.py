@@ -29,6 +29,7 @@ from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.training.config import RunConfig, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
+from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions
 from leapnav.training.scoring.evaluation import Episode, Evaluation
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.reports import COLUMNS, NEGATIVE_REGRET, cell, draw_profiles, plot_episodes, row_name
@@ -89,7 +90,7 @@ def write_report(
 
     """
     if isinstance(runs, Comparison):
-        _write_page(path, runs, {}, list(runs.runs))
+        _write_page(path, runs, {}, list(runs.runs), progress)
         return runs
     if not runs:
         raise ValueError("runs: expected at least one, got none")
@@ -104,7 +105,7 @@ def write_report(
         for row, members in groups.items()
         if (found := [record for record in records if any(record.spec is member for member in members)])
     }
-    _write_page(path, comparison, by_row, list(groups))
+    _write_page(path, comparison, by_row, list(groups), progress)
     return comparison
 
 
@@ -122,6 +123,7 @@ def _write_page(
     comparison: Comparison,
     by_row: dict[str, list[_RunRecord]],
     galleries: Sequence[str],
+    progress: bool,
 ) -> None:
     """Write the page.
 
@@ -130,6 +132,7 @@ def _write_page(
         comparison: the results.
         by_row: the training runs of the rows that have any.
         galleries: the rows whose episodes are drawn.
+        progress: show progress bars.
 
     """
     records = [record for members in by_row.values() for record in members]
@@ -160,6 +163,7 @@ def _write_page(
         failures=_success_tables(comparison),
         negative_regret=NEGATIVE_REGRET if any(row.regret.value < 0 for row in scores) else "",
         galleries=[{"name": row, "png": _gallery(comparison.banks, comparison.runs[row][0])} for row in galleries],
+        decisions=[{"name": row, "png": _decisions(comparison, row, progress)} for row in galleries],
         runs=[_summary(record) for record in records],
     )
     write_text(path, page)
@@ -274,6 +278,14 @@ def _gallery(banks: Sequence[ScenarioBank], evaluation: Evaluation) -> str:
     """Plot selected episodes of a run, as a PNG file in base64."""
     buffer = io.BytesIO()
     plot_episodes(banks, evaluation.episodes, buffer, N_GALLERY_COLUMNS)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def _decisions(comparison: Comparison, row: str, progress: bool) -> str:
+    """Plot the most expensive decisions of a run, as a PNG file in base64."""
+    found = costliest_decisions(comparison.runs[row][0], comparison.banks, N_GALLERY_COLUMNS, progress=progress)
+    buffer = io.BytesIO()
+    plot_decisions(found, comparison.banks, buffer, N_GALLERY_COLUMNS)
     return base64.b64encode(buffer.getvalue()).decode()
 
 
