@@ -18,7 +18,7 @@ from leapnav.envs.goals import GoalConditioned
 from leapnav.envs.navigation import make_noise_generator
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
+from leapnav.envs.scenarios.sources import LevelOutcome, LevelSampler, ScenarioSource, get_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
@@ -48,6 +48,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     Args:
         num_envs: number of robots.
         family, scenario, split, bank, robot, horizon: see `NavigateEnv`.
+        sampler: chooses the scenario of the bank for each episode, and is told its outcome; needs a bank.
         autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
             next one. "SameStep": the last step starts the next episode, and `infos["final_obs"]` and
             `infos["final_info"]` describe the end. "Disabled": `reset(options={"reset_mask": mask})` starts it.
@@ -73,6 +74,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         bank: Any = None,
         robot: Any = None,
         horizon: Any = None,
+        sampler: LevelSampler | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         **settings: Any,
@@ -82,6 +84,9 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             if name not in SETTING_NAMES:
                 raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
         self._source = ScenarioSource(family, scenario, split, bank, robot, horizon)
+        if sampler is not None and self._source.bank is None:
+            raise ValueError("sampler: expected an environment with a bank, got one of fresh or fixed scenarios")
+        self._sampler = sampler
         self.settings = EnvironmentSettings(
             robot=self._source.robot.model,
             horizon=self._source.horizon,
@@ -186,7 +191,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             generator = self._generators[i]
             assert generator is not None  # seeded at the first reset
             choice = None if selected is None else selected[k]
-            choices.append(self._source.draw(generator) if choice is None else choice)
+            choices.append((self._sampler or self._source).draw(generator) if choice is None else choice)
         noise = [self._noise_generators[i] for i in indices] if self.settings.disturbed else []
         self._simulator.reset(robots, choices, self.bank, noise)
         for i, choice in zip(indices, choices, strict=True):
@@ -222,6 +227,8 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         terminated = state[:, columns.TERMINATED] > 0
         truncated = state[:, columns.TRUNCATED] > 0 if self._truncates else self._no_robots.copy()
         ended = terminated | truncated if self._truncates else terminated
+        if self._sampler is not None:
+            self._record_outcomes(self._sampler, ended & ~restarting)
         flat = self._flat_observations()
         rewards = self._rewards(flat, ended, restarting)
         infos: dict[str, Any] = {}
@@ -238,6 +245,20 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._ended = (self._no_robots if self.autoreset_mode is AutoresetMode.SAME_STEP else ended).copy()
         infos.update(self._infos(self._all_robots, restarting if restarting is not self._no_robots else None))
         return simulator.layout.divide(flat), rewards, terminated, truncated, infos
+
+    def _record_outcomes(self, sampler: LevelSampler, ended: np.ndarray) -> None:
+        """Tell the sampler the outcomes of the episodes that have ended."""
+        state, bank, settings = self._simulator.state, self.bank, self.settings
+        assert bank is not None  # required for a sampler
+        for i in np.flatnonzero(ended).tolist():
+            index, row = self._choices[i], state[i]
+            if not isinstance(index, int):  # selected by a reset
+                continue
+            collision, missed = bool(row[columns.COLLIDED]), bool(row[columns.TERMINATED]) and not row[columns.SUCCESS]
+            penalties = settings.collision_penalty * collision + settings.miss_penalty * missed
+            value = -float(row[columns.COST]) - penalties
+            regret = -float(bank.costs[index]) - value
+            sampler.record(LevelOutcome(index, bool(row[columns.SUCCESS]), collision, value, regret))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a frame of each robot, see `NavigateEnv.render`."""

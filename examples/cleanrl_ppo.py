@@ -3,7 +3,10 @@
 S. Huang et al., CleanRL: High-quality single-file implementations of deep RL algorithms, JMLR 23 (2022).
 
 python examples/cleanrl_ppo.py --total-timesteps 1000000
+python examples/cleanrl_ppo.py --family clutter --levels exact_regret
 """
+
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -12,8 +15,9 @@ import tyro
 from torch import nn
 from torch.distributions import Normal
 
+from leapnav.envs import ScenarioBank
 from leapnav.envs.vector import AutoresetMode
-from leapnav.training import NavigationFeatures, evaluate
+from leapnav.training import NavigationFeatures, PrioritizedSampler, evaluate, make_sampler
 
 REWARD_SCALE = 0.1  # brings returns to order 1
 
@@ -62,6 +66,7 @@ def main(
     num_envs: int = 64,
     num_steps: int = 64,
     seed: int = 0,
+    levels: Literal["fresh", "uniform", "plr", "learnability", "exact_regret"] = "fresh",
     test_scenarios: int | None = None,
 ) -> float:
     """Train a policy from scratch, and score it against the optimum.
@@ -72,20 +77,26 @@ def main(
         num_envs: Number of robots.
         num_steps: Environment steps of each robot between two updates.
         seed: Random seed.
+        levels: Scenarios of the episodes: fresh ones, or those of the training split that a level sampler chooses.
         test_scenarios: Number of test scenarios of the score; by default all.
 
     """
     gamma, gae_lambda, clip, epochs, batch = 0.99, 0.95, 0.2, 5, 512
     torch.manual_seed(seed)
     environment = {"reward": "shaped", "control_period": 0.2}
+    scenarios: dict[str, Any] = {"family": family, "split": "fresh"}
+    sampler = None
+    if levels != "fresh":
+        bank = ScenarioBank.shipped(family, "train")
+        sampler = make_sampler(levels, bank)
+        scenarios = {"bank": bank, "sampler": sampler}
     envs = gym.make_vec(
         "leapnav/Navigate-v0",
         num_envs,
         "vector_entry_point",
         autoreset_mode=AutoresetMode.SAME_STEP,
-        family=family,
-        split="fresh",
         discount=gamma,
+        **scenarios,
         **environment,
     )
     agent = Agent(envs)
@@ -96,11 +107,13 @@ def main(
         optimizer.param_groups[0]["lr"] = 1e-3 * (1 - update / updates)
         rows: dict[str, list[torch.Tensor]] = {name: [] for name in ("x", "a", "logp", "value", "reward", "done")}
         successes: list[float] = []
+        played = []
         for _ in range(num_steps):
             with torch.no_grad():
                 distribution = agent.distribution(following)
                 action, value = distribution.sample(), agent.value(following)
             observed = following
+            played.append(envs.unwrapped.indices)
             # The episode terminates at the horizon, so there is no value after it.
             observation, reward, done, _, info = envs.step(action.clamp(-1, 1).numpy())
             following = torch.as_tensor(observation)
@@ -123,6 +136,8 @@ def main(
             alive = 1 - done[t]
             last = reward[t] + gamma * alive * values[t + 1] - values[t] + gamma * gae_lambda * alive * last
             advantage[t] = last
+        if isinstance(sampler, PrioritizedSampler):
+            sampler.score_rollout(np.array(played), value.numpy(), advantage.numpy(), REWARD_SCALE)
         flat = [column.flatten(0, 1) for column in (x, a, logp, advantage, advantage + value)]
         for _ in range(epochs):
             for chosen in torch.randperm(num_envs * num_steps).split(batch):

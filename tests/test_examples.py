@@ -19,7 +19,7 @@ EXAMPLES = {
     "compare_methods": ("--plot {out}", r".*\n(.*SUCCESS.*4\.616791339.*\n){3}.*\n(.*: J = 4\.616791339)\nwrote .*\n"),
     "alternatives": ("--plot {out}", r"the gate: certified: .*\n(J = +\d.*(forward|backward)\n){5,}wrote .*\n"),
     "cleanrl_ppo": (
-        "--total-timesteps 3000 --num-envs 16 --num-steps 64 --test-scenarios 5",
+        "--total-timesteps 3000 --num-envs 16 --num-steps 64 --test-scenarios 5 --levels plr",
         rf"( +\d.*\n)+{SCORE}\n",
     ),
     "offline_rl": ("--scenarios 10 --steps 50 --test-scenarios 5", rf"(.*\n)*{SCORE}\n"),

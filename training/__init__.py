@@ -22,6 +22,14 @@ if TYPE_CHECKING:
     from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
     from leapnav.training.policies.files import load_policy, policy_environment, save_policy, shipped_policies
     from leapnav.training.policies.network import NavigationFeatures, make_policy, network
+    from leapnav.training.robots.level_samplers import (
+        LearnabilitySampler,
+        PrioritizedSampler,
+        RegretSampler,
+        UniformSampler,
+        make_sampler,
+    )
+    from leapnav.training.robots.level_scoring import LevelScoring
     from leapnav.training.robots.vec_env import NavigateVecEnv, make_vec_env
     from leapnav.training.runs.imitation import train_bc, train_dagger
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
@@ -47,14 +55,19 @@ __all__ = [
     "Evaluation",
     "GoToGoal",
     "Interval",
+    "LearnabilitySampler",
+    "LevelScoring",
     "NavigateVecEnv",
     "NavigationFeatures",
     "PPOConfig",
     "Policy",
     "PolicyRegret",
+    "PrioritizedSampler",
     "RandomPolicy",
+    "RegretSampler",
     "SACConfig",
     "Score",
+    "UniformSampler",
     "WarmStart",
     "WarmStartConfig",
     "behaviour_clone",
@@ -63,6 +76,7 @@ __all__ = [
     "imitate",
     "load_policy",
     "make_policy",
+    "make_sampler",
     "make_vec_env",
     "network",
     "plot_episodes",
@@ -93,6 +107,14 @@ _LAZY = {
     "policies.baselines": ("GoToGoal", "RandomPolicy"),
     "policies.files": ("load_policy", "policy_environment", "save_policy", "shipped_policies"),
     "policies.network": ("NavigationFeatures", "make_policy", "network"),
+    "robots.level_samplers": (
+        "LearnabilitySampler",
+        "PrioritizedSampler",
+        "RegretSampler",
+        "UniformSampler",
+        "make_sampler",
+    ),
+    "robots.level_scoring": ("LevelScoring",),
     "robots.vec_env": ("NavigateVecEnv", "make_vec_env"),
     "runs.imitation": ("train_bc", "train_dagger"),
     "runs.reinforcement": ("train_ppo", "train_sac"),

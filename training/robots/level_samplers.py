@@ -1,0 +1,218 @@
+"""Level samplers: which scenario of a bank an episode of the vector environment plays.
+
+A curriculum by unsupervised environment design plays the levels from which the policy can learn most. The regret of a
+level, which the literature approximates, is exact here, because the bank contains the optimum of each level.
+
+Sources:
+    M. Jiang, E. Grefenstette and T. Rocktaschel, "Prioritized level replay" (ICML 2021);
+    M. Jiang et al., "Replay-guided adversarial environment design" (NeurIPS 2021): positive value loss and MaxMC;
+    A. Rutherford et al., "No regrets: investigating and improving regret approximations for curriculum discovery"
+    (NeurIPS 2024, arXiv 2408.15099): learnability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.sources import LevelOutcome
+from leapnav.envs.utils.validation import check_choice, check_fraction, check_positive
+
+ScoreName = Literal["positive_value_loss", "max_mc", "learnability", "exact_regret"]
+SCORES: tuple[str, ...] = get_args(ScoreName)
+VALUE_SCORES = ("positive_value_loss", "max_mc")  # those that need the values of a critic, see `score_rollout`
+SAMPLERS = ("uniform", "plr", "learnability", "exact_regret")
+MAX_AGE = 64  # draws after which the probabilities are computed again
+
+
+class UniformSampler:
+    """Draw all levels of a bank with the same probability: domain randomisation.
+
+    Args:
+        bank: the levels.
+
+    Attributes:
+        plays (N,): number of finished episodes of each level.
+        success (N,): success rate of each level, a moving average; NaN without an episode.
+        regrets (N,): regret of the last episode of each level; NaN without an episode.
+
+    """
+
+    RATE = 0.3  # weight of the last episode in the moving average
+
+    def __init__(self, bank: ScenarioBank) -> None:
+        count = len(bank)
+        if count == 0:
+            raise ValueError("bank: expected at least one scenario, got none")
+        self.plays = np.zeros(count, dtype=np.int64)
+        self.success, self.regrets = np.full(count, np.nan), np.full(count, np.nan)
+
+    def draw(self, rng: np.random.Generator) -> int:
+        """Return the index of the level of the next episode."""
+        return int(rng.integers(len(self.plays)))
+
+    def record(self, outcome: LevelOutcome) -> None:
+        """Store the outcome of an episode; the environment calls it."""
+        i = outcome.index
+        known = self.plays[i] > 0
+        self.plays[i] += 1
+        self.success[i] = (
+            (1 - self.RATE) * self.success[i] + self.RATE * outcome.success if known else float(outcome.success)
+        )
+        self.regrets[i] = outcome.regret
+
+
+class PrioritizedSampler(UniformSampler):
+    """Prioritized level replay: draw levels by the rank of their score, and by the time since they were drawn.
+
+    A level is drawn with the probability (1 - staleness) P_S + staleness P_C. P_S is proportional to
+    rank^(-1 / temperature), with rank 1 for the highest score, and P_C to the number of draws since the level was
+    drawn.
+
+    Args:
+        bank: the levels.
+        score: "exact_regret": regret of the last episode; "learnability": p (1 - p) with the success rate p;
+            "positive_value_loss" or "max_mc": from the critic's values, set by `score_rollout`.
+        replay: probability of a level with a score; otherwise one that has none yet is drawn, as long as there are any.
+        temperature: the smaller, the more the highest scores are preferred.
+        staleness: see above.
+
+    Attributes:
+        scores (N,): score of each level; NaN without one.
+
+    Raises:
+        ValueError: an argument is invalid.
+
+    """
+
+    def __init__(
+        self,
+        bank: ScenarioBank,
+        score: ScoreName = "positive_value_loss",
+        *,
+        replay: float = 0.5,
+        temperature: float = 0.3,
+        staleness: float = 0.1,
+    ) -> None:
+        super().__init__(bank)
+        check_choice("score", score, SCORES)
+        check_fraction("replay", replay)
+        check_fraction("staleness", staleness)
+        check_positive("temperature", temperature)
+        self.score, self._replay, self._temperature, self._staleness = score, replay, temperature, staleness
+        self.scores = np.full(len(self.plays), np.nan)
+        self.best_returns = np.full(len(self.plays), -np.inf)
+        self._drawn = np.zeros(len(self.plays), dtype=np.int64)  # the draw at which a level was drawn last
+        self._draws, self._age = 0, MAX_AGE
+        self._levels, self._cumulative = np.empty(0, dtype=np.int64), np.empty(0)
+
+    def draw(self, rng: np.random.Generator) -> int:
+        """Return the index of the level of the next episode."""
+        unseen = np.flatnonzero(self._drawn == 0)
+        seen = not np.isnan(self.scores).all()
+        if len(unseen) and not (seen and rng.random() < self._replay):
+            level = int(rng.choice(unseen))
+        elif seen:
+            level = self._draw_scored(rng)
+        else:  # all are in their first episode
+            level = int(rng.integers(len(self.plays)))
+        self._draws += 1
+        self._drawn[level] = self._draws
+        return level
+
+    def _draw_scored(self, rng: np.random.Generator) -> int:
+        if self._age >= MAX_AGE:
+            self._levels = np.flatnonzero(~np.isnan(self.scores))
+            self._cumulative, self._age = np.cumsum(self.probabilities[self._levels]), 0
+        self._age += 1
+        k = np.searchsorted(self._cumulative, rng.random() * self._cumulative[-1], side="right")
+        return int(self._levels[min(k, len(self._levels) - 1)])
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """Probabilities (N,) with which the levels that have a score are replayed."""
+        result = np.zeros(len(self.plays))
+        known = np.flatnonzero(~np.isnan(self.scores))
+        if len(known) == 0:
+            return result
+        ranks = np.empty(len(known))
+        ranks[np.argsort(-self.scores[known], kind="stable")] = np.arange(1, len(known) + 1)
+        by_score = ranks ** (-1.0 / self._temperature)
+        by_age = (self._draws - self._drawn[known] + 1).astype(float)
+        result[known] = (1 - self._staleness) * by_score / by_score.sum() + self._staleness * by_age / by_age.sum()
+        return result
+
+    def record(self, outcome: LevelOutcome) -> None:
+        """Store the outcome of an episode, and the score that follows from it; the environment calls it."""
+        super().record(outcome)
+        i = outcome.index
+        self.best_returns[i] = max(self.best_returns[i], outcome.episode_return)
+        if self.score == "exact_regret":
+            self.scores[i] = self.regrets[i]
+        elif self.score == "learnability":
+            self.scores[i] = self.success[i] * (1 - self.success[i])
+
+    def score_rollout(self, levels: np.ndarray, values: np.ndarray, advantages: np.ndarray, scale: float = 1.0) -> None:
+        """Set the scores of the levels in a rollout of T steps of N robots from the values of a critic.
+
+        Call it after each rollout with "positive_value_loss", the mean of the positive generalised advantages of the
+        steps of a level, or "max_mc", the mean difference of the highest return of the level so far and the values. It
+        does nothing with the other scores.
+
+        Args:
+            levels (T, N): index of the level of each step.
+            values (T, N): values of the critic.
+            advantages (T, N): generalised advantage estimates.
+            scale: factor of the rewards that the critic has learned from.
+
+        """
+        if self.score not in VALUE_SCORES:
+            return
+        levels, values, advantages = (np.asarray(column).ravel() for column in (levels, values, advantages))
+        played, inverse = np.unique(levels, return_inverse=True)
+        if self.score == "positive_value_loss":
+            terms = np.maximum(advantages, 0.0)
+        else:
+            terms = scale * self.best_returns[levels] - values  # -inf in a level that has not been finished
+        means = np.bincount(inverse, weights=terms) / np.bincount(inverse)
+        finite = np.isfinite(means)
+        self.scores[played[finite]] = means[finite]
+
+
+class LearnabilitySampler(PrioritizedSampler):
+    """Draw levels by their learnability p (1 - p); arguments as for `PrioritizedSampler`, without `score`."""
+
+    def __init__(self, bank: ScenarioBank, **options: Any) -> None:
+        super().__init__(bank, "learnability", **options)
+
+
+class RegretSampler(PrioritizedSampler):
+    """Draw levels by the exact regret of the policy; arguments as for `PrioritizedSampler`, without `score`."""
+
+    def __init__(self, bank: ScenarioBank, **options: Any) -> None:
+        super().__init__(bank, "exact_regret", **options)
+
+
+def make_sampler(name: str, bank: ScenarioBank, **options: Any) -> UniformSampler:
+    """Make a level sampler.
+
+    Args:
+        name: "uniform", "plr" (with the option `score`), "learnability" or "exact_regret".
+        bank: the levels.
+        options: options of `PrioritizedSampler`; none for "uniform".
+
+    Raises:
+        ValueError: the name or an option is invalid.
+
+    """
+    check_choice("name", name, SAMPLERS)
+    kinds: tuple[Callable[..., UniformSampler], ...] = (
+        UniformSampler,
+        PrioritizedSampler,
+        LearnabilitySampler,
+        RegretSampler,
+    )
+    return kinds[SAMPLERS.index(name)](bank, **options)

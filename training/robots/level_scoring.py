@@ -1,0 +1,52 @@
+"""Scores of levels from the rollouts of Stable-Baselines3's on-policy algorithms."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from leapnav.envs.unwrapping import unwrap
+from leapnav.envs.vector import NavigateVectorEnv
+from leapnav.training.robots.level_samplers import PrioritizedSampler
+
+
+class LevelScoring(BaseCallback):
+    """Give the values and advantages of each rollout of PPO or A2C to a level sampler.
+
+    The scores "positive_value_loss" and "max_mc" need it; the others do not.
+
+    Args:
+        sampler: the sampler of the training environment.
+        reward_scale: factor of the rewards that the algorithm receives, if a wrapper scales them.
+
+    """
+
+    def __init__(self, sampler: PrioritizedSampler, reward_scale: float = 1.0) -> None:
+        super().__init__()
+        self._sampler, self._scale = sampler, reward_scale
+        self._levels: list[np.ndarray] = []
+
+    def _on_training_start(self) -> None:
+        inner = unwrap(self.training_env)[0]
+        if not isinstance(inner, NavigateVectorEnv) or inner.bank is None:
+            raise TypeError("env: expected one from make_vec_env(bank=..., sampler=...)")
+        self._robots = inner
+
+    def _on_rollout_start(self) -> None:
+        self._levels, self._current = [], self._playing()
+
+    def _on_step(self) -> bool:
+        self._levels.append(self._current)
+        self._current = self._playing()
+        return True
+
+    def _on_rollout_end(self) -> None:
+        buffer = cast(OnPolicyAlgorithm, self.model).rollout_buffer
+        self._sampler.score_rollout(np.array(self._levels), buffer.values, buffer.advantages, self._scale)
+
+    def _playing(self) -> np.ndarray:
+        """Return the index of the level (N,) that each robot plays."""
+        return np.array(self._robots.indices, dtype=np.int64)
