@@ -124,8 +124,9 @@ def geodesic_distance(x, y, packed):
 def geodesic_detours(x, y, cos, sin, packed, radius, beams, ranges, out):
     """Write the detour of each lidar beam: what a path along the beam and then to the goal is longer than the shortest.
 
-    It is the minimum of s + D(p + s e) - D(p) over points of the beam at the distances s that the robot can reach,
-    at least 0 and at most `MAX_DETOUR`.
+    It is the minimum of s + D(p + s e) - D(p) over points of the beam at the distances s = 0.25 m, 0.5 m, ... up to that
+    which the robot can reach, at least 0 and at most `MAX_DETOUR`. Thus it is 0 in the direction of the shortest path,
+    and 0.5 m in the opposite direction.
 
     Args:
         x, y: position p of the robot (m).
