@@ -50,6 +50,7 @@ bench: .venv/installed
 	$(BIN)/python benchmarks/solvers.py
 	$(BIN)/python benchmarks/optima.py
 	$(BIN)/python benchmarks/lower_bounds.py
+	$(BIN)/python benchmarks/labels.py
 
 coverage: compile .venv/examples
 	$(PYTEST) --cov=envs --cov=experts --cov=training --cov=leapnav --cov-report=term

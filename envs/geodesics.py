@@ -120,17 +120,16 @@ def geodesic_distance(x, y, packed):
     return (1.0 - a) * near + a * ((1.0 - b) * packed[at + ny] + b * packed[at + ny + 1])
 
 
-@kernel(NOTHING(float64, float64, float64, float64, float32[::1], float64, MATRIX, VECTOR, VECTOR))
-def geodesic_detours(x, y, cos, sin, packed, radius, beams, ranges, out):
+@kernel(NOTHING(float64, float64, float64, float32[::1], float64, MATRIX, VECTOR, VECTOR))
+def geodesic_detours(x, y, heading, packed, radius, beams, ranges, out):
     """Write the detour of each lidar beam: what a path along the beam and then to the goal is longer than the shortest.
 
-    It is the minimum of s + D(p + s e) - D(p) over points of the beam at the distances s = 0.25 m, 0.5 m, ... up to that
-    which the robot can reach, at least 0 and at most `MAX_DETOUR`. Thus it is 0 in the direction of the shortest path,
-    and 0.5 m in the opposite direction.
+    It is the minimum of s + D(p + s e) - D(p) over points of the beam at the distances s = 0.25 m, 0.5 m, ... up to the
+    farthest that the robot can reach, at least 0 and at most `MAX_DETOUR`. Thus it is 0 in the direction of the
+    shortest path, and 0.5 m in the opposite direction.
 
     Args:
-        x, y: position p of the robot (m).
-        cos, sin: of its heading.
+        x, y, heading: pose of the robot (m, rad), at the position p.
         packed: see `geodesic_map`.
         radius: radius of the robot (m).
         beams (2, n): cosine and sine of the angle of each beam, relative to the heading.
@@ -138,7 +137,7 @@ def geodesic_detours(x, y, cos, sin, packed, radius, beams, ranges, out):
         out (n,): overwritten.
 
     """
-    here = geodesic_distance(x, y, packed)
+    here, cos, sin = geodesic_distance(x, y, packed), math.cos(heading), math.sin(heading)
     for k in range(beams.shape[1]):
         ex, ey = cos * beams[0, k] - sin * beams[1, k], sin * beams[0, k] + cos * beams[1, k]
         reach = min(max(ranges[k] - radius, 0.0), MAX_BEAM)

@@ -162,6 +162,7 @@ def episode(success=True, collision=False, cost=2.0, reference=1.0, family="open
         reference_clearance=0.3,
         reversing=False,
         states=np.zeros((2, 3)),
+        costs=np.array([0.0, cost]),
     )
 
 

@@ -32,9 +32,9 @@ def test_an_included_policy_acts_the_same_after_the_export(tmp_path, capsys):
         np.testing.assert_allclose(actions_of(path, observation[None])[0], expected, atol=1e-5)
         observation, *_ = env.step(expected)
     description = json.loads((tmp_path / "clutter.onnx.json").read_text())
-    assert description["input"]["shape"] == ["N", 137] and len(description["observation"]) == 137
+    assert description["input"]["shape"] == ["N", 138] and len(description["observation"]) == 138
     assert description["observation"][4] == {"index": 4, "name": "goal.time_left", "unit": "s", "low": 0, "high": 10000}
-    assert description["environment"]["lidar_beams"] == 128
+    assert description["environment"]["lidar_beams"] == 64
     assert [entry["name"] for entry in description["action"]] == ["speed / max_speed", "turn_rate / max_turn_rate"]
 
 

@@ -346,8 +346,14 @@ def test_tuned_settings_depend_on_the_family_and_the_warm_start():
         assert set(tables) <= settings | {"open", "clutter", "polygons", "rooms", "slalom", "all"}
     # Settings of a family, in the run and in a nested configuration.
     assert DAggerRunConfig.tuned("open").hidden == (128, 128)
-    assert DAggerRunConfig.tuned("open").dagger == DAggerConfig(rounds=2)
-    assert DAggerRunConfig.tuned("clutter").dagger == DAggerConfig()
+    assert DAggerRunConfig.tuned("open").dagger.rounds == 2
+    assert DAggerRunConfig.tuned("clutter").dagger.max_failures < DAggerConfig().max_failures
+    assert DAggerRunConfig.tuned("clutter", observation="lidar").dagger == DAggerConfig()
+    for family, observation, beams in (("clutter", "geodesic", 64), ("open", "lidar", 32)):
+        for kind in (BCConfig, DAggerRunConfig):
+            config = kind.tuned(family)
+            assert (config.observation, config.lidar_beams) == (observation, beams)
+    assert BCConfig.tuned("clutter", observation="lidar").lidar_beams == 128
 
 
 def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):
@@ -362,7 +368,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):
     assert [len(runs) for runs in found.runs.values()] == [2, 1, 1, 1, 1]
     text = page.read_text()
     assert text.count("<svg") == 3
-    assert text.count("data:image/png;base64") == 2
+    assert text.count("data:image/png;base64") == 4  # episodes and decisions of each row
     assert "http" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
         "http://creativecommons.org", ""
     ).replace("https://matplotlib.org", "")

@@ -375,7 +375,7 @@ def test_single_and_vector_agree_on_goals_too():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"observation": "camera"}, "observation: expected one of lidar, state, map, got 'camera'"),
+        ({"observation": "camera"}, "observation: expected one of lidar, state, map, geodesic, got 'camera'"),
         ({"reward": "sparse"}, "reward: expected one of cost, shaped, got 'sparse'"),
         ({"actuation": "legs"}, "actuation: expected one of velocity, motor, got 'legs'"),
         ({"disturbance": -0.1}, "disturbance: expected a number >= 0, got -0.1"),

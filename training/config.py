@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
@@ -146,12 +147,15 @@ class RunConfig:
         return {**observation, "lidar_beams": self.lidar_beams, **robot, **horizon}
 
     @classmethod
-    def tuned(cls, family: str, *, warm: bool | None = None, **changes: Any) -> Self:
+    def tuned(cls, family: str, *, warm: bool | None = None, start: Sequence[Path] = (), **changes: Any) -> Self:
         """Return the settings tuned for a family and a horizon (file `defaults.toml`), with changes.
+
+        A run that starts from a policy has the observation of that policy.
 
         Args:
             family: one of the families, or "all".
             warm: whether to use the settings of a warm start; None: if `changes` contains a `warm_start`.
+            start: the policy to start from, among other paths; by default in `warm_start` and `policy`.
             changes: values of any settings.
 
         Raises:
@@ -175,7 +179,8 @@ class RunConfig:
             names = {setting.name for setting in fields(config)}
             common = {name: value for name, value in table.items() if name in names}  # the other keys are families
             config = _replace_nested(_replace_nested(config, common), table.get(family, {}))
-        return replace(config, **changes)
+        given = changes.get("warm_start") or [path for path in (changes.get("policy"),) if path is not None]
+        return replace(config, **{**_sensors(start or given), **changes})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,6 +218,12 @@ class DAggerRunConfig(RunConfig):
 class _LearnerConfig(RunConfig):
     """Settings shared by the runs of reinforcement learning."""
 
+    actuation: Literal["velocity", "motor"] = "velocity"
+    """Ideal speed control, or motors with inertia and tyres that slip. A policy of the ideal robot can initialise one
+    of a robot with motors."""
+    disturbance: float = 0.0
+    """Noise on actuation and sensing, in training and evaluation: relative standard deviation of speed and turn rate,
+    wheel slip, and a tenth of it in sensing (m, rad)."""
     reward_scale: float = 0.1
     """Factor of the rewards."""
     graded_miss: bool = True
@@ -234,6 +245,13 @@ class _LearnerConfig(RunConfig):
     """Environment steps between evaluations."""
     checkpoint_every: int = 200_000
     """Environment steps between checkpoints."""
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        """Arguments of the environment that determine the observation and the motion."""
+        actuation = {} if self.actuation == "velocity" else {"actuation": self.actuation}
+        disturbance = {} if self.disturbance == 0.0 else {"disturbance": self.disturbance}
+        return {**super().environment, **actuation, **disturbance}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,6 +337,19 @@ class SACConfig(_LearnerConfig):
     """Environment steps between evaluations."""
     checkpoint_every: int = 50_000
     """Environment steps between checkpoints."""
+
+
+def _sensors(paths: Sequence[Path]) -> dict[str, Any]:
+    """Return the observation and the number of beams of the policy among some paths; empty without one."""
+    included = files("leapnav.training").joinpath("policies", "pretrained")
+    for path in paths:
+        for folder in (Path(path), included.joinpath(str(path))):
+            try:
+                environment = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))["environment"]
+                return {name: environment[name] for name in ("observation", "lidar_beams")}
+            except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
+                continue
+    return {}
 
 
 def _replace_nested(config: Any, table: dict[str, Any]) -> Any:

@@ -292,7 +292,7 @@ def observe_robots(robots, packed, packed_buffers, out):
                     row[at + k] += deviation * noise[i, sim.noise_rows[i], sensing + 3 + k]
             at += count
         if has_geodesics:
-            geodesic_detours(x, y, cos, sin, sim.maps[i], sim.fields[i, 2], beams, scratch[2], buffers.detours)
+            geodesic_detours(x, y, heading, sim.maps[i], sim.fields[i, 2], beams, scratch[2], buffers.detours)
             for k in range(count):
                 row[at + k] = buffers.detours[k]
             row[at + count] = geodesic_distance(x, y, sim.maps[i])

@@ -103,6 +103,15 @@ def max_vertices(field):
     return largest
 
 
+def check_map(field: np.ndarray, map_vertices: int) -> None:
+    """Raise ValueError if an obstacle in the field has more vertices than each row of the map."""
+    if (vertices := max_vertices(field)) > map_vertices:
+        raise ValueError(
+            f"map_vertices: expected at least {vertices}, the number of vertices of an obstacle in the scenario, "
+            f"got {map_vertices}"
+        )
+
+
 @kernel(
     NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR),
 )

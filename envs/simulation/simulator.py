@@ -21,7 +21,7 @@ from leapnav.envs.simulation import stepping
 from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
 from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, RobotMotion, no_state_cost
-from leapnav.envs.simulation.sensing import max_vertices
+from leapnav.envs.simulation.sensing import check_map
 from leapnav.envs.simulation.state import (
     CLEARANCE,
     COLUMNS,
@@ -250,14 +250,8 @@ class BatchSimulator:
                 self._check_fits(bank.field(index))
 
     def _check_fits(self, field: np.ndarray) -> None:
-        if not self._maps:
-            return
-        vertices = max_vertices(field)
-        if vertices > self.settings.map_vertices:
-            raise ValueError(
-                f"map_vertices: expected at least {vertices}, the number of vertices of an obstacle in the scenario, "
-                f"got {self.settings.map_vertices}"
-            )
+        if self._maps:
+            check_map(field, self.settings.map_vertices)
 
     def _store_maps(self, robots: np.ndarray, fields: Sequence[np.ndarray]) -> None:
         """Store the geodesic maps of robots whose tasks are stored, with given obstacle fields."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, make_dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
@@ -89,10 +90,14 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
         if not following or following[0].startswith("--"):
             raise ValueError("warm_start: expected demonstrations or a policy, got none")
     warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
+    start = (
+        [Path(word) for name in ("--warm-start", "--policy") for word in _values(arguments, name)] if is_train else []
+    )
     given = {name: _option(arguments, f"--{name}") for name in ("horizon", "observation")} if is_train else {}
     changes = {name: value for name, value in given.items() if value in ("free", "lidar")}  # those with other defaults
     defaults: dict[str, Any] = {
-        name: replace(kind.tuned(family, warm=warm, **changes), out=tyro.MISSING) for name, kind in ALGORITHMS.items()
+        name: replace(kind.tuned(family, warm=warm, start=start, **changes), out=tyro.MISSING)
+        for name, kind in ALGORITHMS.items()
     }
     if is_train and "--resume" in arguments and out is not None:
         algorithm, config = read_config(Path(out))
@@ -106,6 +111,14 @@ def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
     command = make_dataclass("Train", [("config", field)], bases=(TrainCommand,), frozen=True)
     command.__doc__ = HELP
     return command
+
+
+def _values(arguments: Sequence[str], name: str) -> list[str]:
+    """The values of an option, up to the next option."""
+    if name not in arguments:
+        return [word.removeprefix(f"{name}=") for word in arguments if word.startswith(f"{name}=")]
+    following = arguments[arguments.index(name) + 1 :]
+    return list(takewhile(lambda word: not word.startswith("--"), following))
 
 
 def _option(arguments: Sequence[str], name: str) -> str | None:

@@ -9,6 +9,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
 
+from leapnav.training.policies.network import NavigationFeatures
+
 
 def policy_of(model: BaseAlgorithm | BasePolicy) -> BasePolicy:
     """Return the policy of an algorithm, or the policy itself.
@@ -64,8 +66,11 @@ def set_noise(policy: BasePolicy, std: th.Tensor | float) -> None:
 def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
     """Copy the weights of the mean action between policies with the same network.
 
+    If the observation of the target has a part `motion` and that of the source has none, the weights of its features
+    are 0, so that the actions do not depend on it yet.
+
     Raises:
-        ValueError: the networks differ, or only one of the policies squashes its actions.
+        ValueError: the networks differ otherwise, or only one of the policies squashes its actions.
 
     """
     if isinstance(source, ActorCriticPolicy) != isinstance(target, ActorCriticPolicy):
@@ -74,6 +79,9 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
             f"{type(target).__name__}; start from demonstrations instead"
         )
     tensors = _actor_tensors(source), _actor_tensors(target)
+    extractors = [_extractor(policy) for policy in (source, target)]
+    if all(isinstance(extractor, NavigationFeatures) for extractor in extractors):
+        tensors[0][0] = _with_motion(tensors[0][0], tensors[1][0], *cast(Any, extractors))
     if [t.shape for t in tensors[0]] != [t.shape for t in tensors[1]]:
         shapes = [[tuple(t.shape) for t in of_one] for of_one in tensors]
         raise ValueError(f"policy: its network has the shapes {shapes[0]}, the model's {shapes[1]}")
@@ -81,6 +89,24 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
         for a, b in zip(*tensors, strict=True):
             b.copy_(a)
     update_target(target)
+
+
+def _extractor(policy: BasePolicy) -> nn.Module:
+    """Return the features extractor of the mean action."""
+    if isinstance(policy, ActorCriticPolicy):
+        return cast(nn.Module, policy.pi_features_extractor)
+    return _actor(policy).features_extractor
+
+
+def _with_motion(
+    weights: th.Tensor, expected: th.Tensor, source: NavigationFeatures, target: NavigationFeatures
+) -> th.Tensor:
+    """Return the weights of a first layer with columns of zeros for the features of the motion, if only these miss."""
+    missing = expected.shape[1] - weights.shape[1]
+    first = source.motion_features.start
+    if len(source.motion_features) or missing != len(target.motion_features) or first != target.motion_features.start:
+        return weights
+    return th.cat([weights[:, :first], weights.new_zeros(len(weights), missing), weights[:, first:]], dim=1)
 
 
 def update_target(policy: BasePolicy) -> None:

@@ -58,6 +58,15 @@ class NavigationFeatures(BaseFeaturesExtractor):
         super().__init__(observation_space, features + self.BEAM_FEATURES * beams)
         self._first_motion, self._first_beam = goal, goal + motion
 
+    @property
+    def motion_features(self) -> range:
+        """Indices of the features of the part `motion`."""
+        if self._is_timed:
+            first, per_entry = self.POSE_FEATURES, self.MOTION_FEATURES
+        else:
+            first, per_entry = self.FREE_POSE_FEATURES, self.FREE_MOTION_FEATURES
+        return range(first, first + per_entry * (self._first_beam - self._first_motion))
+
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features (B, features_dim) of observations (B, d)."""
         features = self._timed_features if self._is_timed else self._free_features

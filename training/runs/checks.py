@@ -87,7 +87,7 @@ _CHECKS: dict[str, Callable[[str, Any], object]] = {
     **dict.fromkeys(_COUNTS, partial(check_integer, minimum=1)),
     **dict.fromkeys(("learning_starts",), partial(check_integer, minimum=0)),
     **dict.fromkeys(("learning_rate", "reward_scale", "clip_range", "std", "control_period"), check_positive),
-    **dict.fromkeys(("divergence", "imitation", "penalty", "last_std", "quiet"), check_not_negative),
+    **dict.fromkeys(("divergence", "imitation", "penalty", "last_std", "quiet", "disturbance"), check_not_negative),
     **dict.fromkeys(("jump_start", "jump_start_until", "divergence_until", "gamma", "gae_lambda"), check_fraction),
     **dict.fromkeys(("demonstrations", "critic_first"), partial(check_fraction, one=False)),
     "ent_coef": _check_entropy_coefficient,

@@ -17,6 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.utils.progress import advance, progress_bar
@@ -26,7 +27,7 @@ from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.learning.warm_start import warm_start
 from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
-from leapnav.training.policies.files import load_policy, policy_folder
+from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
 from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
 from leapnav.training.policies.momentum import MomentumSACPolicy
 from leapnav.training.policies.network import network
@@ -34,7 +35,7 @@ from leapnav.training.robots.jump_start import JumpStart
 from leapnav.training.robots.rewards import GradedMiss, ScaledReward
 from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
-from leapnav.training.runs.imitation import make_env, momentum_of, observed_settings, show_scores
+from leapnav.training.runs.imitation import momentum_of, observed_settings, show_scores
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.evaluation import Evaluation
 from leapnav.training.threads import limit_threads
@@ -189,8 +190,16 @@ def _resolve_warm_start(config: Config) -> tuple[list[Path], BasePolicy | None]:
     for path in paths:
         if path not in policies and not path.is_dir():
             raise FileNotFoundError(f"warm_start: {path}: no such directory of demonstrations or of a policy")
-    start = load_policy(policies[0], make_env(config)) if policies else None
+    start = _load_start(policies[0], config) if policies else None
     return [path for path in paths if path not in policies], start
+
+
+def _load_start(path: Path, config: Config) -> BasePolicy:
+    """Load the policy to start from: one of the same observations, or of a robot without motors."""
+    arguments = config.environment
+    if policy_environment(path).get("actuation", "velocity") == "velocity":
+        arguments = {name: value for name, value in arguments.items() if name != "actuation"}
+    return load_policy(path, NavigateEnv(config.family, split="fresh", **arguments))
 
 
 def _training_env(config: Config) -> VecEnv:
