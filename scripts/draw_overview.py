@@ -26,7 +26,8 @@ SCORES = {
     "go-to-goal": 0.079,
     "PPO from scratch": 0.492,
     "clone of the expert": 0.902,
-    "DAgger": 0.945,
+    "DAgger, lidar": 0.945,
+    "DAgger, geodesic": 0.991,
     "optimum": 1.0,
 }
 INDEX = 150  # in the test bank of clutter
