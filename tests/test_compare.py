@@ -59,7 +59,7 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
     assert write_report(found, tmp_path / "report.html") is found
     page = (tmp_path / "report.html").read_text()
     assert "Comparison of policies" in page and "Learning curves" not in page and "<h2>Runs</h2>" not in page
-    assert page.count("data:image/png") == len(rows)
+    assert page.count("data:image/png") == 2 * len(rows)  # episodes and decisions
 
 
 def test_a_function_gets_one_observation_at_a_time_and_dictionaries_too():

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training import config as configuration
-from leapnav.training import load_policy, shipped_policies
+from leapnav.training import load_policy, make_policy, shipped_policies
 from leapnav.training.config import (
     ALGORITHMS,
     BCConfig,
@@ -26,7 +26,8 @@ from leapnav.training.config import (
     WarmStartConfig,
     read_config,
 )
-from leapnav.training.policies.actors import actor_parameters
+from leapnav.training.policies.actors import actor_parameters, copy_actor
+from leapnav.training.policies.files import read_description
 from leapnav.training.robots.rewards import GradedMiss
 from leapnav.training.robots.vec_env import environment_seed
 from leapnav.training.runs.imitation import train_bc, train_dagger
@@ -127,6 +128,25 @@ def test_a_policy_that_ships_starts_a_run_with_the_defaults(name, tmp_path):
     demos, start = _resolve_warm_start(config)
     assert demos == []
     assert start.observation_space == _training_env(config).observation_space
+
+
+def test_a_policy_of_the_ideal_robot_starts_one_with_motors(tmp_path):
+    """The actions do not depend on the velocity at first; the evaluations have the motors and the disturbance."""
+    config = ppo(tmp_path / "run", total_timesteps=256, actuation="motor", disturbance=0.05, warm_start=(Path("open"),))
+    config = replace(config, hidden=(128, 128), lidar_beams=32)
+    _, start = _resolve_warm_start(config)
+    venv = _training_env(config)
+    policy = make_policy(venv.observation_space, venv.action_space, 0, (128, 128))
+    copy_actor(start, policy)
+    observations = venv.reset()
+    without = np.concatenate([observations[:, :9], observations[:, 12:]], axis=1)
+    assert policy.predict(observations, deterministic=True)[0] == pytest.approx(
+        start.predict(without, deterministic=True)[0], abs=1e-5
+    )
+    train_ppo(config, progress=False)
+    environment = read_description(config.out)["environment"]
+    assert environment["actuation"] == "motor" and environment["disturbance"]["actuation"] == 0.05
+    assert load_policy(config.out).observation_space.shape == venv.observation_space.shape
 
 
 def test_misses_are_graded_but_not_for_ppo_from_a_warm_start(tmp_path):
