@@ -189,14 +189,7 @@ def find_reached_optimum(
         ScenarioError: the robot is in contact with an obstacle at the state.
 
     """
-    x, y, heading, *motion = (float(value) for value in state)
-    update: dict[str, Any] = {
-        "goal": (x, y, None if scenario.goal[2] is None else math.remainder(heading, 2 * math.pi))
-    }
-    if motion:  # states that are free at the goal stay free
-        fixed = zip(motion, scenario.goal_state[3:], strict=True)
-        update["goal_motion"] = tuple(None if goal is None else value for value, goal in fixed)
-    reached = scenario.model_copy(update=update)
+    reached = scenario.to_state(state)
     followed = None if guess is None else solve(reached, "multiple_shooting", guess=guess)
     if followed is not None and followed.success and followed.cost <= cost:
         return followed

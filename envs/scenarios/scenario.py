@@ -200,6 +200,37 @@ class Scenario(Frozen):
         task.flags.writeable = False
         return task
 
+    def from_state(self, state: Sequence[float] | np.ndarray, time: float) -> Self:
+        """Return the rest of the scenario from a state (n,) of the robot at a time (s).
+
+        Raises:
+            ScenarioError: the robot is in contact with an obstacle, or no time is left.
+
+        """
+        x, y, heading, *motion = (float(value) for value in state)
+        update: dict[str, Any] = {"start": (x, y, heading)}
+        if self.horizon is not None:
+            update["horizon"] = float(self.horizon - time)
+        if motion:
+            update["start_motion"] = tuple(motion)
+        return self.model_copy(update=update)
+
+    def to_state(self, state: Sequence[float] | np.ndarray) -> Self:
+        """Return the scenario with a state (n,) as its goal; states that are free at the goal stay free.
+
+        Raises:
+            ScenarioError: the robot is in contact with an obstacle at the state.
+
+        """
+        x, y, heading, *motion = (float(value) for value in state)
+        update: dict[str, Any] = {
+            "goal": (x, y, None if self.goal[2] is None else math.remainder(heading, 2 * math.pi))
+        }
+        if motion:
+            fixed = zip(motion, self.goal_state[3:], strict=True)
+            update["goal_motion"] = tuple(None if goal is None else value for value, goal in fixed)
+        return self.model_copy(update=update)
+
     def __eq__(self, other: object) -> bool:
         # pydantic would compare the cached arrays, too.
         return isinstance(other, Scenario) and self._key() == other._key()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -217,14 +217,8 @@ class Feedback:
 
     def _remaining_scenario(self, state: np.ndarray, time: float) -> Scenario | None:
         """The rest of the episode as a scenario, None in collision or without time left."""
-        x, y, heading, *motion = state.tolist()
-        update: dict[str, Any] = {"start": (x, y, heading)}
-        if self.scenario.horizon is not None:
-            update["horizon"] = float(self.scenario.horizon - time)
-        if motion:
-            update["start_motion"] = tuple(motion)
         try:
-            return self.scenario.model_copy(update=update)
+            return self.scenario.from_state(state, time)
         except ScenarioError:
             return None
 

@@ -199,13 +199,10 @@ def recovery(
     n = scenario.robot.sizes()[0]
     perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
     state = extremal.evaluate(time)[0] + perturbation
-    x, y, heading, *motion = state.tolist()
+    x, y, heading = state[:3].tolist()
     if footprint_clearance(x, y, heading, scenario.discs, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
-    update: dict[str, Any] = {"name": name, "start": (x, y, heading)}
-    if scenario.horizon is not None:
-        update["horizon"] = float(scenario.horizon - time)
-    rest = scenario.model_copy(update={**update, "start_motion": tuple(motion)} if motion else update)
+    rest = scenario.from_state(state, time).model_copy(update={"name": name})
     times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])
     states, _, costates = extremal.evaluate(times + time)
     times[-1] = extremal.horizon - time

@@ -67,7 +67,7 @@ def drive_episodes(
         for portion in cast(Iterator[list[DrivenEpisode]], portions):
             yield from portion
     finally:
-        with warnings.catch_warnings():  # joblib warns of tasks that were computed in vain
+        with warnings.catch_warnings():  # joblib warns that results were not used
             warnings.simplefilter("ignore", UserWarning)
             cast(Any, portions).close()
 

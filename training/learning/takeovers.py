@@ -73,7 +73,7 @@ class Labeller:
     def _by_regret(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[tuple[Scenario, Extremal]]:
         """Return the takeovers where the regret of the following or the previous decisions exceeds the threshold.
 
-        In a failed episode without such regret, they are those shortly before its end.
+        If the goal cannot be reached any more, the last decisions before count as such, also without regret before.
         """
         period, threshold = self._settings.control_period, self._config.regret_threshold
         every = max(1, round(SEARCH_INTERVAL / period))
@@ -121,18 +121,11 @@ def scheduled_steps(episode: DrivenEpisode, period: float, rng: np.random.Genera
 
 def rest_of(episode: DrivenEpisode, step: int, period: float) -> Scenario | None:
     """Return the scenario that starts at a state of an episode; None in collision or with little time left."""
-    horizon = episode.scenario.horizon
-    x, y, heading, *motion = episode.states[step].tolist()
-    rest: dict[str, Any] = {"start": (x, y, heading)}
-    if horizon is not None:
-        left = round(horizon - step * period, 9)
-        if left < MIN_TIME_LEFT:
-            return None
-        rest["horizon"] = left
-    if motion:
-        rest["start_motion"] = tuple(motion)
+    horizon, time = episode.scenario.horizon, step * period
+    if horizon is not None and horizon - time < MIN_TIME_LEFT:
+        return None
     try:
-        return episode.scenario.model_copy(update=rest)
+        return episode.scenario.from_state(episode.states[step], time)
     except ScenarioError:
         return None
 

@@ -70,10 +70,7 @@ class JumpStart(VecEnvWrapper):
         k = int(fraction * (len(reference.times) - 1))
         if k == 0:
             return scenario
-        update: dict[str, Any] = {"start": tuple(reference.states[k].astype(float).tolist())}
-        if scenario.horizon is not None:
-            update["horizon"] = float(scenario.horizon - reference.times[k])
-        return scenario.model_copy(update=update)
+        return scenario.from_state(reference.states[k], float(reference.times[k]))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state that determines the following jump starts."""

@@ -164,7 +164,7 @@ def _level_regret(episode: Episode, settings: EnvironmentSettings) -> float:
 def _decide(scenario: Scenario, episode: Episode, level: float, every: int, period: float) -> Decisions:
     """Return the regret of the decisions of an episode, with a search after every so many steps."""
     if episode.success:  # the optimum to the pose reached, with which the cost of the episode is compared
-        scenario = _to_reached(scenario, episode.states[-1])
+        scenario = scenario.to_state(episode.states[-1])
     last = len(episode.states) - 1
     steps = [*range(0, last, every), last]
     # The cost so far plus the optimal cost to go
@@ -186,27 +186,10 @@ def _decide(scenario: Scenario, episode: Episode, level: float, every: int, peri
     return Decisions(episode, chosen, chosen * period, np.diff(bounded), lost_at)
 
 
-def _to_reached(scenario: Scenario, state: np.ndarray) -> Scenario:
-    """Return the scenario with a reached state as its goal; states that are free at the goal stay free."""
-    x, y, heading, *motion = (float(value) for value in state)
-    free = scenario.goal[2] is None
-    update: dict[str, Any] = {"goal": (x, y, None if free else math.remainder(heading, 2 * math.pi))}
-    if motion:
-        fixed = zip(motion, scenario.goal_state[3:], strict=True)
-        update["goal_motion"] = tuple(None if goal is None else value for value, goal in fixed)
-    return scenario.model_copy(update=update)
-
-
 def _optimal_cost(scenario: Scenario, state: np.ndarray, time: float) -> float:
     """Return the optimal cost from a state at a time (s) to the goal; NaN if none was found."""
-    x, y, heading, *motion = (float(value) for value in state)
-    update: dict[str, Any] = {"start": (x, y, heading)}
-    if scenario.horizon is not None:
-        update["horizon"] = round(scenario.horizon - time, 9)
-    if motion:
-        update["start_motion"] = tuple(motion)
     try:
-        rest = scenario.model_copy(update=update)
+        rest = scenario.from_state(state, time)
     except ScenarioError:  # in collision, or without time left
         return math.nan
     for thorough in (False, True):
