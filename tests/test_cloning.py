@@ -63,16 +63,16 @@ def test_making_and_cloning_leave_the_global_generators_alone(dataset, env):
 
 
 def test_no_course_is_in_both_training_and_validation(dataset):
-    from leapnav.training.learning.cloning import _split
+    from leapnav.training.learning.samples import split_courses
 
-    train, held_out = _split(dataset, 0.25, 0)
+    train, held_out = split_courses(dataset, 0.25, 0)
     assert train.sum() + held_out.sum() == len(dataset)
     assert held_out.any()
     courses = np.array(dataset.course_texts)[dataset.episodes]
     assert not set(courses[train]) & set(courses[held_out])
     # With fewer courses the same ones are held out, except for the rounding of the fraction.
     fewer = dataset.episodes < 60
-    again = _split(dataset[fewer], 0.25, 0)[1]
+    again = split_courses(dataset[fewer], 0.25, 0)[1]
     assert len(set(courses[fewer][again]) - set(courses[held_out])) <= 3
 
 
@@ -98,7 +98,7 @@ def test_cloning_stops_early_and_keeps_the_best_epoch(dataset, env):
 def test_little_data_gives_smaller_batches_and_more_epochs(
     n_samples, batch_size, batches, epochs, dataset, env, monkeypatch
 ):
-    monkeypatch.setattr("leapnav.training.learning.cloning._Samples.__len__", lambda samples: n_samples)
+    monkeypatch.setattr("leapnav.training.learning.samples.Samples.__len__", lambda samples: n_samples)
     fit = Cloning(fresh(env), dataset, CloningConfig())
     assert (fit.batch_size, fit.batches, fit.epochs) == (batch_size, batches, epochs)
     assert fit.epochs * fit.batches >= 2500
@@ -126,7 +126,8 @@ def test_a_resumed_fit_has_the_same_bits_as_an_uninterrupted_one(dataset, env, t
 
 def test_the_hamiltonian_loss_equals_the_cost_of_an_error():
     """The loss equals H(q, lambda, u) - H(q, lambda, u*) for optima inside the robot's limits and at them."""
-    from leapnav.training.learning.cloning import _hamiltonian_loss, action_slopes
+    from leapnav.training.learning.cloning import _hamiltonian_loss
+    from leapnav.training.learning.samples import action_slopes
 
     rng = np.random.default_rng(0)
     count, limits, weights = 200, np.array([2.0, 3.0]), np.array([1.0, 0.5])
@@ -199,6 +200,8 @@ def test_a_diverging_fit_raises_an_error(dataset, env):
         behaviour_clone(fresh(env), dataset, config, progress=False)
     with pytest.raises(ValueError, match="dataset: actions: expected finite numbers"):
         replace(dataset, actions=np.full_like(dataset.actions, np.nan))
+    with pytest.raises(ValueError, match="dataset: actions: expected finite numbers, or only NaN in a sample without"):
+        replace(dataset, actions=np.where([True, False], dataset.actions, np.nan))
 
 
 @pytest.mark.parametrize(

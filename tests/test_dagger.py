@@ -86,8 +86,8 @@ def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
     steps = np.arange(round(scenario.horizon / 0.05) + 1)
     states = np.array(scenario.start) * np.ones((len(steps), 1))
     left = [
-        rest.horizon
-        for rest, _ in Labeller(EnvironmentSettings(), DAggerConfig(), quick=True)._by_schedule(
+        taken.scenario.horizon
+        for taken in Labeller(EnvironmentSettings(), DAggerConfig(), quick=True)._by_schedule(
             driven(scenario, states), np.random.default_rng(0)
         )
     ]

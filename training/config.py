@@ -26,6 +26,7 @@ FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObservationName = Literal["lidar", "geodesic"]
+MemoryName = Literal["none", "stack", "lstm"]
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 
@@ -150,7 +151,7 @@ class RunConfig:
     def tuned(cls, family: str, *, warm: bool | None = None, start: Sequence[Path] = (), **changes: Any) -> Self:
         """Return the settings tuned for a family and a horizon (file `defaults.toml`), with changes.
 
-        A run that starts from a policy has the observation of that policy.
+        A run that starts from a policy has the observation and the memory of that policy.
 
         Args:
             family: one of the families, or "all".
@@ -180,11 +181,22 @@ class RunConfig:
             common = {name: value for name, value in table.items() if name in names}  # the other keys are families
             config = _replace_nested(_replace_nested(config, common), table.get(family, {}))
         given = changes.get("warm_start") or [path for path in (changes.get("policy"),) if path is not None]
-        return replace(config, **{**_sensors(start or given), **changes})
+        own = {setting.name for setting in fields(config)}
+        inherited = {name: value for name, value in _inherited(start or given).items() if name in own}
+        return replace(config, **{**inherited, **changes})
 
 
 @dataclass(frozen=True, kw_only=True)
-class BCConfig(RunConfig):
+class _ImitationConfig(RunConfig):
+    """Settings shared by the runs of imitation learning."""
+
+    memory: MemoryName = "none"
+    """Memory of the policy: of the observations 0.4, 1.2 and 2.8 s ago ("stack"), or an LSTM as the first hidden layer
+    ("lstm", with the extra `contrib`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BCConfig(_ImitationConfig):
     """Behaviour cloning: fit a policy to demonstrations of the expert."""
 
     demos: tuple[Path, ...] = ()
@@ -196,7 +208,7 @@ class BCConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DAggerRunConfig(RunConfig):
+class DAggerRunConfig(_ImitationConfig):
     """Dataset aggregation (DAgger): the learner drives, the expert takes over and provides the labels."""
 
     demos: tuple[Path, ...] = ()
@@ -339,14 +351,15 @@ class SACConfig(_LearnerConfig):
     """Environment steps between checkpoints."""
 
 
-def _sensors(paths: Sequence[Path]) -> dict[str, Any]:
-    """Return the observation and the number of beams of the policy among some paths; empty without one."""
+def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
+    """Return the observation, the number of beams and the memory of the policy among some paths; empty without one."""
     included = files("leapnav.training").joinpath("policies", "pretrained")
     for path in paths:
         for folder in (Path(path), included.joinpath(str(path))):
             try:
-                environment = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))["environment"]
-                return {name: environment[name] for name in ("observation", "lidar_beams")}
+                description = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))
+                sensors = {name: description["environment"][name] for name in ("observation", "lidar_beams")}
+                return {**sensors, "memory": description.get("memory", "none")}
             except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
                 continue
     return {}

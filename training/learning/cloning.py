@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -11,7 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -28,11 +26,11 @@ from leapnav.envs.utils.validation import (
     check_positive,
 )
 from leapnav.experts.data.demonstrations import Demonstration
-from leapnav.experts.problem.system import switching_functions
 from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
+from leapnav.training.learning.samples import Batch, Samples, Symmetry, samples_class, split_courses
 from leapnav.training.learning.symmetries import mirror, time_reverse
-from leapnav.training.policies.actors import actor_parameters, mean_action, policy_of, set_noise, update_target
+from leapnav.training.policies.actors import actor_parameters, policy_of, set_noise, update_target
 from leapnav.training.threads import limit_threads
 
 # Gradient steps of a fit with the default epochs, and bounds of the default batch size. A network that has learned from
@@ -43,8 +41,7 @@ MIN_BATCH_SIZE, MAX_BATCH_SIZE = 64, 2048
 WARM_UP_STEPS = 200  # gradient steps of the linear warm-up of the learning rate
 MIN_STD = 0.01  # lower bound of the fitted standard deviation of the actions
 MAX_GRADIENT_NORM = 1.0
-SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
-EVALUATION_BATCH_SIZE = 65_536
+EVALUATION_BATCH_SIZE = 16_384
 HUBER_DELTA = 0.05  # action error (actions are in [-1, 1]) above which Huber's loss is linear
 
 
@@ -145,8 +142,11 @@ class Cloning:
         self.config, self.losses = config, []
         self._policy = policy
         self._rng = th.Generator().manual_seed(config.seed + stream)
-        train, held_out = _split(dataset, config.validation_share, config.seed)
-        self._train, self._held_out = (_Samples(dataset, chosen, policy.device) for chosen in (train, held_out))
+        kind = samples_class(policy)
+        self._train, self._held_out = (
+            kind(dataset, chosen, policy.device)
+            for chosen in split_courses(dataset, config.validation_share, config.seed)
+        )
         self._scale = _scale(self._train, config.loss)
         self.batch_size = config.batch_size or _default_batch_size(len(self._train))
         self.batches = math.ceil(len(self._train) / self.batch_size)
@@ -189,11 +189,9 @@ class Cloning:
         """
         config, total = self.config, 0.0
         self._policy.set_training_mode(True)
-        order = th.randperm(len(self._train), generator=self._rng)
-        for chosen in order.split(self.batch_size):
-            loss = self._loss(
-                self._train.augmented(chosen, self._symmetries, self._rng) if config.augment else self._train.at(chosen)
-            )
+        for chosen in self._train.shuffled(self.batch_size, self._rng):
+            batch = self._train.batch(chosen, self._random_symmetries() if config.augment else ())
+            loss = self._loss(batch)
             if not th.isfinite(loss):
                 raise ValueError(
                     f"learning_rate: the fit diverged in epoch {len(self.losses) + 1} at {config.learning_rate!r}; "
@@ -204,7 +202,7 @@ class Cloning:
             th.nn.utils.clip_grad_norm_(actor_parameters(self._policy), MAX_GRADIENT_NORM)
             self._optimiser.step()
             self._scheduler.step()
-            total += float(loss.detach()) * len(chosen)
+            total += float(loss.detach()) * len(batch)
             on_batch()
         self._policy.set_training_mode(False)
         losses = EpochLoss(len(self.losses) + 1, total / len(self._train), self._validation_loss())
@@ -221,8 +219,8 @@ class Cloning:
         samples = self._held_out if len(self._held_out) else self._train
         with th.no_grad():
             squares = [
-                (mean_action(self._policy, batch[0]) - batch[1]).square().sum(dim=0)
-                for batch in samples.batches(EVALUATION_BATCH_SIZE)
+                (batch.actions_of(self._policy) - batch.actions).square().sum(dim=0)
+                for batch in map(samples.batch, samples.in_order(EVALUATION_BATCH_SIZE))
             ]
         set_noise(self._policy, (th.stack(squares).sum(dim=0) / len(samples)).sqrt().clamp(min=MIN_STD))
         update_target(self._policy)
@@ -245,57 +243,29 @@ class Cloning:
         self.losses = [EpochLoss(*loss) for loss in state["losses"]]
         self._best = state["best"]
 
-    def _loss(self, samples: tuple[th.Tensor, ...]) -> th.Tensor:
-        observations, actions, slopes, weights = samples
-        error = mean_action(self._policy, observations) - actions
-        return (
-            (_action_loss(error) if self.config.loss == "action" else _hamiltonian_loss(error, slopes, weights))
-            .mul(self._scale)
-            .sum(dim=1)
-            .mean()
-        )
+    def _random_symmetries(self) -> list[Symmetry]:
+        """Return a random combination of the robot's symmetries."""
+        combination = int(th.randint(2 ** len(self._symmetries), (1,), generator=self._rng))
+        return [transform for number, transform in enumerate(self._symmetries) if combination & 2**number]
+
+    def _loss(self, batch: Batch) -> th.Tensor:
+        error = batch.actions_of(self._policy) - batch.actions
+        is_action_loss = self.config.loss == "action"
+        losses = _action_loss(error) if is_action_loss else _hamiltonian_loss(error, batch.slopes, batch.weights)
+        return losses.mul(self._scale).sum(dim=1).mean()
 
     def _validation_loss(self) -> float:
         if not len(self._held_out):
             return math.nan
         with th.no_grad():
-            batches = self._held_out.batches(EVALUATION_BATCH_SIZE)
-            losses = [float(self._loss(batch)) * len(batch[0]) for batch in batches]
+            batches = map(self._held_out.batch, self._held_out.in_order(EVALUATION_BATCH_SIZE))
+            losses = [float(self._loss(batch)) * len(batch) for batch in batches]
         return sum(losses) / len(self._held_out)
 
 
 def _default_batch_size(n_samples: int) -> int:
     """Return the batch size with which `DEFAULT_EPOCHS` epochs have about `MIN_STEPS` gradient steps, or more."""
     return min(max(n_samples * DEFAULT_EPOCHS // MIN_STEPS, MIN_BATCH_SIZE), MAX_BATCH_SIZE)
-
-
-class _Samples:
-    """Samples as tensors: observations, actions, and the slopes and weights of `_hamiltonian_loss`."""
-
-    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
-        columns = dataset.observations, dataset.actions, action_slopes(dataset), dataset.weights * dataset.limits**2
-        self.columns = tuple(th.as_tensor(np.asarray(c[chosen], dtype=np.float32), device=device) for c in columns)
-
-    def __len__(self) -> int:
-        return len(self.columns[0])
-
-    def at(self, chosen: th.Tensor) -> tuple[th.Tensor, ...]:
-        return tuple(column[chosen] for column in self.columns)
-
-    def batches(self, size: int) -> list[tuple[th.Tensor, ...]]:
-        return list(zip(*(column.split(size) for column in self.columns), strict=True))
-
-    def augmented(
-        self, chosen: th.Tensor, symmetries: Sequence[Callable[..., tuple[th.Tensor, th.Tensor]]], rng: th.Generator
-    ) -> tuple[th.Tensor, ...]:
-        """Return samples after a random combination of the robot's symmetries."""
-        observations, actions, slopes, weights = self.at(chosen)
-        combination = int(th.randint(2 ** len(symmetries), (1,), generator=rng))
-        for number, transform in enumerate(symmetries):
-            if combination & 2**number:
-                _, slopes = transform(observations, slopes)  # the slopes change sign with the actions
-                observations, actions = transform(observations, actions)
-        return observations, actions, slopes, weights
 
 
 def warm_up_and_cosine(total_steps: int) -> Callable[[int], float]:
@@ -334,35 +304,13 @@ def _hamiltonian_loss(error: th.Tensor, slopes: th.Tensor, weights: th.Tensor) -
     return 0.5 * weights * error.square() + functional.relu(slopes * error)
 
 
-def action_slopes(dataset: Dataset) -> np.ndarray:
-    """dH/du (N, m) at the expert's actions, per unit of the action; zero for actions that no limit bounds."""
-    p = switching_functions(dataset.settings.model, dataset.states, dataset.costates, dataset.parameters)
-    slopes = (p + dataset.weights * dataset.limits * dataset.actions) * dataset.limits
-    # The expert's action belongs to the middle of the control period, the costate to its beginning. Inside the limits
-    # the difference of the two is not meaningful, and at a limit dH/du must point outwards.
-    limited = (np.abs(dataset.actions) >= SATURATION) & (slopes * dataset.actions < 0)
-    return np.where(limited & np.isfinite(slopes), slopes, 0.0)
-
-
-def _scale(samples: _Samples, loss: str) -> th.Tensor:
+def _scale(samples: Samples, loss: str) -> th.Tensor:
     """Factors (m,) of the components of the loss with which the mean action has the loss 1."""
-    _, actions, slopes, weights = samples.columns
+    actions, slopes, weights = samples.columns
     error = actions.mean(dim=0) - actions
     if loss == "action":
         return 0.5 / _action_loss(error).mean(dim=0).clamp(min=1e-6)
     return (1.0 / _hamiltonian_loss(error, slopes, weights).sum(dim=1).mean()).clamp(max=1e6).repeat(actions.shape[1])
-
-
-def _split(dataset: Dataset, fraction: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (N,) of the training and the validation samples, which have no obstacle course in common.
-
-    A hash of the course decides, so that most courses stay in their part when the dataset grows.
-    """
-    courses = dataset.course_texts
-    hashes = {text: hashlib.blake2b(f"{seed} {text}".encode()).digest() for text in set(courses)}
-    held_out = set(sorted(hashes, key=hashes.__getitem__)[: int(fraction * len(hashes))])
-    mask = np.array([text in held_out for text in courses])[dataset.episodes]
-    return ~mask, mask
 
 
 def check_observations(policy: BasePolicy, dataset: Dataset) -> None:

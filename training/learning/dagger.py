@@ -31,8 +31,9 @@ from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.learning.cloning import Cloning, check_observations
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.driving import DrivenEpisode, drive_episodes
-from leapnav.training.learning.takeovers import TAKEOVERS, label_episodes
+from leapnav.training.learning.takeovers import TAKEOVERS, Labeller, label_episodes
 from leapnav.training.policies.actors import policy_of
+from leapnav.training.policies.memory import history_length
 from leapnav.training.robots.vec_env import NavigateVecEnv
 from leapnav.training.threads import limit_threads
 
@@ -232,12 +233,10 @@ class DAgger:
         """Return the samples of the expert after the takeovers; None if it has no optimum in any of them."""
         # The division into tasks does not depend on the number of workers, and neither do the samples.
         portions = [episodes[k : k + LABELLED_PER_TASK] for k in range(0, len(episodes), LABELLED_PER_TASK)]
-        settings, quick = self._venv.venv.settings, bool(self._expert.settings["quick"])
+        quick, history = bool(self._expert.settings["quick"]), history_length(self._policy)
+        labeller = Labeller(self._venv.venv.settings, self.config, quick=quick, history=history)
         seed = self.config.seed, len(self.rounds), TAKEOVER_STREAM
-        tasks = (
-            delayed(label_episodes)(settings, self.config, quick, portion, (*seed, number))
-            for number, portion in enumerate(portions)
-        )
+        tasks = (delayed(label_episodes)(labeller, portion, (*seed, number)) for number, portion in enumerate(portions))
         labelled = cast(Iterator[list[Dataset]], Parallel(self._workers, return_as="generator")(tasks))
         parts: list[Dataset] = []
         for datasets, portion in zip(labelled, portions, strict=True):

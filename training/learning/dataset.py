@@ -33,7 +33,8 @@ class Dataset:
 
     Attributes:
         observations (N, d): float32.
-        actions (N, m): the expert's actions, float32, in [-1, 1].
+        actions (N, m): the expert's actions, float32, in [-1, 1]; NaN in samples that contain only what was observed
+            before, for policies with memory.
         returns (N,): expert's return from the sample to the end of the episode (-cost-to-go); NaN if unknown.
         costates (N, n): gradient of the cost-to-go with respect to the state; NaN if unknown.
         states (N, n): x, y (m), heading (rad) and further states of the robot.
@@ -71,9 +72,12 @@ class Dataset:
             found = getattr(self, name).shape
             if found != (count, *shape):
                 raise ValueError(f"dataset: {name}: expected the shape {(count, *shape)}, got {found}")
-        for name in ("observations", "actions"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"dataset: {name}: expected finite numbers")
+        if not np.isfinite(self.observations).all():
+            raise ValueError("dataset: observations: expected finite numbers")
+        if not (np.isfinite(self.actions).all(axis=1) | np.isnan(self.actions).all(axis=1)).all():
+            raise ValueError("dataset: actions: expected finite numbers, or only NaN in a sample without a label")
+        if not self.labelled.any():
+            raise ValueError("dataset: actions: expected finite numbers, got only NaN")
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -102,6 +106,29 @@ class Dataset:
         scenarios = [parsed[episode] for episode in self.episodes.tolist()]
         observations = Observer(settings).observe(scenarios, self.states, self.times)
         return replace(self, observations=observations, settings=settings)
+
+    @property
+    def labelled(self) -> np.ndarray:
+        """Whether the expert's action of each sample is known (N,)."""
+        return ~np.isnan(self.actions[:, 0])
+
+    def preceded(self, observations: np.ndarray, states: np.ndarray, times: np.ndarray) -> Dataset:
+        """Return the samples of one episode after samples without a label.
+
+        Args:
+            observations: (K, d), what was observed before the first sample, in order of time.
+            states: (K, n), the states there.
+            times: (K,), relative to the same time as those of the samples (s).
+
+        """
+        columns: dict[str, Any] = {
+            name: np.concatenate([np.full((len(states), *getattr(self, name).shape[1:]), np.nan, np.float32), own])
+            for name in _COLUMNS
+            if (own := getattr(self, name)).dtype.kind == "f"
+        }
+        for name, before in (("observations", observations), ("states", states), ("times", times)):
+            columns[name][: len(states)] = before
+        return replace(self, **columns, episodes=np.full(len(states) + len(self), self.episodes[0]))
 
     @cached_property
     def _scenario_fields(self) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,14 @@ SEARCH_INTERVAL = 0.75  # s between the states at which the regret is computed
 REGRET_WINDOW = 3.0  # s in which the regret is accumulated
 
 
+class Takeover(NamedTuple):
+    """A step of an episode, the rest of the episode from there as a scenario, and its optimum."""
+
+    step: int
+    scenario: Scenario
+    optimum: Extremal
+
+
 class Labeller:
     """Choose takeovers in the episodes of a learner, and label them.
 
@@ -39,28 +47,39 @@ class Labeller:
         settings: settings of the environment.
         config: settings of DAgger.
         quick: whether the searches examine only the most promising candidates, see `find_optimum`.
+        history: maximum number of samples without a label before a takeover, for policies with memory.
 
     """
 
-    def __init__(self, settings: EnvironmentSettings, config: DAggerConfig, *, quick: bool) -> None:
-        self._settings, self._config, self._quick = settings, config, quick
+    def __init__(self, settings: EnvironmentSettings, config: DAggerConfig, *, quick: bool, history: int = 0) -> None:
+        self._settings, self._config, self._quick, self._history = settings, config, quick, history
         self._observer = Observer(settings)
 
     def label(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Dataset]:
         """Return the samples of the takeovers of an episode, in order of time."""
         choose = self._by_regret if self._config.takeovers == "regret" else self._by_schedule
-        lead = self._config.lead
-        return [samples_of(self._observer, self._settings, *taken, lead) for taken in choose(episode, rng)]
+        return [self._samples(episode, taken) for taken in choose(episode, rng)]
 
-    def _search(self, episode: DrivenEpisode, step: int) -> tuple[Scenario, Extremal] | None:
-        """Return the rest of an episode from a step on, and its optimum; None without one."""
+    def _samples(self, episode: DrivenEpisode, taken: Takeover) -> Dataset:
+        """Return the samples of a takeover, after those of the learner's states before it."""
+        lead = self._config.lead
+        samples = samples_of(self._observer, self._settings, taken.scenario, taken.optimum, lead)
+        before = episode.states[max(0, taken.step - self._history) : taken.step]
+        if len(before) == 0:
+            return samples
+        times = self._settings.control_period * np.arange(-len(before), 0)
+        observations = self._observer.observe([taken.scenario] * len(before), before, times)
+        return samples.preceded(observations, before, times)
+
+    def _search(self, episode: DrivenEpisode, step: int) -> Takeover | None:
+        """Return the takeover at a step; None if there is no optimum."""
         scenario = rest_of(episode, step, self._settings.control_period)
         if scenario is None:
             return None
         optimum = find_optimum(scenario, thorough=not self._quick)
-        return (scenario, optimum) if optimum.success else None
+        return Takeover(step, scenario, optimum) if optimum.success else None
 
-    def _by_schedule(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[tuple[Scenario, Extremal]]:
+    def _by_schedule(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Takeover]:
         """Return the takeovers at the scheduled times, until the first one without an optimum."""
         chosen = []
         for step in scheduled_steps(episode, self._settings.control_period, rng):
@@ -70,7 +89,7 @@ class Labeller:
             chosen.append(found)
         return chosen
 
-    def _by_regret(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[tuple[Scenario, Extremal]]:
+    def _by_regret(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Takeover]:
         """Return the takeovers where the regret of the following or the previous decisions exceeds the threshold.
 
         If the goal cannot be reached any more, the last decisions before count as such, also without regret before.
@@ -80,22 +99,22 @@ class Labeller:
         steps = range(int(rng.integers(1, every + 1)), len(episode.states) - 1, every)
         if episode.success:  # a near miss, or not: the regret of the whole episode
             first = self._search(episode, 0)
-            if first is None or episode.costs[-1] - first[1].cost <= threshold:
+            if first is None or episode.costs[-1] - first.optimum.cost <= threshold:
                 return []
-        found: list[tuple[int, tuple[Scenario, Extremal]]] = []
+        found: list[Takeover] = []
         for step in steps:
             searched = self._search(episode, step)
             if searched is None:
                 break
-            found.append((step, searched))
-        values = np.array([episode.costs[step] + optimum.cost for step, (_, optimum) in found])
+            found.append(searched)
+        values = np.array([episode.costs[taken.step] + taken.optimum.cost for taken in found])
         window = max(1, round(REGRET_WINDOW / SEARCH_INTERVAL))
         chosen = []
         # The cost so far plus the optimal cost to go increases by the regret. If the goal cannot be reached any more,
         # the last decisions have an infinite regret.
         lost = math.inf if not episode.success else episode.costs[-1]
         following = np.append(values, [lost] * window)
-        for k, (_, searched) in enumerate(found):
+        for k, searched in enumerate(found):
             ahead = following[k + 1 : k + 1 + window].max() - values[k]
             behind = values[k] - values[max(0, k - window) : k + 1].min()
             if max(ahead, behind) > threshold:
@@ -164,9 +183,7 @@ def samples_of(
     )
 
 
-def label_episodes(
-    settings: EnvironmentSettings, config: DAggerConfig, quick: bool, episodes: Sequence[DrivenEpisode], seed: Any
-) -> list[Dataset]:
+def label_episodes(labeller: Labeller, episodes: Sequence[DrivenEpisode], seed: Any) -> list[Dataset]:
     """Return the samples of the takeovers of several episodes."""
-    labeller, rng = Labeller(settings, config, quick=quick), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     return [samples for episode in episodes for samples in labeller.label(episode, rng)]

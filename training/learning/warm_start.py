@@ -23,12 +23,12 @@ from leapnav.experts.data.demonstrations import CONTROL_PERIOD
 from leapnav.training.config import CloningConfig, WarmStartConfig
 from leapnav.training.learning.cloning import (
     EpochLoss,
-    action_slopes,
     behaviour_clone,
     check_observations,
     cosine_decay,
 )
 from leapnav.training.learning.dataset import Dataset
+from leapnav.training.learning.samples import action_slopes
 from leapnav.training.policies.actors import copy_actor, policy_of
 from leapnav.training.threads import limit_threads
 

@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
 
+from leapnav.training.policies.memory import is_recurrent, memory_of, recurrent_actions
 from leapnav.training.policies.network import NavigationFeatures
 
 
@@ -35,13 +36,26 @@ def _actor(policy: BasePolicy) -> Any:
 def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
     """Return the parameters of the actor: of an on-policy algorithm those of the mean action, without the noise."""
     if isinstance(policy, ActorCriticPolicy):
-        modules = policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net
+        memory = [cast(Any, policy).lstm_actor] if is_recurrent(policy) else []
+        modules = policy.pi_features_extractor, *memory, policy.mlp_extractor.policy_net, policy.action_net
         return [parameter for module in modules for parameter in module.parameters()]
     return list(_actor(policy).parameters())
 
 
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
-    """Compute the deterministic action (B, m) of a policy, not clipped, with gradients."""
+    """Compute the deterministic actions of a policy, not clipped, with gradients.
+
+    Args:
+        policy: the policy.
+        observations: (B, d); for a policy with stacked frames (B, k d); for one with an LSTM sequences (S, T, d) from
+            the start of an episode on.
+
+    Returns:
+        The actions (B, m) or (S, T, m).
+
+    """
+    if is_recurrent(policy):
+        return recurrent_actions(policy, observations)
     if isinstance(policy, ActorCriticPolicy):
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
         return policy.action_net(policy.mlp_extractor.forward_actor(features))
@@ -78,6 +92,8 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
             f"policy: expected the same squashing of the actions, got a {type(source).__name__} for a "
             f"{type(target).__name__}; start from demonstrations instead"
         )
+    if memory_of(source) != memory_of(target):
+        raise ValueError(f"policy: expected the memory {memory_of(target)!r}, got {memory_of(source)!r}")
     tensors = _actor_tensors(source), _actor_tensors(target)
     extractors = [_extractor(policy) for policy in (source, target)]
     if all(isinstance(extractor, NavigationFeatures) for extractor in extractors):

@@ -15,6 +15,13 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from leapnav.envs.utils.validation import check_choice
+from leapnav.training.policies.memory import (
+    MEMORIES,
+    FrameStackPolicy,
+    memory_of,
+    recurrent_arguments,
+    recurrent_policy_class,
+)
 from leapnav.training.policies.momentum import MomentumPolicy, MomentumSACPolicy
 from leapnav.training.policies.network import NavigationFeatures, check_spaces
 
@@ -33,6 +40,7 @@ class Architecture:
         extractor: "navigation" (`NavigationFeatures`) or "flatten" (the observation itself).
         activation: name of the activation function in `torch.nn`.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`, or None.
+        memory: "none", "stack" or "lstm", see `leapnav.training.policies.memory`.
 
     """
 
@@ -42,12 +50,13 @@ class Architecture:
     extractor: str = "navigation"
     activation: str = "ReLU"
     effort_weights: tuple[float, ...] | None = None
+    memory: str = "none"
 
     def make(self, observation_space: spaces.Box, action_space: spaces.Space) -> BasePolicy:
         """Create an untrained policy on the CPU.
 
         Raises:
-            ModuleNotFoundError: a TQC policy needs the extra `contrib`.
+            ModuleNotFoundError: a TQC policy or one with an LSTM needs the extra `contrib`.
             ValueError: an attribute is unknown, or the spaces do not fit the extractor.
 
         """
@@ -56,16 +65,25 @@ class Architecture:
         check_choice("activation", self.activation, ACTIVATIONS)
         if self.extractor == "navigation":
             check_spaces(observation_space, action_space)
-        momentum = {} if self.effort_weights is None else {"effort_weights": self.effort_weights}
-        return _policy_class(self.kind, has_momentum=bool(momentum))(
-            observation_space,
-            action_space,
-            lambda _: 3e-4,
-            net_arch={"pi": list(self.hidden), "vf": list(self.critic), "qf": list(self.critic)},
-            activation_fn=ACTIVATIONS[self.activation],
-            features_extractor_class=EXTRACTORS[self.extractor],
-            **momentum,
-        )
+        check_choice("memory", self.memory, MEMORIES)
+        arguments: dict[str, Any] = {
+            "net_arch": {"pi": list(self.hidden), "vf": list(self.critic), "qf": list(self.critic)},
+            "activation_fn": ACTIVATIONS[self.activation],
+            "features_extractor_class": EXTRACTORS[self.extractor],
+        }
+        if self.memory == "lstm":
+            arguments |= recurrent_arguments(self.hidden, self.critic)
+        if self.effort_weights is not None:
+            arguments["effort_weights"] = self.effort_weights
+        return self._policy_class()(observation_space, action_space, lambda _: 3e-4, **arguments)
+
+    def _policy_class(self) -> Any:
+        """Return the class of the policy."""
+        if self.memory == "lstm":
+            return recurrent_policy_class()
+        if self.memory == "stack":
+            return FrameStackPolicy
+        return _policy_class(self.kind, has_momentum=self.effort_weights is not None)
 
     @classmethod
     def of(cls, policy: BasePolicy) -> Architecture:
@@ -84,12 +102,16 @@ class Architecture:
         if not isinstance(policy.observation_space, spaces.Box):
             got = type(policy.observation_space).__name__
             raise ValueError(f"model: expected an MlpPolicy for observations in a Box, got a {got}")
-        extractor = _name_of("features extractor", EXTRACTORS, policy.features_extractor_class)
+        memory = memory_of(policy)
+        extractor_class = given.frame_extractor_class if memory == "stack" else policy.features_extractor_class
+        extractor = _name_of("features extractor", EXTRACTORS, extractor_class)
         activation = _name_of("activation function", ACTIVATIONS, given.activation_fn)
         if getattr(given, "use_sde", False):
             raise ValueError("model: expected a policy without state-dependent exploration, got use_sde=True")
         hidden, critic = widths(given.net_arch)
-        return cls(kind, hidden, critic, extractor, activation, getattr(given, "effort_weights", None))
+        if memory == "lstm":
+            hidden, critic = ((given.lstm_actor.hidden_size, *rest) for rest in (hidden, critic))
+        return cls(kind, hidden, critic, extractor, activation, getattr(given, "effort_weights", None), memory)
 
 
 def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -109,7 +131,7 @@ def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 def is_actor_weight(name: str) -> bool:
     """Return whether a weight belongs to the mean action or its noise."""
-    return name.startswith(("actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))
+    return name.startswith(("actor.", "lstm_actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))
 
 
 def _name_of(what: str, known: Mapping[str, type], value: object) -> str:

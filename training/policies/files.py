@@ -30,7 +30,7 @@ from leapnav.training.policies.architecture import KINDS, Architecture, is_actor
 from leapnav.training.policies.zips import is_zip, load_zip
 
 BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
-FORMAT, READ_FORMATS = 3, (2, 3)  # version of policy.json; in version 2 every network is that of `network`
+FORMAT, READ_FORMATS = 4, (2, 3, 4)  # version of policy.json; before 3 all have the default network, before 4 no memory
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
 OBSERVED = (*SENSORS, "robot", "horizon", "actuation", "dict_observation")

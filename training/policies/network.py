@@ -17,7 +17,14 @@ from leapnav.envs.simulation.observations import (
     has_geodesics,
     has_time_left,
 )
+from leapnav.envs.utils.validation import check_choice
 from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.training.policies.memory import (
+    MEMORIES,
+    FrameStackPolicy,
+    recurrent_arguments,
+    recurrent_policy_class,
+)
 from leapnav.training.policies.momentum import MomentumPolicy
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
@@ -200,8 +207,9 @@ def make_policy(
     hidden: Sequence[int] = HIDDEN,
     critic: Sequence[int] | None = None,
     effort_weights: Sequence[float] | None = None,
+    memory: str = "none",
 ) -> ActorCriticPolicy:
-    """Create an untrained actor-critic policy for `leapnav/Navigate-v0`, which PPO and A2C can train.
+    """Create an untrained actor-critic policy for `leapnav/Navigate-v0`; PPO and A2C can train one without memory.
 
     Args:
         observation_space, action_space: spaces of the environment.
@@ -209,24 +217,31 @@ def make_policy(
         hidden: widths of the actor's hidden layers.
         critic: widths of the critic's hidden layers; None: those of the actor.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`; None: without.
+        memory: "none"; "stack", of earlier observations; or "lstm", whose first hidden layer is an LSTM. See
+            `leapnav.training.policies.memory`.
 
     Raises:
-        ValueError: the spaces are not those of the environment with a lidar.
+        ModuleNotFoundError: an LSTM needs the extra `contrib`.
+        ValueError: the spaces are not those of the environment with a lidar, or `memory` is unknown or combined with
+            momentum.
 
     """
     check_spaces(observation_space, action_space)
+    check_choice("memory", memory, MEMORIES)
+    if memory != "none" and effort_weights is not None:
+        raise ValueError(f"memory: expected 'none' for a policy with momentum, got {memory!r}")
+    arguments = network(hidden, critic)
+    kind: Any = ActorCriticPolicy
+    if effort_weights is not None:
+        kind, arguments = MomentumPolicy, {**arguments, "effort_weights": effort_weights}
+    elif memory == "stack":
+        kind = FrameStackPolicy
+    elif memory == "lstm":
+        kind = recurrent_policy_class()
+        arguments |= recurrent_arguments(hidden, hidden if critic is None else critic)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
-        momentum: dict[str, Any] = {} if effort_weights is None else {"effort_weights": effort_weights}
-        kind: Any = MomentumPolicy if momentum else ActorCriticPolicy
-        return kind(
-            observation_space,
-            action_space,
-            lr_schedule=lambda _: 3e-4,
-            log_std_init=-2.0,
-            **network(hidden, critic),
-            **momentum,
-        )
+        return kind(observation_space, action_space, lr_schedule=lambda _: 3e-4, log_std_init=-2.0, **arguments)
 
 
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:

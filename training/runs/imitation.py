@@ -183,11 +183,19 @@ def observed_settings(config: RunConfig) -> EnvironmentSettings:
     return make_env(config).settings
 
 
-def _new_policy(config: RunConfig) -> ActorCriticPolicy:
+def _new_policy(config: BCConfig | DAggerRunConfig) -> ActorCriticPolicy:
     """Return an untrained policy with the network and the observations of a run."""
     env = make_env(config)
-    weights = momentum_of(config)
-    return make_policy(env.observation_space, env.action_space, config.seed, config.hidden, effort_weights=weights)
+    # With a memory, the network itself can continue in the direction of the last actions.
+    weights = momentum_of(config) if config.memory == "none" else None
+    return make_policy(
+        env.observation_space,
+        env.action_space,
+        config.seed,
+        config.hidden,
+        effort_weights=weights,
+        memory=config.memory,
+    )
 
 
 def momentum_of(config: RunConfig) -> tuple[float, ...] | None:

@@ -1,0 +1,192 @@
+"""The samples of a dataset as the inputs of a policy: single observations, stacked observations, or sequences."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+
+from leapnav.experts.problem.system import switching_functions
+from leapnav.training.learning.dataset import Dataset
+from leapnav.training.policies.actors import mean_action
+from leapnav.training.policies.memory import LAGS, memory_of
+
+SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
+SORTED_BATCHES = 16  # batches among which sequences are exchanged, such that those of a batch have similar lengths
+
+Symmetry = Callable[..., tuple[th.Tensor, th.Tensor]]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples as tensors.
+
+    Attributes:
+        observations: input of `mean_action`: (B, d), stacked (B, k d), or sequences (S, T, d).
+        actions (B, m): the expert's actions.
+        slopes, weights (B, m): see `action_slopes`; cost weights of the actions.
+        labelled (S, T): the steps of the sequences that have the B actions; None if there are no sequences.
+
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    slopes: th.Tensor
+    weights: th.Tensor
+    labelled: th.Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def actions_of(self, policy: BasePolicy) -> th.Tensor:
+        """Compute the mean actions (B, m) of a policy, with gradients."""
+        actions = mean_action(policy, self.observations)
+        return actions if self.labelled is None else actions[self.labelled]
+
+
+class Samples:
+    """The chosen samples of a dataset that have a label, for a policy without memory.
+
+    Args:
+        dataset: the dataset.
+        chosen: (N,), bool; with a memory, whole episodes.
+        device: device of the tensors.
+
+    """
+
+    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
+        self.rows = th.as_tensor(np.flatnonzero(chosen & dataset.labelled), device=device)
+        self._observations = _tensor(dataset.observations, device)
+        columns = dataset.actions, action_slopes(dataset), dataset.weights * dataset.limits**2
+        self._columns = [_tensor(column, device) for column in columns]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def columns(self) -> tuple[th.Tensor, ...]:
+        """Actions, slopes and weights of all samples, see `Batch`."""
+        return tuple(column[self.rows] for column in self._columns)
+
+    def shuffled(self, size: int, rng: th.Generator) -> Iterator[th.Tensor]:
+        """Yield what `batch` takes, for one pass over the samples in random order, in batches of about `size`."""
+        yield from th.randperm(len(self), generator=rng).split(size)
+
+    def in_order(self, size: int) -> Iterator[th.Tensor]:
+        """Yield what `batch` takes, for one pass over the samples in their order."""
+        yield from th.arange(len(self)).split(size)
+
+    def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:
+        """Return some samples, after transformations by symmetries."""
+        rows = self.rows[chosen]
+        observations, *columns = self._transformed(rows, self._observations_of(rows), symmetries)
+        return Batch(observations, *columns)
+
+    def _observations_of(self, rows: th.Tensor) -> th.Tensor:
+        """Return observations (b, d) of which those of a row are consecutive."""
+        return self._observations[rows]
+
+    def _transformed(
+        self, rows: th.Tensor, observations: th.Tensor, symmetries: Sequence[Symmetry]
+    ) -> tuple[th.Tensor, ...]:
+        """Return observations (b, d) and the columns of the rows after transformations."""
+        actions, slopes, weights = (column[rows] for column in self._columns)
+        for transform in symmetries:
+            _, slopes = transform(observations[:1], slopes)  # the slopes change sign with the actions
+            observations, actions = transform(observations, actions)
+        return observations, actions, slopes, weights
+
+
+class StackedSamples(Samples):
+    """Samples for a policy with stacked observations, see `FrameStackPolicy`."""
+
+    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
+        super().__init__(dataset, chosen, device)
+        first, lengths = _sequences(dataset)
+        starts = np.repeat(first, lengths)
+        rows = np.flatnonzero(chosen & dataset.labelled)
+        frames = [rows, *(np.maximum(rows - lag, starts[rows]) for lag in LAGS)]
+        self._frames = th.as_tensor(np.stack(frames, axis=1), device=device)
+
+    def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:  # noqa: D102 (see `Samples`)
+        frames = self._frames[chosen]
+        observations = self._observations[frames.flatten()]
+        observations, *columns = self._transformed(self.rows[chosen], observations, symmetries)
+        return Batch(observations.reshape(len(chosen), -1), *columns)
+
+
+class Sequences(Samples):
+    """Samples for a policy with an LSTM: whole episodes, of which some steps have labels."""
+
+    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
+        super().__init__(dataset, chosen, device)
+        starts, lengths = _sequences(dataset)
+        self._labelled = th.as_tensor(dataset.labelled, device=device)
+        kept = chosen[starts] & (np.add.reduceat(dataset.labelled, starts) > 0)
+        self._starts, self._lengths = (th.as_tensor(values[kept], device=device) for values in (starts, lengths))
+
+    def _size(self, size: int) -> int:
+        """Return how many sequences have about `size` labels."""
+        return max(1, round(size * len(self._starts) / max(1, len(self))))
+
+    def shuffled(self, size: int, rng: th.Generator) -> Iterator[th.Tensor]:  # noqa: D102 (see `Samples`)
+        per_batch, batches = self._size(size), []
+        for portion in th.randperm(len(self._starts), generator=rng).split(SORTED_BATCHES * per_batch):
+            batches += portion[self._lengths[portion].argsort(stable=True)].split(per_batch)
+        for k in th.randperm(len(batches), generator=rng).tolist():
+            yield batches[k]
+
+    def in_order(self, size: int) -> Iterator[th.Tensor]:  # noqa: D102 (see `Samples`)
+        yield from th.arange(len(self._starts)).split(self._size(size))
+
+    def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:  # noqa: D102 (see `Samples`)
+        starts, lengths = self._starts[chosen], self._lengths[chosen]
+        steps = th.arange(int(lengths.max()), device=starts.device)
+        exists = steps < lengths[:, None]
+        rows = starts[:, None] + th.minimum(steps, lengths[:, None] - 1)  # the last step fills the shorter ones
+        labelled = exists & self._labelled[rows]
+        observations = self._observations[rows.flatten()]
+        observations, *columns = self._transformed(rows[labelled], observations, symmetries)
+        return Batch(observations.reshape(*rows.shape, -1), *columns, labelled=labelled)
+
+
+def samples_class(policy: BasePolicy) -> type[Samples]:
+    """Return the class of the samples for a policy."""
+    return {"none": Samples, "stack": StackedSamples, "lstm": Sequences}[memory_of(policy)]
+
+
+def _sequences(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first rows and the lengths of the episodes of a dataset."""
+    starts = np.flatnonzero(np.diff(dataset.episodes, prepend=-1) != 0)
+    return starts, np.diff(starts, append=len(dataset))
+
+
+def _tensor(values: Any, device: th.device) -> th.Tensor:
+    return th.as_tensor(np.asarray(values, dtype=np.float32), device=device)
+
+
+def action_slopes(dataset: Dataset) -> np.ndarray:
+    """dH/du (N, m) at the expert's actions, per unit of the action; zero for actions that no limit bounds."""
+    p = switching_functions(dataset.settings.model, dataset.states, dataset.costates, dataset.parameters)
+    slopes = (p + dataset.weights * dataset.limits * dataset.actions) * dataset.limits
+    # The expert's action belongs to the middle of the control period, the costate to its beginning. Inside the limits
+    # the difference of the two is not meaningful, and at a limit dH/du must point outwards.
+    limited = (np.abs(dataset.actions) >= SATURATION) & (slopes * dataset.actions < 0)
+    return np.where(limited & np.isfinite(slopes), slopes, 0.0)
+
+
+def split_courses(dataset: Dataset, fraction: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (N,) of the training and the validation samples, which have no obstacle course in common.
+
+    A hash of the course decides, so that most courses stay in their part when the dataset grows.
+    """
+    courses = dataset.course_texts
+    hashes = {text: hashlib.blake2b(f"{seed} {text}".encode()).digest() for text in set(courses)}
+    held_out = set(sorted(hashes, key=hashes.__getitem__)[: int(fraction * len(hashes))])
+    mask = np.array([text in held_out for text in courses])[dataset.episodes]
+    return ~mask, mask
