@@ -158,8 +158,7 @@ class FrameStackPolicy(ActorCriticPolicy):
 def stack_frames(current: Any, history: Any) -> Any:
     """Return the input (N, k d) of the network for the current observations (N, 1, d) and the history (N, H, d)."""
     concatenate = th.cat if isinstance(current, th.Tensor) else np.concatenate
-    frames = [current, *(history[:, -lag, None] for lag in LAGS)]
-    return concatenate(frames, 1).reshape(len(current), -1)
+    return concatenate([current[:, 0], *(history[:, -lag] for lag in LAGS)], 1)
 
 
 def next_history(current: Any, history: Any) -> Any:
