@@ -25,11 +25,8 @@ def ship(name: str, runs: Path) -> None:
     """Train the policy of a family, or resume its run; write the actor in half precision, and score it."""
     run = runs / name
     prefix, _, family = name.rpartition("-")
-    config = DAggerRunConfig.tuned(family, out=run, horizon="free" if name == FREE else "fixed")
-    if prefix in ROBOTS:
-        # Their actions are rates of what the unicycle controls directly; the fit needs more weights and epochs.
-        dagger = replace(config.dagger, rounds=12, last_epochs=12)
-        config = replace(config, robot=cast(RobotName, prefix), hidden=(400, 400, 400), dagger=dagger)
+    robot = cast(RobotName, prefix if prefix in ROBOTS else "unicycle")
+    config = DAggerRunConfig.tuned(family, out=run, robot=robot, horizon="free" if name == FREE else "fixed")
     train_dagger(replace(config, resume=(run / "config.json").exists()), workers=os.cpu_count() or 1)
     shipped = SHIPPED / name
     shutil.rmtree(shipped, ignore_errors=True)

@@ -42,7 +42,7 @@ PRINTED = {
     "index.md": rf"True {NUMBER} times the optimal cost\nRolloutSummary\(demonstrations=50, .*\)\n{RATE}\n"
     r"True 3 True\n",
     "lower_bounds.md": r"True\n",
-    "training.md": r"20 True\n1\n2 True\nTrue \(400,\)\n\(3,\) True\n",
+    "training.md": r"20 True\n\(1, 56, 137\)\n1\n2 True\nTrue \(400,\)\n\(3,\) True\n",
     "tutorial.md": rf"True {NUMBER} 0\.3106\d+\n\[5\.2072\d+, .*\]\nTrue 1\.0000\d*\n"
     rf"RolloutSummary\(demonstrations=50, .*\)\n{NUMBER} {RATE} {RATE} 0\.00\d*\n{RATE}\n",
     "guides/compare.md": r"(.*\n)* expert +100\.0 +0\.0 +1\.000 (.*\n)*1\.0\n3\n",

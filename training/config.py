@@ -12,9 +12,9 @@ from typing import Any, Literal, Self, cast
 
 from leapnav.deprecated import renamed_fields
 
-# Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start, "-free" those
-# for a free horizon, "-lidar" those for lidar alone; a sub-table with the name of a family contains the changes for
-# this family.
+# Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start, "-warm-motor"
+# those for a warm start of a robot with motors, "-free" those for a free horizon, "-lidar" those for lidar alone; a
+# sub-table with the name of a family contains the changes for this family.
 _DEFAULTS: dict[str, Any] = tomllib.loads(
     files("leapnav.training").joinpath("defaults.toml").read_text(encoding="utf-8")
 )
@@ -175,6 +175,8 @@ class RunConfig:
             sections.append(f"{cls.__name__}-free")
         if changes.get("observation") == "lidar":
             sections.append(f"{cls.__name__}-lidar")
+        if warm and changes.get("actuation") == "motor":
+            sections.append(f"{cls.__name__}-warm-motor")
         for section in sections:
             table = _DEFAULTS.get(section, {})
             names = {setting.name for setting in fields(config)}
