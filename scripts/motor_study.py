@@ -57,7 +57,7 @@ def main() -> None:
             gained, lost = (sum(pair == wanted for pair in pairs) for wanted in ((False, True), (True, False)))
             p = binomtest(gained, max(1, gained + lost)).pvalue  # McNemar's exact test
             gain = float(np.mean([b - a for a, b in pairs]))
-            print(f"{run}: {score(FAMILY, after)}\n  gain {100 * gain:.1f} %, p = {p:.1e}", flush=True)
+            print(f"{run}: {score(FAMILY, after)}\n  gain {100 * gain:.1f} %, p <= {max(p, 1e-300):.0e}", flush=True)
 
 
 if __name__ == "__main__":
