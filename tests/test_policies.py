@@ -103,7 +103,7 @@ def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
         load_policy(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     faults = [
-        ({**description, "format": 99}, "format: expected 3, got 99"),
+        ({**description, "format": 99}, "format: expected 4, got 99"),
         ({}, "not the description of a policy"),
         ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
         ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, td3, tqc, got 'dqn'"),

@@ -25,6 +25,7 @@ PolicyName = (
         "slalom",
         "car-clutter",
         "dynamic_unicycle-clutter",
+        "all",
         "free-clutter",
     ]
     | str

@@ -74,10 +74,10 @@ class Dataset:
                 raise ValueError(f"dataset: {name}: expected the shape {(count, *shape)}, got {found}")
         if not np.isfinite(self.observations).all():
             raise ValueError("dataset: observations: expected finite numbers")
+        if not self.labelled.any():
+            raise ValueError("dataset: actions: expected finite numbers")
         if not (np.isfinite(self.actions).all(axis=1) | np.isnan(self.actions).all(axis=1)).all():
             raise ValueError("dataset: actions: expected finite numbers, or only NaN in a sample without a label")
-        if not self.labelled.any():
-            raise ValueError("dataset: actions: expected finite numbers, got only NaN")
 
     def __len__(self) -> int:
         return len(self.observations)
