@@ -169,7 +169,7 @@ class DAgger:
         loss = self._fit(number, progress)
         done = Round(
             number=number + 1,
-            samples=0 if samples is None else len(samples),
+            samples=0 if samples is None else int(samples.labelled.sum()),
             episodes=len(episodes),
             success=sum(episode.success for episode in episodes) / len(episodes),
             collision=sum(episode.collision for episode in episodes) / len(episodes),

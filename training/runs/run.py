@@ -98,7 +98,9 @@ class Run:
             stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
-        stored.setdefault("horizon", "fixed")  # in runs of versions without a free horizon
+        for name, value in (("horizon", "fixed"), ("memory", "none")):  # settings that earlier versions did not have
+            if name in self._settings:
+                stored.setdefault(name, value)
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
