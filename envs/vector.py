@@ -292,6 +292,11 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._source.bank
 
     @property
+    def sampler(self) -> LevelSampler | None:
+        """The sampler of the levels, or None."""
+        return self._sampler
+
+    @property
     def scenarios(self) -> tuple[Scenario, ...]:
         """The current scenario of each robot."""
         return tuple(get_scenario(choice, self.bank) for choice in self._choices if choice is not None)

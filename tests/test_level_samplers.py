@@ -85,14 +85,28 @@ def test_learnability_is_highest_at_half_the_success(bank):
 def test_value_scores_are_means_over_the_steps_of_a_level(bank):
     levels = np.array([[3, 5], [3, 5], [3, 8]])
     values, advantages = np.full((3, 2), -2.0), np.array([[1.0, -1.0], [-3.0, -1.0], [2.0, 4.0]])
+    rewards, starts = np.array([[-1.0, -2.0], [-1.0, -2.0], [-3.0, -7.0]]), np.zeros((3, 2), bool)
+    starts[0], starts[2, 1] = True, True
     sampler = PrioritizedSampler(bank, "positive_value_loss")
-    sampler.score_rollout(levels, values, advantages)
+    sampler.score_rollout(levels, values, advantages, rewards, starts)
     assert sampler.scores[[3, 5, 8]] == pytest.approx([1.0, 0.0, 4.0])
+
+
+def test_max_mc_compares_the_highest_return_with_the_expected_one(bank):
+    """Two robots and rollouts of two steps; the episodes of the first robot have the returns -6 and -4."""
     sampler = PrioritizedSampler(bank, "max_mc")
-    for value in (-30.0, -10.0, -20.0):
-        sampler.record(LevelOutcome(3, True, False, value, 1.0))
-    sampler.score_rollout(levels, values, advantages, scale=0.1)
-    assert sampler.scores[3] == pytest.approx(0.1 * -10.0 + 2.0) and np.isnan(sampler.scores[[5, 8]]).all()
+
+    def score_rollout(levels, values, rewards, starts):
+        advantages = np.zeros((2, 2))
+        sampler.score_rollout(np.array(levels), np.array(values), advantages, np.array(rewards), np.array(starts))
+
+    score_rollout([[3, 5], [3, 5]], [[-7.0, -1.0], [-5.0, -1.0]], [[-1.0, -1.0], [-2.0, -1.0]], [[1, 1], [0, 0]])
+    assert np.isnan(sampler.scores).all()  # no episode has ended
+    score_rollout([[3, 5], [3, 5]], [[-3.0, -1.0], [-5.0, -1.0]], [[-3.0, -1.0], [-4.0, -1.0]], [[0, 0], [1, 0]])
+    # The highest return is -6; the returns expected before the two steps are -3 - 3 and 0 - 5.
+    assert sampler.scores[3] == pytest.approx(((-6 + 6) + (-6 + 5)) / 2) and np.isnan(sampler.scores[5])
+    score_rollout([[8, 5], [8, 5]], [[0.0, -1.0], [0.0, -1.0]], [[-1.0, -1.0], [-1.0, -1.0]], [[1, 0], [0, 0]])
+    assert sampler._best_returns[3] == -4.0 and np.isnan(sampler.scores[[5, 8]]).all()
 
 
 @pytest.mark.parametrize("name", ["uniform", "plr", "learnability", "exact_regret"])

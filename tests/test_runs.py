@@ -6,12 +6,16 @@ import sys
 import time
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.unwrapping import unwrap
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training import config as configuration
 from leapnav.training import load_policy, make_policy, shipped_policies
@@ -21,6 +25,7 @@ from leapnav.training.config import (
     CloningConfig,
     DAggerConfig,
     DAggerRunConfig,
+    LevelsName,
     PPOConfig,
     SACConfig,
     WarmStartConfig,
@@ -28,10 +33,11 @@ from leapnav.training.config import (
 )
 from leapnav.training.policies.actors import actor_parameters, copy_actor
 from leapnav.training.policies.files import read_description
+from leapnav.training.robots.level_samplers import SCORES, UniformSampler
 from leapnav.training.robots.rewards import GradedMiss
 from leapnav.training.robots.vec_env import environment_seed
 from leapnav.training.runs.imitation import train_bc, train_dagger
-from leapnav.training.runs.reinforcement import _resolve_warm_start, _training_env, train_ppo, train_sac
+from leapnav.training.runs.reinforcement import _resolve_warm_start, make_training_env, train_ppo, train_sac
 from leapnav.training.scoring.html_report import write_report
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
@@ -127,7 +133,7 @@ def test_a_policy_that_ships_starts_a_run_with_the_defaults(name, tmp_path):
     config = PPOConfig.tuned(family, **task, out=tmp_path, warm_start=(Path(name),))
     demos, start = _resolve_warm_start(config)
     assert demos == []
-    assert start.observation_space == _training_env(config).observation_space
+    assert start.observation_space == make_training_env(config).observation_space
 
 
 def test_a_policy_of_the_ideal_robot_starts_one_with_motors(tmp_path):
@@ -135,7 +141,7 @@ def test_a_policy_of_the_ideal_robot_starts_one_with_motors(tmp_path):
     config = ppo(tmp_path / "run", total_timesteps=256, actuation="motor", disturbance=0.05, warm_start=(Path("open"),))
     config = replace(config, hidden=(128, 128), lidar_beams=32)
     _, start = _resolve_warm_start(config)
-    venv = _training_env(config)
+    venv = make_training_env(config)
     policy = make_policy(venv.observation_space, venv.action_space, 0, (128, 128))
     copy_actor(start, policy)
     observations = venv.reset()
@@ -157,7 +163,7 @@ def test_misses_are_graded_but_not_for_ppo_from_a_warm_start(tmp_path):
         (SACConfig.tuned("open", warm=True), True),
         (replace(PPOConfig.tuned("open", out=tmp_path), graded_miss=False), False),
     ):
-        venv, found = _training_env(config), False
+        venv, found = make_training_env(config), False
         while isinstance(venv, VecEnvWrapper):
             venv, found = venv.venv, found or isinstance(venv, GradedMiss)
         assert found == graded
@@ -193,6 +199,8 @@ def run(name, out, demos, resume):
         train_bc(bc(out, demos, resume=resume), progress=False)
     elif name == "ppo":
         train_ppo(warm(out, demos, resume=resume), progress=False)
+    elif name == "ppo, levels":
+        train_ppo(ppo(out, levels="max_mc", resume=resume), progress=False)
     else:  # "sac" is killed while the actions are random, "sac, learning" during learning
         start = WarmStartConfig(critic_epochs=1, slopes=100)
         changes = {
@@ -220,7 +228,9 @@ def warm(out, demos, **changes):
     return ppo(out, start=start, **{**extra, **changes})
 
 
-@pytest.mark.parametrize("name", ["bc", "ppo", pytest.param("sac", marks=pytest.mark.slow), "sac, learning"])
+@pytest.mark.parametrize(
+    "name", ["bc", "ppo", "ppo, levels", pytest.param("sac", marks=pytest.mark.slow), "sac, learning"]
+)
 def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
     """SIGKILL after the first checkpoint; PPO with all parts of a warm start, SAC with demonstrations."""
     straight, killed = tmp_path / "straight", tmp_path / "killed"
@@ -306,6 +316,10 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         ({"cloning": CloningConfig(seed=3)}, r"cloning.seed: expected 0, got 3; set the seed of the run"),
         ({"start": WarmStartConfig(slopes=0)}, r"start.slopes: expected a positive number, got 0"),
         ({"ent_coef": -1.0}, r"ent_coef: expected a number >= 0"),
+        ({"levels": "plr"}, r"levels: expected one of fresh, .*, got 'plr'"),
+        ({"level_bank": "my.bank"}, r"level_bank: expected none with levels='fresh', got 'my.bank'"),
+        ({"levels": "uniform", "family": "all"}, r"level_bank: expected a bank for levels='uniform' of all families"),
+        ({"levels": "max_mc", "jump_start": 0.5}, r"jump_start: expected 0 with levels='max_mc', got 0.5"),
     ],
 )
 def test_invalid_settings_are_reported_before_the_run_directory_is_created(changes, message, tmp_path):
@@ -329,11 +343,33 @@ def test_ppo_may_let_the_critic_learn_first_and_end_with_little_noise(demos, tmp
 
 
 def test_ppos_robots_have_the_settings_of_the_run(tmp_path):
-    robots = _training_env(ppo(tmp_path, control_period=0.1, penalty=7.0, lidar_beams=8))
+    robots = make_training_env(ppo(tmp_path, control_period=0.1, penalty=7.0, lidar_beams=8))
     settings = robots.get_attr("settings")[0]
     assert (settings.control_period, settings.lidar_beams) == (0.1, 8)
     assert settings.collision_penalty == settings.miss_penalty == 7.0
-    assert _training_env(sac(tmp_path)).get_attr("settings")[0].control_period == 0.05
+    assert make_training_env(sac(tmp_path)).get_attr("settings")[0].control_period == 0.05
+
+
+def test_a_run_learns_from_the_levels_that_a_sampler_chooses(tmp_path):
+    levels, names = LevelsOfEpisodes(), get_args(LevelsName)
+    assert names == ("fresh", "uniform", *SCORES)
+    train_ppo(ppo(tmp_path / "run", levels="positive_value_loss"), callbacks=[levels], progress=False)
+    bank = ScenarioBank.shipped("open", "train")
+    assert levels.sampler.score == "positive_value_loss" and len(levels.sampler.scores) == len(bank)
+    assert (~np.isnan(levels.sampler.scores)).sum() >= 4 and levels.indices <= set(range(len(bank)))
+    robots = unwrap(make_training_env(ppo(tmp_path, levels="uniform", level_bank=bank.path)))[0]
+    assert robots.bank.path == bank.path and type(robots.sampler) is UniformSampler
+
+
+class LevelsOfEpisodes(BaseCallback):
+    """Collects the levels that are played."""
+
+    def _on_training_start(self):
+        self.indices, self.sampler = set(), unwrap(self.training_env)[0].sampler
+
+    def _on_step(self):
+        self.indices |= set(unwrap(self.training_env)[0].indices)
+        return True
 
 
 def test_demonstrations_have_one_reward_only(demos, tmp_path):

@@ -26,6 +26,7 @@ FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObservationName = Literal["lidar", "geodesic"]
+LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
 MemoryName = Literal["none", "stack", "lstm"]
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
@@ -274,6 +275,11 @@ class PPOConfig(_LearnerConfig):
 
     total_timesteps: int = 5_000_000
     """Environment steps of all robots together."""
+    levels: LevelsName = "fresh"
+    """Scenarios of the episodes: "fresh": new ones; "uniform": those of a bank, with equal probability; otherwise the
+    score by which prioritized level replay chooses them from a bank."""
+    level_bank: Path | None = None
+    """Bank of the levels; by default the included training split of the family."""
     n_envs: int = 64
     """Number of parallel robots."""
     learning_rate: float = 1e-3

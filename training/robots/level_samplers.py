@@ -77,7 +77,8 @@ class PrioritizedSampler(UniformSampler):
         score: "exact_regret": regret of the last episode; "learnability": p (1 - p) with the success rate p;
             "positive_value_loss" or "max_mc": from the critic's values, set by `score_rollout`.
         replay: probability of a level with a score; otherwise one that has none yet is drawn, as long as there are any.
-        temperature: the smaller, the more the highest scores are preferred.
+        temperature: the smaller, the more the highest scores are preferred. With 0.3, as in the literature for levels
+            from a generator, a few levels of a bank are played most of the time, and PPO learns more slowly.
         staleness: see above.
 
     Attributes:
@@ -94,8 +95,8 @@ class PrioritizedSampler(UniformSampler):
         score: ScoreName = "positive_value_loss",
         *,
         replay: float = 0.5,
-        temperature: float = 0.3,
-        staleness: float = 0.1,
+        temperature: float = 1.0,
+        staleness: float = 0.3,
     ) -> None:
         super().__init__(bank)
         check_choice("score", score, SCORES)
@@ -104,7 +105,9 @@ class PrioritizedSampler(UniformSampler):
         check_positive("temperature", temperature)
         self.score, self._replay, self._temperature, self._staleness = score, replay, temperature, staleness
         self.scores = np.full(len(self.plays), np.nan)
-        self.best_returns = np.full(len(self.plays), -np.inf)
+        self._best_returns = np.full(len(self.plays), -np.inf)  # as the critic sees them, for "max_mc"
+        # Level and return so far of each robot's episode, between two rollouts, for "max_mc".
+        self._episodes: tuple[np.ndarray, np.ndarray] | None = None
         self._drawn = np.zeros(len(self.plays), dtype=np.int64)  # the draw at which a level was drawn last
         self._draws, self._age = 0, MAX_AGE
         self._levels, self._cumulative = np.empty(0, dtype=np.int64), np.empty(0)
@@ -149,37 +152,52 @@ class PrioritizedSampler(UniformSampler):
         """Store the outcome of an episode, and the score that follows from it; the environment calls it."""
         super().record(outcome)
         i = outcome.index
-        self.best_returns[i] = max(self.best_returns[i], outcome.episode_return)
         if self.score == "exact_regret":
             self.scores[i] = self.regrets[i]
         elif self.score == "learnability":
             self.scores[i] = self.success[i] * (1 - self.success[i])
 
-    def score_rollout(self, levels: np.ndarray, values: np.ndarray, advantages: np.ndarray, scale: float = 1.0) -> None:
+    def score_rollout(
+        self, levels: np.ndarray, values: np.ndarray, advantages: np.ndarray, rewards: np.ndarray, starts: np.ndarray
+    ) -> None:
         """Set the scores of the levels in a rollout of T steps of N robots from the values of a critic.
 
         Call it after each rollout with "positive_value_loss", the mean of the positive generalised advantages of the
-        steps of a level, or "max_mc", the mean difference of the highest return of the level so far and the values. It
-        does nothing with the other scores.
+        steps of a level, or "max_mc", the mean of G - (R + V): highest return G of the level so far, reward R of the
+        episode until the step, value V. (In the literature R = 0, since rewards come at the end of an episode.) It does
+        nothing with the other scores.
 
         Args:
             levels (T, N): index of the level of each step.
-            values (T, N): values of the critic.
+            values (T, N): values of the critic before each step.
             advantages (T, N): generalised advantage estimates.
-            scale: factor of the rewards that the critic has learned from.
+            rewards (T, N): the rewards that the critic learns from.
+            starts (T, N): whether an episode starts with the step.
 
         """
         if self.score not in VALUE_SCORES:
             return
-        levels, values, advantages = (np.asarray(column).ravel() for column in (levels, values, advantages))
-        played, inverse = np.unique(levels, return_inverse=True)
+        levels = np.asarray(levels)
         if self.score == "positive_value_loss":
             terms = np.maximum(advantages, 0.0)
         else:
-            terms = scale * self.best_returns[levels] - values  # -inf in a level that has not been finished
-        means = np.bincount(inverse, weights=terms) / np.bincount(inverse)
+            earned = self._sum_rewards(levels, np.asarray(rewards), np.asarray(starts, dtype=bool))
+            terms = self._best_returns[levels] - (earned + values)  # -inf in a level that has not been finished
+        played, inverse = np.unique(levels.ravel(), return_inverse=True)
+        means = np.bincount(inverse, weights=terms.ravel()) / np.bincount(inverse)
         finite = np.isfinite(means)
         self.scores[played[finite]] = means[finite]
+
+    def _sum_rewards(self, levels: np.ndarray, rewards: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Return the reward (T, N) of the episode before each step, and update the highest returns."""
+        before = np.empty(rewards.shape)
+        playing, total = self._episodes or (levels[0], np.full(levels.shape[1], -np.inf))
+        for t in range(len(levels)):
+            np.maximum.at(self._best_returns, playing[starts[t]], total[starts[t]])
+            before[t] = total = np.where(starts[t], 0.0, total)
+            playing, total = levels[t], total + rewards[t]
+        self._episodes = playing, total
+        return before
 
 
 class LearnabilitySampler(PrioritizedSampler):

@@ -20,13 +20,12 @@ class LevelScoring(BaseCallback):
 
     Args:
         sampler: the sampler of the training environment.
-        reward_scale: factor of the rewards that the algorithm receives, if a wrapper scales them.
 
     """
 
-    def __init__(self, sampler: PrioritizedSampler, reward_scale: float = 1.0) -> None:
+    def __init__(self, sampler: PrioritizedSampler) -> None:
         super().__init__()
-        self._sampler, self._scale = sampler, reward_scale
+        self._sampler = sampler
         self._levels: list[np.ndarray] = []
 
     def _on_training_start(self) -> None:
@@ -45,7 +44,9 @@ class LevelScoring(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         buffer = cast(OnPolicyAlgorithm, self.model).rollout_buffer
-        self._sampler.score_rollout(np.array(self._levels), buffer.values, buffer.advantages, self._scale)
+        self._sampler.score_rollout(
+            np.array(self._levels), buffer.values, buffer.advantages, buffer.rewards, buffer.episode_starts
+        )
 
     def _playing(self) -> np.ndarray:
         """Return the index of the level (N,) that each robot plays."""

@@ -6,12 +6,25 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
-from leapnav.envs.scenarios.families import check_family
+from leapnav.envs.scenarios.families import ALL, check_family
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.utils.validation import check_fraction, check_integer, check_not_negative, check_positive
-from leapnav.training.config import CloningConfig, DAggerConfig, PPOConfig, RunConfig, WarmStartConfig
+from leapnav.envs.utils.validation import (
+    check_choice,
+    check_fraction,
+    check_integer,
+    check_not_negative,
+    check_positive,
+)
+from leapnav.training.config import (
+    CloningConfig,
+    DAggerConfig,
+    LevelsName,
+    PPOConfig,
+    RunConfig,
+    WarmStartConfig,
+)
 from leapnav.training.learning.cloning import check_cloning
 from leapnav.training.learning.dagger import check_dagger
 from leapnav.training.learning.warm_start import check_warm_start
@@ -35,12 +48,27 @@ def check_config(config: RunConfig) -> None:
         raise ValueError(
             f"ent_coef: expected 0, because last_std > 0 fixes the noise and its entropy, got {config.ent_coef!r}"
         )
+    if isinstance(config, PPOConfig):
+        _check_levels(config)
     for field in fields(config):
         value = getattr(config, field.name)
         if is_dataclass(value):
             _check_nested(field.name, value)
         elif field.name in _CHECKS:
             _CHECKS[field.name](field.name, value)
+
+
+def _check_levels(config: PPOConfig) -> None:
+    """Check that the choice of the levels is possible with the other settings."""
+    check_choice("levels", config.levels, get_args(LevelsName))
+    if config.levels == "fresh":
+        if config.level_bank is not None:
+            raise ValueError(f"level_bank: expected none with levels='fresh', got {str(config.level_bank)!r}")
+        return
+    if config.level_bank is None and config.family == ALL:
+        raise ValueError(f"level_bank: expected a bank for levels={config.levels!r} of all families, got none")
+    if config.jump_start > 0:
+        raise ValueError(f"jump_start: expected 0 with levels={config.levels!r}, got {config.jump_start!r}")
 
 
 def _check_entropy_coefficient(name: str, value: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -20,8 +20,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_choice
+from leapnav.envs.vector import NavigateVectorEnv
 from leapnav.training.config import PPOConfig, SACConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
@@ -32,6 +34,8 @@ from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
 from leapnav.training.policies.momentum import MomentumSACPolicy
 from leapnav.training.policies.network import network
 from leapnav.training.robots.jump_start import JumpStart
+from leapnav.training.robots.level_samplers import VALUE_SCORES, PrioritizedSampler, UniformSampler
+from leapnav.training.robots.level_scoring import LevelScoring
 from leapnav.training.robots.rewards import GradedMiss, ScaledReward
 from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
@@ -44,13 +48,14 @@ Config = PPOConfig | SACConfig
 
 
 @limit_threads
-def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
+def train_ppo(config: PPOConfig, *, callbacks: Sequence[BaseCallback] = (), progress: bool = True) -> list[Evaluation]:
     """Train a policy by proximal policy optimisation.
 
     With `config.resume` the run resumes after any interruption, with bitwise identical results.
 
     Args:
         config: settings.
+        callbacks: further callbacks of Stable-Baselines3; a resumed run does not restore their state.
         progress: show progress bars.
 
     Returns:
@@ -58,7 +63,7 @@ def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
 
     Raises:
         TypeError: the configuration is not a `PPOConfig`.
-        FileNotFoundError, FileExistsError, ValueError: see `Run`, `Dataset.of` and `load_policy`.
+        BankError, FileNotFoundError, FileExistsError, ValueError: see `Run`, `Dataset.of` and `load_policy`.
 
     """
     if not isinstance(cast(object, config), PPOConfig):
@@ -87,11 +92,11 @@ def train_ppo(config: PPOConfig, *, progress: bool = True) -> list[Evaluation]:
             device="cpu",
         )
 
-    return _train("ppo", config, make, progress)
+    return _train("ppo", config, make, callbacks, progress)
 
 
 @limit_threads
-def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
+def train_sac(config: SACConfig, *, callbacks: Sequence[BaseCallback] = (), progress: bool = True) -> list[Evaluation]:
     """Train a policy by soft actor-critic or truncated quantile critics.
 
     Arguments, returns and further errors are those of `train_ppo`.
@@ -132,11 +137,15 @@ def train_sac(config: SACConfig, *, progress: bool = True) -> list[Evaluation]:
             **_buffer_arguments(config, dataset),
         )
 
-    return _train(config.algorithm, config, make, progress)
+    return _train(config.algorithm, config, make, callbacks, progress)
 
 
 def _train(
-    algorithm: str, config: Config, make: Callable[[VecEnv, Dataset | None], BaseAlgorithm], progress: bool
+    algorithm: str,
+    config: Config,
+    make: Callable[[VecEnv, Dataset | None], BaseAlgorithm],
+    callbacks: Sequence[BaseCallback],
+    progress: bool,
 ) -> list[Evaluation]:
     """Train the model that `make` returns for the training environment and the demonstrations."""
     # Invalid arguments are reported before the run directory is created.
@@ -150,7 +159,7 @@ def _train(
             f"got {config.divergence!r}"
         )
     dataset = Dataset.of(demos).observed(observed_settings(config)) if demos else None
-    venv = _training_env(config)
+    venv = make_training_env(config)
     model = make(venv, dataset)
     # Stable-Baselines3 has seeded the environment with the seed of the run itself, see `environment_seed`.
     venv.seed(environment_seed(config.seed))
@@ -170,7 +179,8 @@ def _train(
         run.restore_generators()
     remaining = config.total_timesteps - model.num_timesteps
     if remaining > 0:
-        model.learn(remaining, callback=callback, reset_num_timesteps=checkpoint is None)
+        chosen = [callback, *_level_scoring(venv), *callbacks]
+        model.learn(remaining, callback=chosen, reset_num_timesteps=checkpoint is None)
         callback.save_checkpoint()
     callback.bar.close()
     if isinstance(config, PPOConfig) and config.last_std > 0:
@@ -202,7 +212,7 @@ def _load_start(path: Path, config: Config) -> BasePolicy:
     return load_policy(path, NavigateEnv(config.family, split="fresh", **arguments))
 
 
-def _training_env(config: Config) -> VecEnv:
+def make_training_env(config: Config) -> VecEnv:
     """Return the training environment, which samples a new scenario for each episode."""
     task: dict[str, Any] = {}
     if isinstance(config, PPOConfig):
@@ -210,8 +220,7 @@ def _training_env(config: Config) -> VecEnv:
         task = {"control_period": config.control_period, "collision_penalty": penalty, "miss_penalty": penalty}
     robots = make_vec_env(
         n_envs=config.n_envs,
-        family=config.family,
-        split="fresh",
+        **_scenarios(config),
         reward=config.reward,
         discount=config.gamma,
         **config.environment,
@@ -225,6 +234,27 @@ def _training_env(config: Config) -> VecEnv:
     if config.graded_miss:
         venv = GradedMiss(venv)
     return ScaledReward(venv, config.reward_scale)
+
+
+def _scenarios(config: Config) -> dict[str, Any]:
+    """Return the arguments of the training environment that choose the scenarios."""
+    if not isinstance(config, PPOConfig) or config.levels == "fresh":
+        return {"family": config.family, "split": "fresh"}
+    if config.level_bank is not None:
+        bank = ScenarioBank(config.level_bank)
+    else:
+        bank = ScenarioBank.shipped(config.family, "train", config.robot, config.horizon)
+    uniform = config.levels == "uniform"
+    return {"bank": bank, "sampler": UniformSampler(bank) if uniform else PrioritizedSampler(bank, config.levels)}
+
+
+def _level_scoring(venv: VecEnv) -> list[LevelScoring]:
+    """Return the callback that scores the levels of the training environment, if its sampler needs one."""
+    robots = unwrap(venv)[0]
+    assert isinstance(robots, NavigateVectorEnv)
+    sampler = robots.sampler
+    needs_values = isinstance(sampler, PrioritizedSampler) and sampler.score in VALUE_SCORES
+    return [LevelScoring(sampler)] if needs_values else []
 
 
 def _warm_start(

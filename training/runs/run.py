@@ -32,6 +32,8 @@ from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, eva
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
+# Settings that earlier versions did not have, with the values that correspond to them.
+NEW_SETTINGS = {"horizon": "fixed", "memory": "none", "levels": "fresh", "level_bank": None}
 MEASURES = ("success", "collision", "soc", "regret")  # of an evaluation, for each family
 
 
@@ -98,7 +100,7 @@ class Run:
             stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
-        for name, value in (("horizon", "fixed"), ("memory", "none")):  # settings that earlier versions did not have
+        for name, value in NEW_SETTINGS.items():
             if name in self._settings:
                 stored.setdefault(name, value)
         missing = sorted(set(self._settings) - set(stored))
