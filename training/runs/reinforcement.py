@@ -48,7 +48,13 @@ Config = PPOConfig | SACConfig
 
 
 @limit_threads
-def train_ppo(config: PPOConfig, *, callbacks: Sequence[BaseCallback] = (), progress: bool = True) -> list[Evaluation]:
+def train_ppo(
+    config: PPOConfig,
+    *,
+    callbacks: Sequence[BaseCallback] = (),
+    wrapper: Callable[[VecEnv], VecEnv] | None = None,
+    progress: bool = True,
+) -> list[Evaluation]:
     """Train a policy by proximal policy optimisation.
 
     With `config.resume` the run resumes after any interruption, with bitwise identical results.
@@ -56,6 +62,8 @@ def train_ppo(config: PPOConfig, *, callbacks: Sequence[BaseCallback] = (), prog
     Args:
         config: settings.
         callbacks: further callbacks of Stable-Baselines3; a resumed run does not restore their state.
+        wrapper: function that wraps the training environment. A resumed run restores the state of the wrapper if it
+            has the methods `state_dict` and `load_state_dict`.
         progress: show progress bars.
 
     Returns:
@@ -92,11 +100,17 @@ def train_ppo(config: PPOConfig, *, callbacks: Sequence[BaseCallback] = (), prog
             device="cpu",
         )
 
-    return _train("ppo", config, make, callbacks, progress)
+    return _train("ppo", config, make, callbacks, wrapper, progress)
 
 
 @limit_threads
-def train_sac(config: SACConfig, *, callbacks: Sequence[BaseCallback] = (), progress: bool = True) -> list[Evaluation]:
+def train_sac(
+    config: SACConfig,
+    *,
+    callbacks: Sequence[BaseCallback] = (),
+    wrapper: Callable[[VecEnv], VecEnv] | None = None,
+    progress: bool = True,
+) -> list[Evaluation]:
     """Train a policy by soft actor-critic or truncated quantile critics.
 
     Arguments, returns and further errors are those of `train_ppo`.
@@ -137,7 +151,7 @@ def train_sac(config: SACConfig, *, callbacks: Sequence[BaseCallback] = (), prog
             **_buffer_arguments(config, dataset),
         )
 
-    return _train(config.algorithm, config, make, callbacks, progress)
+    return _train(config.algorithm, config, make, callbacks, wrapper, progress)
 
 
 def _train(
@@ -145,6 +159,7 @@ def _train(
     config: Config,
     make: Callable[[VecEnv, Dataset | None], BaseAlgorithm],
     callbacks: Sequence[BaseCallback],
+    wrapper: Callable[[VecEnv], VecEnv] | None,
     progress: bool,
 ) -> list[Evaluation]:
     """Train the model that `make` returns for the training environment and the demonstrations."""
@@ -160,6 +175,8 @@ def _train(
         )
     dataset = Dataset.of(demos).observed(observed_settings(config)) if demos else None
     venv = make_training_env(config)
+    if wrapper is not None:
+        venv = wrapper(venv)
     model = make(venv, dataset)
     # Stable-Baselines3 has seeded the environment with the seed of the run itself, see `environment_seed`.
     venv.seed(environment_seed(config.seed))
