@@ -18,9 +18,8 @@ from leapnav.experts import rollout
 from leapnav.training import BCConfig, PPOConfig, SACConfig, train_bc, train_ppo, train_sac
 from leapnav.training.scoring.comparison import compare_policies
 from leapnav.training.scoring.policy_specs import load_policy_spec
-from leapnav.training.scoring.reports import COLUMNS, cell
+from leapnav.training.scoring.reports import markdown_cells
 
-SHOWN_COLUMNS = ("success", "collision", "soc", "regret")
 METHODS = ("bc", "scratch", "warm", "sac", "sacwarm")
 DEMONSTRATIONS = {"open": 2000, "clutter": 10_000, "polygons": 4000, "rooms": 4000, "slalom": 4000}
 DEMONSTRATION_SEED = 60_000
@@ -106,12 +105,7 @@ def main() -> None:
         policies = [load_policy_spec(name) for name in specs(family, arguments.runs)]
         comparison = compare_policies(policies, [ScenarioBank.shipped(family, "test")])
         for row in comparison.scores():
-            cells = [
-                cell(getattr(row, name), *form).replace("\n", " ")
-                for _, name, *form in COLUMNS
-                if name in SHOWN_COLUMNS
-            ]
-            print(f"| {family} | {row.policy} | {row.runs} | {' | '.join(cells)} |", flush=True)
+            print(f"| {family} | {row.policy} | {row.runs} | {markdown_cells(row)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from leapnav.experts.data.banks import build_bank
 from leapnav.training import CloningConfig, Dataset, NavigationFeatures, evaluate, make_policy, score
 from leapnav.training.learning.cloning import Cloning
 from leapnav.training.learning.samples import Batch
+from leapnav.training.scoring.reports import markdown_cells
 from leapnav.training.threads import limit_threads
 
 FAMILY, DEMONSTRATIONS, DEMONSTRATION_SEED = "rooms", 6000, 60_000
@@ -145,7 +146,7 @@ def main() -> None:
         fit.finish()
         evaluation = evaluate(policy, bank, environment=SENSORS[name], timed=False)
         lowest = np.nanmin([loss.validation for loss in fit.losses])
-        print(f"{name}: validation loss {lowest:.4f}, {score(name, evaluation)}", flush=True)
+        print(f"| {name} | {lowest:.3f} | {markdown_cells(score(name, evaluation))} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ from leapnav.training import (
 )
 from leapnav.training.learning.driving import drive_episodes
 from leapnav.training.policies.actors import copy_actor
+from leapnav.training.scoring.reports import markdown_cells
 
 SEEDS, SCENARIOS, BANK_SEED = 3, 4000, 781
 N_DRIVEN, HARD_SEED = 20_000, 783  # episodes of the start, from whose failures the hard starts are taken
@@ -195,7 +196,7 @@ def print_scores(name: str, case: Case, folder: Path) -> None:
         environment = {**policy_environment(start), **actuation, "disturbance": disturbance}
         options: dict[str, Any] = {"environment": environment, "timed": False, "progress": False}
         before = evaluate(adapt(start, environment, case.family), bank, **options)
-        print(f"{name}, disturbance {disturbance}, the start: {score(name, before)}", flush=True)
+        print(f"disturbance {disturbance}\n| {start} | {markdown_cells(score(name, before))} |", flush=True)
         for run in sorted(folder.glob(f"{name}-[0-9]*")):
             if not (run / "finished").exists():
                 continue
@@ -203,7 +204,7 @@ def print_scores(name: str, case: Case, folder: Path) -> None:
             pairs = [(a.success, b.success) for a, b in zip(before, after, strict=True)]
             gained, lost = (sum(pair == wanted for pair in pairs) for wanted in ((False, True), (True, False)))
             p = binomtest(gained, max(1, gained + lost)).pvalue  # McNemar's exact test
-            print(f"{run}: {score(name, after)}")
+            print(f"| {run} | {markdown_cells(score(name, after))} |")
             print(f"  gain {100 * (gained - lost) / len(pairs):.2f} % ({gained} gained, {lost} lost), p = {p:.0e}")
 
 

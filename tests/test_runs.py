@@ -361,6 +361,38 @@ def test_a_run_learns_from_the_levels_that_a_sampler_chooses(tmp_path):
     assert robots.bank.path == bank.path and type(robots.sampler) is UniformSampler
 
 
+class CountingSteps(VecEnvWrapper):
+    """Counts the steps of the robots."""
+
+    steps = 0
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        self.steps += self.num_envs
+        return self.venv.step_wait()
+
+    def state_dict(self):
+        return {"steps": self.steps}
+
+    def load_state_dict(self, state):
+        self.steps = state["steps"]
+
+
+def test_a_wrapper_of_the_training_environment_is_part_of_the_run(tmp_path):
+    made = []
+
+    def wrapper(venv):
+        made.append(CountingSteps(venv))
+        return made[-1]
+
+    config = ppo(tmp_path / "run")
+    train_ppo(config, wrapper=wrapper, progress=False)
+    train_ppo(replace(config, resume=True), wrapper=wrapper, progress=False)  # the run is finished
+    assert [counter.steps for counter in made] == [config.total_timesteps] * 2
+
+
 class LevelsOfEpisodes(BaseCallback):
     """Collects the levels that are played."""
 

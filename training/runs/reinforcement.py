@@ -261,8 +261,8 @@ def _scenarios(config: Config) -> dict[str, Any]:
         bank = ScenarioBank(config.level_bank)
     else:
         bank = ScenarioBank.shipped(config.family, "train", config.robot, config.horizon)
-    uniform = config.levels == "uniform"
-    return {"bank": bank, "sampler": UniformSampler(bank) if uniform else PrioritizedSampler(bank, config.levels)}
+    sampler = UniformSampler(bank) if config.levels == "uniform" else PrioritizedSampler(bank, config.levels)
+    return {"bank": bank, "sampler": sampler}
 
 
 def _level_scoring(venv: VecEnv) -> list[LevelScoring]:
@@ -270,8 +270,9 @@ def _level_scoring(venv: VecEnv) -> list[LevelScoring]:
     robots = unwrap(venv)[0]
     assert isinstance(robots, NavigateVectorEnv)
     sampler = robots.sampler
-    needs_values = isinstance(sampler, PrioritizedSampler) and sampler.score in VALUE_SCORES
-    return [LevelScoring(sampler)] if needs_values else []
+    if isinstance(sampler, PrioritizedSampler) and sampler.score in VALUE_SCORES:
+        return [LevelScoring(sampler)]
+    return []
 
 
 def _warm_start(

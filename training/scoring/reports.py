@@ -40,6 +40,7 @@ NEGATIVE_REGRET = (
     "A negative regret: the episodes cost less than the best known optimum for the pose reached. A robot that slips "
     "violates the unicycle model, for which the optimum is computed; otherwise the search has missed a better path."
 )
+MARKDOWN_COLUMNS = ("success", "collision", "soc", "regret")  # attributes of `Score` in the tables of the documentation
 N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal; the other outputs have all
 
 
@@ -103,6 +104,12 @@ def cell(interval: Interval, factor: float, digits: int, interval_digits: int) -
         return "-"
     low, high = (f"{factor * bound:z.{interval_digits}f}" for bound in (interval.low, interval.high))
     return f"{factor * interval.value:z.{digits}f}\n[{low}, {high}]"
+
+
+def markdown_cells(row: Score) -> str:
+    """Return success, collision, SOC and median regret, with intervals, as cells of a Markdown table."""
+    cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS if name in MARKDOWN_COLUMNS]
+    return " | ".join(cells).replace("\n", " ")
 
 
 def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
