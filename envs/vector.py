@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import fields
 from enum import Enum
@@ -87,6 +88,8 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if sampler is not None and self._source.bank is None:
             raise ValueError("sampler: expected an environment with a bank, got one of fresh or fixed scenarios")
         self._sampler = sampler
+        if sampler is not None:
+            _check_sampler(sampler, self._source.bank)
         self.settings = EnvironmentSettings(
             robot=self._source.robot.model,
             horizon=self._source.horizon,
@@ -191,7 +194,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             generator = self._generators[i]
             assert generator is not None  # seeded at the first reset
             choice = None if selected is None else selected[k]
-            choices.append((self._sampler or self._source).draw(generator) if choice is None else choice)
+            choices.append(self._draw(generator) if choice is None else choice)
         noise = [self._noise_generators[i] for i in indices] if self.settings.disturbed else []
         self._simulator.reset(robots, choices, self.bank, noise)
         for i, choice in zip(indices, choices, strict=True):
@@ -200,6 +203,15 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if self.render_mode is not None:
             for i in indices:
                 self._trails[i] = [tuple(self._simulator.poses[i].tolist())]
+
+    def _draw(self, generator: np.random.Generator) -> Scenario | int:
+        """Return a random scenario, or the index of one in the bank."""
+        if self._sampler is None:
+            return self._source.draw(generator)
+        index, count = operator.index(self._sampler.draw(generator)), len(self.bank or ())
+        if not 0 <= index < count:
+            raise IndexError(f"sampler: expected an index of the {count} scenarios of the bank, got {index}")
+        return index
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold each robot's action for one control period.
@@ -420,6 +432,21 @@ SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) -
     "robot",
     "horizon",
 }
+
+
+def _check_sampler(sampler: Any, bank: ScenarioBank | None) -> None:
+    """Check that a level sampler has the methods, and is one for a bank.
+
+    Raises:
+        TypeError: a method is missing.
+        ValueError: the sampler is one for another bank.
+
+    """
+    if not all(callable(getattr(sampler, name, None)) for name in ("draw", "record")):
+        raise TypeError(f"sampler: expected an object with the methods draw and record, got {sampler!r}")
+    own = getattr(sampler, "bank", None)
+    if isinstance(own, ScenarioBank) and bank is not None and (own.path, len(own)) != (bank.path, len(bank)):
+        raise ValueError(f"sampler: expected one for the bank {bank.path}, got one for {own.path}")
 
 
 def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

@@ -102,23 +102,21 @@ def main(
     agent = Agent(envs)
     optimizer = torch.optim.Adam(agent.parameters(), lr=1e-3, eps=1e-5)
     following = torch.as_tensor(envs.reset(seed=seed)[0])
-    starting = np.ones(num_envs)
     updates = max(1, total_timesteps // (num_envs * num_steps))
     for update in range(updates):
         optimizer.param_groups[0]["lr"] = 1e-3 * (1 - update / updates)
         rows: dict[str, list[torch.Tensor]] = {name: [] for name in ("x", "a", "logp", "value", "reward", "done")}
         successes: list[float] = []
-        played, starts = [], []
+        played = []
         for _ in range(num_steps):
             with torch.no_grad():
                 distribution = agent.distribution(following)
                 action, value = distribution.sample(), agent.value(following)
             observed = following
             played.append(envs.unwrapped.indices)
-            starts.append(starting)
             # The episode terminates at the horizon, so there is no value after it.
             observation, reward, done, _, info = envs.step(action.clamp(-1, 1).numpy())
-            following, starting = torch.as_tensor(observation), done
+            following = torch.as_tensor(observation)
             if done.any():
                 final_info, final_obs = info["final_info"], np.stack(info["final_obs"][done].tolist())
                 successes += final_info["is_success"][done].tolist()
@@ -139,8 +137,8 @@ def main(
             last = reward[t] + gamma * alive * values[t + 1] - values[t] + gamma * gae_lambda * alive * last
             advantage[t] = last
         if isinstance(sampler, PrioritizedSampler):
-            columns = (column.numpy() for column in (value, advantage, reward))
-            sampler.score_rollout(np.array(played), *columns, np.array(starts))
+            columns = (column.numpy() for column in (value, advantage, reward, done))
+            sampler.score_rollout(np.array(played), *columns)
         flat = [column.flatten(0, 1) for column in (x, a, logp, advantage, advantage + value)]
         for _ in range(epochs):
             for chosen in torch.randperm(num_envs * num_steps).split(batch):

@@ -32,11 +32,13 @@ import matplotlib.pyplot as plt
 FAMILY, N_LEVELS, LEVEL_SEED = "clutter", 2000, 782
 STEPS, SEEDS = 1_000_000, 3
 STAGES = (0.0, 0.1, 0.25, 0.5, 1.0)  # fractions of a run at which the scores of all levels are computed
-EPISODES = 8  # of each level, with the noise of training
+# Of each level, with the noise of training. The scores and what they are compared with are computed from different
+# episodes, so that their errors are independent.
+EPISODES = 4
 N_ROBOTS = 500
 SAMPLERS = get_args(LevelsName)
-SCORES = ("positive_value_loss", "max_mc", "learnability", "failure_rate")
-NAMES = {"max_mc": "MaxMC"}
+SCORES = ("positive_value_loss", "max_mc", "learnability", "failures")
+NAMES = {"max_mc": "MaxMC", "failures": "failure rate"}
 
 
 class Snapshots(BaseCallback):
@@ -44,17 +46,19 @@ class Snapshots(BaseCallback):
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
-        self._folder, self._next = folder, 0
+        self._folder = folder
+        self._next = len(list(folder.glob("stage-*.zip")))  # of a resumed run, which repeats what it saved already
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        if self.num_timesteps >= STAGES[self._next] * STEPS:
+        if self._next < len(STAGES) and self.num_timesteps >= STAGES[self._next] * STEPS:
             self._save()
 
     def _on_training_end(self) -> None:
-        self._save()
+        if self._next < len(STAGES):
+            self._save()
 
     def _save(self) -> None:
         self.model.save(self._folder / f"stage-{self._next}.zip")
@@ -73,10 +77,11 @@ def train(config: PPOConfig, stages: Path | None) -> None:
     """Train with a level sampler, unless the run is finished; save the stages if a directory is given."""
     if is_finished(config.out):
         return
-    if stages is not None:  # a resumed run would not save the stages before its checkpoint
+    callbacks = []
+    if stages is not None:
         stages.mkdir(parents=True, exist_ok=True)
-    resume = stages is None and (config.out / "checkpoint").exists()
-    train_ppo(replace(config, resume=resume), callbacks=[] if stages is None else [Snapshots(stages)])
+        callbacks.append(Snapshots(stages))
+    train_ppo(replace(config, resume=(config.out / "config.json").exists()), callback=callbacks)
 
 
 def is_finished(run: Path) -> bool:
@@ -110,15 +115,15 @@ def play(model: PPO, venv: Any, indices: np.ndarray) -> dict[str, np.ndarray]:
         for column, entry in zip(rows.values(), (rewards, values[:, 0].numpy(), alive), strict=True):
             column.append(entry.copy())
         for i in np.flatnonzero(dones & alive).tolist():
-            parts = infos[i]["reward_parts"]
-            ends["returns"][i] = sum(part for name, part in parts.items() if name != "shaping")
+            parts = infos[i]["reward_parts"]  # of the last step
             ends["costs"][i], ends["success"][i] = infos[i]["cost"], infos[i]["is_success"]
+            ends["returns"][i] = parts["collision"] + parts["miss"] - infos[i]["cost"]
         alive &= ~dones
     return {**{name: np.array(column) for name, column in rows.items()}, **ends}
 
 
 def score_levels(model: PPO, config: PPOConfig, bank: ScenarioBank) -> dict[str, np.ndarray]:
-    """Return the scores, the exact regret and the regret of the successes, all (N,), of the levels of a bank.
+    """Return the scores, the failure rate, the regret and the regret of the successes, (N,), of the levels of a bank.
 
     The regret is -J* minus the mean return of the episodes; that of the successes is NaN without any.
     """
@@ -126,14 +131,15 @@ def score_levels(model: PPO, config: PPOConfig, bank: ScenarioBank) -> dict[str,
     columns: dict[str, list[np.ndarray]] = {}
     for first in range(0, len(bank), N_ROBOTS):
         indices = np.arange(first, first + N_ROBOTS)
-        episodes = [play(model, venv, indices) for _ in range(EPISODES)]
-        for name, column in _scores(episodes, bank.costs[indices], config.gae_lambda).items():
+        episodes = [play(model, venv, indices) for _ in range(2 * EPISODES)]
+        found = _scores(episodes[:EPISODES], config.gae_lambda) | _targets(episodes[EPISODES:], bank.costs[indices])
+        for name, column in found.items():
             columns.setdefault(name, []).append(column)
     venv.close()
     return {name: np.concatenate(column) for name, column in columns.items()}
 
 
-def _scores(episodes: Sequence[dict[str, np.ndarray]], optimal: np.ndarray, gae_lambda: float) -> dict[str, np.ndarray]:
+def _scores(episodes: Sequence[dict[str, np.ndarray]], gae_lambda: float) -> dict[str, np.ndarray]:
     """Return the scores of N levels from several episodes of each, see `PrioritizedSampler`; the discount is 1."""
     totals = [np.sum(episode["rewards"] * episode["running"], axis=0) for episode in episodes]
     best = np.max(totals, axis=0)
@@ -148,16 +154,22 @@ def _scores(episodes: Sequence[dict[str, np.ndarray]], optimal: np.ndarray, gae_
             gains += np.maximum(advantage, 0.0)
         losses += np.sum(running * (best - earned - values), axis=0)
         steps += running.sum(axis=0)
-    success = np.array([episode["success"] for episode in episodes])
-    rate = success.mean(axis=0)
-    costs = np.array([episode["costs"] for episode in episodes])
-    with np.errstate(invalid="ignore"):
-        successful = np.sum(costs * success, axis=0) / success.sum(axis=0) - optimal
+    rate = np.mean([episode["success"] for episode in episodes], axis=0)
     return {
         "positive_value_loss": gains / steps,
         "max_mc": losses / steps,
         "learnability": rate * (1 - rate),
-        "failure_rate": 1 - rate,
+        "failures": 1 - rate,
+    }
+
+
+def _targets(episodes: Sequence[dict[str, np.ndarray]], optimal: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what the scores of N levels are compared with, see `score_levels`."""
+    success, costs = (np.array([episode[name] for episode in episodes]) for name in ("success", "costs"))
+    with np.errstate(invalid="ignore"):
+        successful = np.sum(costs * success, axis=0) / success.sum(axis=0) - optimal
+    return {
+        "failure_rate": 1 - success.mean(axis=0),
         "regret": -optimal - np.mean([episode["returns"] for episode in episodes], axis=0),
         "success_regret": successful,
     }

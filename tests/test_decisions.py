@@ -59,6 +59,18 @@ def test_failures_cost_the_penalties_and_are_lost_before_they_end(tmp_path, caps
     assert decisions[0].episode.scenario in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("decisions", [False, True])
+def test_the_regret_of_a_failure_is_that_of_the_returns(decisions):
+    """Also of episodes that continue after a contact, until the time limit of a free horizon."""
+    environment = {"horizon": "free", "terminate_on_collision": False}
+    found = regret(GoToGoal, count=4, decisions=decisions, resolution=20.0, environment=environment, progress=False)
+    failures = [not episode.success for episode in found.evaluation]
+    assert any(failures) and any(episode.collision and episode.truncated for episode in found.evaluation)
+    for episode, level in zip(found.evaluation, found.levels, strict=True):
+        if not episode.success:
+            assert level == pytest.approx(-episode.episode_return - episode.reference_cost)
+
+
 def test_a_robot_that_stands_still_loses_before_the_horizon():
     """The interval before the first state without an optimum has the regret of the penalty."""
     found = regret(late(ExpertPolicy, 10_000), "open", count=1, decisions=True, progress=False)

@@ -85,10 +85,8 @@ def test_learnability_is_highest_at_half_the_success(bank):
 def test_value_scores_are_means_over_the_steps_of_a_level(bank):
     levels = np.array([[3, 5], [3, 5], [3, 8]])
     values, advantages = np.full((3, 2), -2.0), np.array([[1.0, -1.0], [-3.0, -1.0], [2.0, 4.0]])
-    rewards, starts = np.array([[-1.0, -2.0], [-1.0, -2.0], [-3.0, -7.0]]), np.zeros((3, 2), bool)
-    starts[0], starts[2, 1] = True, True
     sampler = PrioritizedSampler(bank, "positive_value_loss")
-    sampler.score_rollout(levels, values, advantages, rewards, starts)
+    sampler.score_rollout(levels, values, advantages, np.zeros((3, 2)), np.zeros((3, 2), dtype=bool))
     assert sampler.scores[[3, 5, 8]] == pytest.approx([1.0, 0.0, 4.0])
 
 
@@ -96,17 +94,90 @@ def test_max_mc_compares_the_highest_return_with_the_expected_one(bank):
     """Two robots and rollouts of two steps; the episodes of the first robot have the returns -6 and -4."""
     sampler = PrioritizedSampler(bank, "max_mc")
 
-    def score_rollout(levels, values, rewards, starts):
+    def score_rollout(levels, values, rewards, ends):
         advantages = np.zeros((2, 2))
-        sampler.score_rollout(np.array(levels), np.array(values), advantages, np.array(rewards), np.array(starts))
+        sampler.score_rollout(np.array(levels), np.array(values), advantages, np.array(rewards), np.array(ends))
 
-    score_rollout([[3, 5], [3, 5]], [[-7.0, -1.0], [-5.0, -1.0]], [[-1.0, -1.0], [-2.0, -1.0]], [[1, 1], [0, 0]])
+    score_rollout([[3, 5], [3, 5]], [[-7.0, -1.0], [-5.0, -1.0]], [[-1.0, -1.0], [-2.0, -1.0]], [[0, 0], [0, 0]])
     assert np.isnan(sampler.scores).all()  # no episode has ended
-    score_rollout([[3, 5], [3, 5]], [[-3.0, -1.0], [-5.0, -1.0]], [[-3.0, -1.0], [-4.0, -1.0]], [[0, 0], [1, 0]])
-    # The highest return is -6; the returns expected before the two steps are -3 - 3 and 0 - 5.
-    assert sampler.scores[3] == pytest.approx(((-6 + 6) + (-6 + 5)) / 2) and np.isnan(sampler.scores[5])
-    score_rollout([[8, 5], [8, 5]], [[0.0, -1.0], [0.0, -1.0]], [[-1.0, -1.0], [-1.0, -1.0]], [[1, 0], [0, 0]])
-    assert sampler._best_returns[3] == -4.0 and np.isnan(sampler.scores[[5, 8]]).all()
+    score_rollout([[3, 5], [3, 5]], [[-3.0, -1.0], [-5.0, -1.0]], [[-3.0, -1.0], [-4.0, -1.0]], [[1, 0], [1, 0]])
+    # The highest return is -4; the returns expected before the two steps are -3 - 3 and 0 - 5.
+    assert sampler.scores[3] == pytest.approx(((-4 + 6) + (-4 + 5)) / 2) and np.isnan(sampler.scores[5])
+    sampler.discard_episodes()  # the environment is reset
+    score_rollout([[8, 5], [8, 5]], [[0.0, 0.0], [0.0, 0.0]], [[-1.0, -1.0], [-1.0, -2.0]], [[0, 0], [0, 1]])
+    assert np.isnan(sampler.scores[8]) and sampler.scores[5] == pytest.approx((-3.0 + -2.0) / 2)
+
+
+def test_equal_scores_have_equal_probabilities(bank):
+    sampler = PrioritizedSampler(bank, "exact_regret", staleness=0.0)
+    for i in range(20):
+        sampler.record(LevelOutcome(i, True, False, -1.0, float(i >= 15)))
+    probabilities = sampler.probabilities
+    assert np.ptp(probabilities[:15]) == np.ptp(probabilities[15:20]) == 0.0 < probabilities[0] < probabilities[15]
+
+
+def test_the_first_levels_with_a_score_are_not_played_all_the_time(bank):
+    rng, sampler = np.random.default_rng(0), PrioritizedSampler(bank, "exact_regret")
+    drawn = []
+    for _ in range(200):
+        drawn.append(sampler.draw(rng))
+        sampler.record(LevelOutcome(drawn[-1], True, False, -1.0, 0.1))
+    assert np.bincount(drawn).max() <= 12
+
+
+def test_a_level_whose_episode_was_aborted_is_drawn_again():
+    few = ScenarioBank.shipped("clutter", "train")
+    rng, sampler = np.random.default_rng(0), RegretSampler(few)
+    aborted = [sampler.draw(rng) for _ in range(64)]
+    for _ in range(2000):
+        sampler.record(LevelOutcome(sampler.draw(rng), True, False, -1.0, 0.1))
+    assert (sampler.plays[aborted] > 0).all()
+
+
+class CountingSampler:
+    """A sampler of a user, which draws integers of NumPy."""
+
+    def __init__(self):
+        self.outcomes = []
+
+    def draw(self, rng):
+        return rng.integers(10)
+
+    def record(self, outcome):
+        self.outcomes.append(outcome)
+
+
+def test_a_sampler_may_draw_integers_of_numpy(bank):
+    sampler = CountingSampler()
+    venv = gym.make_vec(ID, 4, **SAME, bank=bank, sampler=sampler)
+    venv.reset(seed=0)
+    for _ in range(260):
+        venv.step(np.tile([0.5, 0.0], (4, 1)))
+    assert len(sampler.outcomes) >= 4 and {type(outcome.index) for outcome in sampler.outcomes} == {int}
+
+
+def test_a_sampler_and_a_callback_have_to_fit_the_environment(bank):
+    other = UniformSampler(ScenarioBank.shipped("clutter", "test"))
+    with pytest.raises(ValueError, match=r"sampler: expected one for the bank .*clutter-train\.bank"):
+        make_vec_env(n_envs=1, bank=bank, sampler=other)
+    with pytest.raises(TypeError, match="sampler: expected an object with the methods draw and record, got 'uniform'"):
+        make_vec_env(n_envs=1, bank=bank, sampler="uniform")
+    with pytest.raises(TypeError, match="bank: expected a ScenarioBank, got str"):
+        RegretSampler("clutter")
+    with pytest.raises(TypeError, match="sampler: expected a PrioritizedSampler, got UniformSampler"):
+        LevelScoring(UniformSampler(bank))
+    venv = make_vec_env(n_envs=4, bank=bank, sampler=PrioritizedSampler(bank), control_period=0.2, lidar_beams=8)
+    model = PPO("MlpPolicy", venv, n_steps=64, batch_size=64, n_epochs=1, seed=0)
+    with pytest.raises(ValueError, match="sampler: expected that of the training environment"):
+        model.learn(256, callback=LevelScoring(PrioritizedSampler(bank)))
+
+
+def test_scores_that_are_never_set_are_reported(bank):
+    rng, sampler = np.random.default_rng(0), make_sampler("plr", bank)
+    for _ in range(5 * len(bank)):
+        sampler.record(LevelOutcome(sampler.draw(rng), True, False, -1.0, 0.1))
+    with pytest.warns(UserWarning, match=r"no scores 'positive_value_loss'.*LevelScoring"):
+        sampler.draw(rng)
 
 
 @pytest.mark.parametrize("name", ["uniform", "plr", "learnability", "exact_regret"])

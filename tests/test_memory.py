@@ -25,6 +25,7 @@ from leapnav.training import (
     save_policy,
 )
 from leapnav.training.config import DAggerRunConfig
+from leapnav.training.learning.cloning import Cloning
 from leapnav.training.learning.driving import DrivenEpisode
 from leapnav.training.learning.samples import samples_class
 from leapnav.training.learning.takeovers import Labeller
@@ -119,6 +120,23 @@ def test_a_policy_is_fitted_with_the_symmetries(kind, env, dataset):
     losses = behaviour_clone(policy, dataset, replace(QUICK, epochs=6), progress=False)
     assert losses[-1].training < 0.7 * losses[0].training
     assert losses[-1].validation < 1.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_schedule_of_a_fit_has_as_many_steps_as_there_are_batches(kind, env, dataset):
+    fit = Cloning(with_memory(env, kind), dataset, replace(QUICK, batch_size=150))
+    batches = []
+    fit.run_epoch(lambda: batches.append(1))
+    assert len(batches) == fit.batches
+
+
+def test_a_policy_with_stacked_frames_is_loaded_by_stable_baselines(env, tmp_path):
+    policy = with_memory(env, "stack")
+    policy.save(tmp_path / "policy.pt")
+    observations = observed(env, 5, 65)
+    np.testing.assert_array_equal(
+        act(type(policy).load(tmp_path / "policy.pt"), observations), act(policy, observations)
+    )
 
 
 @pytest.mark.parametrize("half", [False, True])

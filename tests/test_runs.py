@@ -120,6 +120,10 @@ def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):
     config = ppo(tmp_path / "run", total_timesteps=256)
     train_ppo(config, progress=False)
     record = json.loads((config.out / "config.json").read_text())
+    for name in ("observation", "actuation", "disturbance", "levels"):  # those that the first version did not have
+        del record["config"][name]
+    (config.out / "config.json").write_text(json.dumps(record))
+    train_ppo(replace(config, resume=True), progress=False)
     del record["config"]["graded_miss"]
     (config.out / "config.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match="a run of another version of leapnav, without graded_miss"):
@@ -318,7 +322,10 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         ({"ent_coef": -1.0}, r"ent_coef: expected a number >= 0"),
         ({"levels": "plr"}, r"levels: expected one of fresh, .*, got 'plr'"),
         ({"level_bank": "my.bank"}, r"level_bank: expected none with levels='fresh', got 'my.bank'"),
-        ({"levels": "uniform", "family": "all"}, r"level_bank: expected a bank for levels='uniform' of all families"),
+        (
+            {"levels": "uniform", "family": "all"},
+            "level_bank: expected a bank for levels='uniform' of 'all'",
+        ),
         ({"levels": "max_mc", "jump_start": 0.5}, r"jump_start: expected 0 with levels='max_mc', got 0.5"),
     ],
 )
@@ -353,7 +360,7 @@ def test_ppos_robots_have_the_settings_of_the_run(tmp_path):
 def test_a_run_learns_from_the_levels_that_a_sampler_chooses(tmp_path):
     levels, names = LevelsOfEpisodes(), get_args(LevelsName)
     assert names == ("fresh", "uniform", *SCORES)
-    train_ppo(ppo(tmp_path / "run", levels="positive_value_loss"), callbacks=[levels], progress=False)
+    train_ppo(ppo(tmp_path / "run", levels="positive_value_loss"), callback=levels, progress=False)
     bank = ScenarioBank.shipped("open", "train")
     assert levels.sampler.score == "positive_value_loss" and len(levels.sampler.scores) == len(bank)
     assert (~np.isnan(levels.sampler.scores)).sum() >= 4 and levels.indices <= set(range(len(bank)))
@@ -380,17 +387,55 @@ class CountingSteps(VecEnvWrapper):
         self.steps = state["steps"]
 
 
+class CountingMore(CountingSteps):
+    """Inherits its state."""
+
+
 def test_a_wrapper_of_the_training_environment_is_part_of_the_run(tmp_path):
     made = []
 
     def wrapper(venv):
-        made.append(CountingSteps(venv))
+        made.append(CountingMore(venv))
         return made[-1]
 
     config = ppo(tmp_path / "run")
     train_ppo(config, wrapper=wrapper, progress=False)
     train_ppo(replace(config, resume=True), wrapper=wrapper, progress=False)  # the run is finished
     assert [counter.steps for counter in made] == [config.total_timesteps] * 2
+    with pytest.raises(ValueError, match="wrapper: the run has 2 wrappers with a state, got NavigateVecEnv"):
+        train_ppo(replace(config, resume=True), progress=False)
+    with pytest.raises(TypeError, match="wrapper: expected a function that returns a VecEnv, got NoneType"):
+        train_ppo(ppo(tmp_path / "other"), wrapper=lambda venv: None, progress=False)
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_bank_of_levels_has_the_robot_and_the_horizon_of_the_run(tmp_path):
+    for arguments, message in (
+        ({"horizon": "free"}, "level_bank: horizon: expected 'fixed', got 'free'"),
+        ({"family": "clutter", "robot": "car"}, "level_bank: robot: expected 'unicycle', got 'car'"),
+    ):
+        bank = ScenarioBank.shipped(**{"family": "open", "split": "train", **arguments})
+        with pytest.raises(ValueError, match=message):
+            train_ppo(ppo(tmp_path / "run", levels="uniform", level_bank=bank.path), progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_starts_from_a_policy_has_its_observation():
+    for start in ("clutter", Path("clutter"), (Path("clutter"),)):
+        config = PPOConfig.tuned("clutter", warm_start=start)
+        assert (config.observation, config.lidar_beams) == ("geodesic", 64)
+    given = DAggerRunConfig.tuned("clutter", observation="lidar")
+    inherited = DAggerRunConfig.tuned("clutter", policy=Path("free-clutter"))
+    assert inherited.observation == "lidar" and inherited.dagger == given.dagger
+
+
+def test_dagger_with_another_memory_than_its_first_learner_is_refused(demos, tmp_path):
+    clone = tmp_path / "clone"
+    train_bc(bc(clone, demos), progress=False)
+    config = DAggerRunConfig(out=tmp_path / "run", demos=(demos,), policy=clone, memory="stack", **COMMON)
+    with pytest.raises(ValueError, match="policy: expected the memory 'stack', got 'none'"):
+        train_dagger(config, progress=False)
+    assert not (tmp_path / "run").exists()
 
 
 class LevelsOfEpisodes(BaseCallback):

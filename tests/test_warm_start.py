@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch as th
@@ -277,6 +279,15 @@ def test_imitation_holds_an_actor_to_the_demonstrations(kind, dataset):
             actions = mean_action(model.policy, th.as_tensor(dataset.observations))
         error[weight] = float(np.abs(actions.numpy() - dataset.actions).mean())
     assert error[100.0] < 0.5 * error[0.0]
+
+
+def test_imitation_ignores_samples_without_a_label(dataset):
+    actions = dataset.actions.copy()
+    actions[::2] = np.nan
+    model = SAC("MlpPolicy", make_vec_env(n_envs=2, family="open"), policy_kwargs=small(), seed=0, learning_starts=0)
+    imitate(model, replace(dataset, actions=actions), 1.0)
+    model.learn(20)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.actor.parameters())
 
 
 def test_imitation_needs_the_models_observations(dataset):

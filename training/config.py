@@ -20,14 +20,15 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(
 )
 
 
-# A literal, so that the command line shows and completes the choices; a test compares it with `FAMILIES`.
-FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"]
-# A literal, so that the help texts show the choices; a robot registered by the user is text as well.
+# Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
+# robots of the user are text as well.
+FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"] | str
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
 MemoryName = Literal["none", "stack", "lstm"]
+TEST_BANK = "test.bank"  # file in the directory of a run of a family that is not built in: scenarios of the evaluations
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 
@@ -170,6 +171,10 @@ class RunConfig:
             check_family(family)
         if warm is None:
             warm = bool(changes.get("warm_start"))
+        own = {setting.name for setting in fields(cls)}
+        given = _as_paths(start) or _as_paths(changes.get("warm_start")) or _as_paths(changes.get("policy"))
+        inherited = {name: value for name, value in _inherited(given).items() if name in own}
+        changes = {**inherited, **changes}
         config = cls(out=Path(), family=cast(FamilyName, family))
         sections = ["RunConfig", cls.__name__, *([f"{cls.__name__}-warm"] if warm else [])]
         if changes.get("horizon") == "free":
@@ -183,10 +188,7 @@ class RunConfig:
             names = {setting.name for setting in fields(config)}
             common = {name: value for name, value in table.items() if name in names}  # the other keys are families
             config = _replace_nested(_replace_nested(config, common), table.get(family, {}))
-        given = changes.get("warm_start") or [path for path in (changes.get("policy"),) if path is not None]
-        own = {setting.name for setting in fields(config)}
-        inherited = {name: value for name, value in _inherited(start or given).items() if name in own}
-        return replace(config, **{**inherited, **changes})
+        return replace(config, **changes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,6 +359,13 @@ class SACConfig(_LearnerConfig):
     """Environment steps between evaluations."""
     checkpoint_every: int = 50_000
     """Environment steps between checkpoints."""
+
+
+def _as_paths(value: Any) -> list[Path]:
+    """Return one path, several or none as a list."""
+    if not value:
+        return []
+    return [Path(path) for path in ([value] if isinstance(value, (str, Path)) else value)]
 
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:

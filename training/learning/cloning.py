@@ -149,7 +149,7 @@ class Cloning:
         )
         self._scale = _scale(self._train, config.loss)
         self.batch_size = config.batch_size or _default_batch_size(len(self._train))
-        self.batches = math.ceil(len(self._train) / self.batch_size)
+        self.batches = self._train.n_batches(self.batch_size)
         self.epochs = config.epochs or max(DEFAULT_EPOCHS, math.ceil(MIN_STEPS / self.batches))
         parameters = actor_parameters(policy)
         self._optimiser = th.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -276,7 +276,7 @@ def warm_up_and_cosine(total_steps: int) -> Callable[[int], float]:
 
 def cosine_decay(total_steps: int) -> Callable[[int], float]:
     """Return the learning-rate factor per gradient step: cosine decay from 1 to 0 after `total_steps`."""
-    return lambda step: 0.5 * (1 + math.cos(math.pi * step / total_steps))
+    return lambda step: 0.5 * (1 + math.cos(math.pi * min(1.0, step / total_steps)))
 
 
 def _action_loss(error: th.Tensor) -> th.Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -73,6 +74,10 @@ class Samples:
         """Actions, slopes and weights of all samples, see `Batch`."""
         return tuple(column[self.rows] for column in self._columns)
 
+    def n_batches(self, size: int) -> int:
+        """Return the number of batches of about `size` samples in a pass."""
+        return math.ceil(len(self) / size)
+
     def shuffled(self, size: int, rng: th.Generator) -> Iterator[th.Tensor]:
         """Yield what `batch` takes, for one pass over the samples in random order, in batches of about `size`."""
         yield from th.randperm(len(self), generator=rng).split(size)
@@ -133,6 +138,9 @@ class Sequences(Samples):
     def _size(self, size: int) -> int:
         """Return how many sequences have about `size` labels."""
         return max(1, round(size * len(self._starts) / max(1, len(self))))
+
+    def n_batches(self, size: int) -> int:  # noqa: D102 (see `Samples`)
+        return math.ceil(len(self._starts) / self._size(size))
 
     def shuffled(self, size: int, rng: th.Generator) -> Iterator[th.Tensor]:  # noqa: D102 (see `Samples`)
         per_batch, batches = self._size(size), []

@@ -126,6 +126,12 @@ class FrameStackPolicy(ActorCriticPolicy):
         )
         self.observation_space = observation_space
 
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        # The base class adds its own arguments, of which this class determines the extractor's.
+        parameters = super()._get_constructor_parameters()
+        del parameters["features_extractor_kwargs"]
+        return {**parameters, "features_extractor_class": self.frame_extractor_class}
+
     def predict(
         self,
         observation: Any,

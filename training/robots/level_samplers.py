@@ -13,9 +13,11 @@ Sources:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
+import gymnasium as gym
 import numpy as np
+from scipy.stats import rankdata
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.sources import LevelOutcome
@@ -25,7 +27,9 @@ ScoreName = Literal["positive_value_loss", "max_mc", "learnability", "exact_regr
 SCORES: tuple[str, ...] = get_args(ScoreName)
 VALUE_SCORES = ("positive_value_loss", "max_mc")  # those that need the values of a critic, see `score_rollout`
 SAMPLERS = ("uniform", "plr", "learnability", "exact_regret")
-MAX_AGE = 64  # draws after which the probabilities are computed again
+MAX_AGE = 64  # draws after which the probabilities are computed again ...
+MAX_GROWTH = 1.1  # ... or, earlier, growth of the number of levels with a score
+PLAYS_WITHOUT_SCORE = 5  # mean number of episodes of a level after which missing scores are reported
 
 
 class UniformSampler:
@@ -35,18 +39,27 @@ class UniformSampler:
         bank: the levels.
 
     Attributes:
+        bank: the levels.
         plays (N,): number of finished episodes of each level.
         success (N,): success rate of each level, a moving average; NaN without an episode.
-        regrets (N,): regret of the last episode of each level; NaN without an episode.
+        regrets (N,): regret of the last episode of each level; NaN without an episode. It refers to the optimum of the
+            level, while `regret` uses that of the pose reached, so that of a success can be slightly negative.
+
+    Raises:
+        TypeError: `bank` is not a bank.
+        ValueError: the bank is empty.
 
     """
 
     RATE = 0.3  # weight of the last episode in the moving average
 
     def __init__(self, bank: ScenarioBank) -> None:
+        if not isinstance(cast(object, bank), ScenarioBank):
+            raise TypeError(f"bank: expected a ScenarioBank, got {type(bank).__name__}")
         count = len(bank)
         if count == 0:
             raise ValueError("bank: expected at least one scenario, got none")
+        self.bank = bank
         self.plays = np.zeros(count, dtype=np.int64)
         self.success, self.regrets = np.full(count, np.nan), np.full(count, np.nan)
 
@@ -69,8 +82,8 @@ class PrioritizedSampler(UniformSampler):
     """Prioritized level replay: draw levels by the rank of their score, and by the time since they were drawn.
 
     A level is drawn with the probability (1 - staleness) P_S + staleness P_C. P_S is proportional to
-    rank^(-1 / temperature), with rank 1 for the highest score, and P_C to the number of draws since the level was
-    drawn.
+    rank^(-1 / temperature), with rank 1 for the highest score and the mean rank for equal scores, and P_C to the number
+    of draws since the level was drawn.
 
     Args:
         bank: the levels.
@@ -106,28 +119,39 @@ class PrioritizedSampler(UniformSampler):
         self.score, self._replay, self._temperature, self._staleness = score, replay, temperature, staleness
         self.scores = np.full(len(self.plays), np.nan)
         self._best_returns = np.full(len(self.plays), -np.inf)  # as the critic sees them, for "max_mc"
-        # Level and return so far of each robot's episode, between two rollouts, for "max_mc".
-        self._episodes: tuple[np.ndarray, np.ndarray] | None = None
+        self._earned: np.ndarray | None = None  # reward of each robot's episode so far, between two rollouts
         self._drawn = np.zeros(len(self.plays), dtype=np.int64)  # the draw at which a level was drawn last
         self._draws, self._age = 0, MAX_AGE
         self._levels, self._cumulative = np.empty(0, dtype=np.int64), np.empty(0)
+        self._reported = False
 
     def draw(self, rng: np.random.Generator) -> int:
         """Return the index of the level of the next episode."""
-        unseen = np.flatnonzero(self._drawn == 0)
-        seen = not np.isnan(self.scores).all()
-        if len(unseen) and not (seen and rng.random() < self._replay):
-            level = int(rng.choice(unseen))
-        elif seen:
-            level = self._draw_scored(rng)
-        else:  # all are in their first episode
-            level = int(rng.integers(len(self.plays)))
+        unscored = np.flatnonzero(np.isnan(self.scores))
+        n_scored = len(self.scores) - len(unscored)
+        if n_scored == 0:
+            self._check_scoring()
+        if len(unscored) and not (n_scored and rng.random() < self._replay):
+            # Those that have never been drawn, then those drawn the longest ago: their episodes may have been aborted.
+            drawn = self._drawn[unscored]
+            level = int(rng.choice(unscored[drawn == drawn.min()]))
+        else:
+            level = self._draw_scored(rng, n_scored)
         self._draws += 1
         self._drawn[level] = self._draws
         return level
 
-    def _draw_scored(self, rng: np.random.Generator) -> int:
-        if self._age >= MAX_AGE:
+    def _check_scoring(self) -> None:
+        """Warn once if the scores of the critic are never set."""
+        if not self._reported and self.plays.sum() >= PLAYS_WITHOUT_SCORE * len(self.plays):
+            self._reported = True
+            gym.logger.warn(
+                f"the levels have no scores {self.score!r}, so all are drawn alike; use the callback LevelScoring, or "
+                "call score_rollout after each rollout"
+            )
+
+    def _draw_scored(self, rng: np.random.Generator, n_scored: int) -> int:
+        if self._age >= MAX_AGE or n_scored > MAX_GROWTH * len(self._levels):
             self._levels = np.flatnonzero(~np.isnan(self.scores))
             self._cumulative, self._age = np.cumsum(self.probabilities[self._levels]), 0
         self._age += 1
@@ -141,9 +165,7 @@ class PrioritizedSampler(UniformSampler):
         known = np.flatnonzero(~np.isnan(self.scores))
         if len(known) == 0:
             return result
-        ranks = np.empty(len(known))
-        ranks[np.argsort(-self.scores[known], kind="stable")] = np.arange(1, len(known) + 1)
-        by_score = ranks ** (-1.0 / self._temperature)
+        by_score = rankdata(-self.scores[known]) ** (-1.0 / self._temperature)
         by_age = (self._draws - self._drawn[known] + 1).astype(float)
         result[known] = (1 - self._staleness) * by_score / by_score.sum() + self._staleness * by_age / by_age.sum()
         return result
@@ -158,7 +180,7 @@ class PrioritizedSampler(UniformSampler):
             self.scores[i] = self.success[i] * (1 - self.success[i])
 
     def score_rollout(
-        self, levels: np.ndarray, values: np.ndarray, advantages: np.ndarray, rewards: np.ndarray, starts: np.ndarray
+        self, levels: np.ndarray, values: np.ndarray, advantages: np.ndarray, rewards: np.ndarray, ends: np.ndarray
     ) -> None:
         """Set the scores of the levels in a rollout of T steps of N robots from the values of a critic.
 
@@ -172,7 +194,7 @@ class PrioritizedSampler(UniformSampler):
             values (T, N): values of the critic before each step.
             advantages (T, N): generalised advantage estimates.
             rewards (T, N): the rewards that the critic learns from.
-            starts (T, N): whether an episode starts with the step.
+            ends (T, N): whether an episode ends with the step.
 
         """
         if self.score not in VALUE_SCORES:
@@ -181,22 +203,27 @@ class PrioritizedSampler(UniformSampler):
         if self.score == "positive_value_loss":
             terms = np.maximum(advantages, 0.0)
         else:
-            earned = self._sum_rewards(levels, np.asarray(rewards), np.asarray(starts, dtype=bool))
+            earned = self._sum_rewards(levels, np.asarray(rewards), np.asarray(ends, dtype=bool))
             terms = self._best_returns[levels] - (earned + values)  # -inf in a level that has not been finished
         played, inverse = np.unique(levels.ravel(), return_inverse=True)
         means = np.bincount(inverse, weights=terms.ravel()) / np.bincount(inverse)
         finite = np.isfinite(means)
         self.scores[played[finite]] = means[finite]
 
-    def _sum_rewards(self, levels: np.ndarray, rewards: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    def discard_episodes(self) -> None:
+        """Forget the rewards of unfinished episodes; call it after a reset of the environment, for "max_mc"."""
+        self._earned = None
+
+    def _sum_rewards(self, levels: np.ndarray, rewards: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return the reward (T, N) of the episode before each step, and update the highest returns."""
         before = np.empty(rewards.shape)
-        playing, total = self._episodes or (levels[0], np.full(levels.shape[1], -np.inf))
-        for t in range(len(levels)):
-            np.maximum.at(self._best_returns, playing[starts[t]], total[starts[t]])
-            before[t] = total = np.where(starts[t], 0.0, total)
-            playing, total = levels[t], total + rewards[t]
-        self._episodes = playing, total
+        total = np.zeros(levels.shape[1]) if self._earned is None else self._earned
+        for t, (playing, ended) in enumerate(zip(levels, ends, strict=True)):
+            before[t] = total
+            total = total + rewards[t]
+            np.maximum.at(self._best_returns, playing[ended], total[ended])
+            total = np.where(ended, 0.0, total)
+        self._earned = total
         return before
 
 

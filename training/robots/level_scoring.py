@@ -21,31 +21,40 @@ class LevelScoring(BaseCallback):
     Args:
         sampler: the sampler of the training environment.
 
+    Raises:
+        TypeError: `sampler` is not a `PrioritizedSampler`.
+
     """
 
     def __init__(self, sampler: PrioritizedSampler) -> None:
         super().__init__()
+        if not isinstance(cast(object, sampler), PrioritizedSampler):
+            raise TypeError(f"sampler: expected a PrioritizedSampler, got {type(sampler).__name__}")
         self._sampler = sampler
         self._levels: list[np.ndarray] = []
+        self._ends: list[np.ndarray] = []
 
     def _on_training_start(self) -> None:
         inner = unwrap(self.training_env)[0]
-        if not isinstance(inner, NavigateVectorEnv) or inner.bank is None:
-            raise TypeError("env: expected one from make_vec_env(bank=..., sampler=...)")
+        if not isinstance(inner, NavigateVectorEnv) or inner.sampler is not self._sampler:
+            raise ValueError("sampler: expected that of the training environment, make_vec_env(bank=..., sampler=...)")
         self._robots = inner
+        if self.model.num_timesteps == 0:  # `learn` has reset the environment
+            self._sampler.discard_episodes()
 
     def _on_rollout_start(self) -> None:
-        self._levels, self._current = [], self._playing()
+        self._levels, self._ends, self._current = [], [], self._playing()
 
     def _on_step(self) -> bool:
         self._levels.append(self._current)
+        self._ends.append(np.array(self.locals["dones"], dtype=bool))
         self._current = self._playing()
         return True
 
     def _on_rollout_end(self) -> None:
         buffer = cast(OnPolicyAlgorithm, self.model).rollout_buffer
         self._sampler.score_rollout(
-            np.array(self._levels), buffer.values, buffer.advantages, buffer.rewards, buffer.episode_starts
+            np.array(self._levels), buffer.values, buffer.advantages, buffer.rewards, np.array(self._ends)
         )
 
     def _playing(self) -> np.ndarray:

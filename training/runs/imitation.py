@@ -112,11 +112,12 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     """
     check_config(config)
     dataset = Dataset.of(config.demos) if config.demos else None
-    first = None if config.policy is None else load_policy(config.policy, make_env(config))
+    policy = _new_policy(config)
+    if config.policy is not None:
+        copy_actor(load_policy(config.policy, make_env(config)), policy)
     run = Run("dagger", config)
     dataset = dataset or _demonstrations(run, config.scenarios, workers, progress)
     dataset = dataset.observed(observed_settings(config))  # replaced, to release the memory of the other observations
-    policy = _new_policy(config)
     venv = make_vec_env(n_envs=config.n_envs, family=config.family, split="fresh", **config.environment)
     dagger = DAgger(
         policy,
@@ -133,9 +134,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
         policy.load_state_dict(th.load(checkpoint[0] / "policy.pt", weights_only=True))
         dagger.restore([Round(**completed) for completed in checkpoint[1]["rounds"]])
         run.restore_generators()
-    elif first is not None:
-        copy_actor(first, policy)
-    else:
+    elif config.policy is None:
         behaviour_clone(policy, dataset, replace(config.cloning, seed=config.seed), progress=progress)
         _save_round(run, policy, dagger)
     evaluations: list[Evaluation] = []

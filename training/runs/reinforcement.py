@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -14,12 +14,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.scenarios.families import families_of
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_choice
@@ -51,7 +52,7 @@ Config = PPOConfig | SACConfig
 def train_ppo(
     config: PPOConfig,
     *,
-    callbacks: Sequence[BaseCallback] = (),
+    callback: MaybeCallback = None,
     wrapper: Callable[[VecEnv], VecEnv] | None = None,
     progress: bool = True,
 ) -> list[Evaluation]:
@@ -61,9 +62,9 @@ def train_ppo(
 
     Args:
         config: settings.
-        callbacks: further callbacks of Stable-Baselines3; a resumed run does not restore their state.
-        wrapper: function that wraps the training environment. A resumed run restores the state of the wrapper if it
-            has the methods `state_dict` and `load_state_dict`.
+        callback: further callbacks of Stable-Baselines3, one or a list; a resumed run does not restore their state.
+        wrapper: function that wraps the training environment; it must not change the observations. A resumed run
+            restores the state of the wrapper if it has the methods `state_dict` and `load_state_dict`.
         progress: show progress bars.
 
     Returns:
@@ -100,14 +101,14 @@ def train_ppo(
             device="cpu",
         )
 
-    return _train("ppo", config, make, callbacks, wrapper, progress)
+    return _train("ppo", config, make, callback, wrapper, progress)
 
 
 @limit_threads
 def train_sac(
     config: SACConfig,
     *,
-    callbacks: Sequence[BaseCallback] = (),
+    callback: MaybeCallback = None,
     wrapper: Callable[[VecEnv], VecEnv] | None = None,
     progress: bool = True,
 ) -> list[Evaluation]:
@@ -151,14 +152,14 @@ def train_sac(
             **_buffer_arguments(config, dataset),
         )
 
-    return _train(config.algorithm, config, make, callbacks, wrapper, progress)
+    return _train(config.algorithm, config, make, callback, wrapper, progress)
 
 
 def _train(
     algorithm: str,
     config: Config,
     make: Callable[[VecEnv, Dataset | None], BaseAlgorithm],
-    callbacks: Sequence[BaseCallback],
+    callback: MaybeCallback,
     wrapper: Callable[[VecEnv], VecEnv] | None,
     progress: bool,
 ) -> list[Evaluation]:
@@ -177,6 +178,8 @@ def _train(
     venv = make_training_env(config)
     if wrapper is not None:
         venv = wrapper(venv)
+        if not isinstance(cast(object, venv), VecEnv):
+            raise TypeError(f"wrapper: expected a function that returns a VecEnv, got {type(venv).__name__}")
     model = make(venv, dataset)
     # Stable-Baselines3 has seeded the environment with the seed of the run itself, see `environment_seed`.
     venv.seed(environment_seed(config.seed))
@@ -191,15 +194,16 @@ def _train(
     model.set_logger(run.logger)
     if isinstance(config, SACConfig) and config.imitation > 0 and dataset is not None:
         imitate(cast(OffPolicyAlgorithm, model), dataset, config.imitation)
-    callback = _RunCallback(run, config, venv, checkpoint[1] if checkpoint else None, progress)
+    own = _RunCallback(run, config, venv, checkpoint[1] if checkpoint else None, progress)
     if checkpoint is not None:
         run.restore_generators()
     remaining = config.total_timesteps - model.num_timesteps
     if remaining > 0:
-        chosen = [callback, *_level_scoring(venv), *callbacks]
+        further = callback if isinstance(callback, list) else [] if callback is None else [callback]
+        chosen = [own, *_level_scoring(venv), *further]
         model.learn(remaining, callback=chosen, reset_num_timesteps=checkpoint is None)
-        callback.save_checkpoint()
-    callback.bar.close()
+        own.save_checkpoint()
+    own.bar.close()
     if isinstance(config, PPOConfig) and config.last_std > 0:
         set_noise(model.policy, config.last_std)
     evaluations = run.evaluate(model.policy, model.num_timesteps, final=True)
@@ -245,8 +249,9 @@ def make_training_env(config: Config) -> VecEnv:
     )
     venv: VecEnv = robots
     if config.jump_start > 0:
-        families = FAMILIES if config.family == ALL else (config.family,)
-        banks = [ScenarioBank.shipped(family, "train", config.robot, config.horizon) for family in families]
+        banks = [
+            ScenarioBank.shipped(family, "train", config.robot, config.horizon) for family in families_of(config.family)
+        ]
         venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
     if config.graded_miss:
         venv = GradedMiss(venv)
@@ -259,6 +264,9 @@ def _scenarios(config: Config) -> dict[str, Any]:
         return {"family": config.family, "split": "fresh"}
     if config.level_bank is not None:
         bank = ScenarioBank(config.level_bank)
+        for name, found in (("robot", bank.robot.model), ("horizon", bank.horizon)):
+            if found != getattr(config, name):
+                raise ValueError(f"level_bank: {name}: expected {getattr(config, name)!r}, got {found!r}")
     else:
         bank = ScenarioBank.shipped(config.family, "train", config.robot, config.horizon)
     sampler = UniformSampler(bank) if config.levels == "uniform" else PrioritizedSampler(bank, config.levels)
@@ -314,9 +322,13 @@ def _load_model(kind: Any, folder: Path, venv: VecEnv, dataset: Dataset | None, 
             model.replay_buffer.demonstrate(dataset, config.reward_scale)
     with (folder / "robots.pkl").open("rb") as file:
         wrapper_states, action_generator = pickle.load(file)
+    wrappers = _stateful_wrappers(venv)
+    if len(wrappers) != len(wrapper_states):
+        names = ", ".join(type(wrapper).__name__ for wrapper in wrappers)
+        raise ValueError(f"wrapper: the run has {len(wrapper_states)} wrappers with a state, got {names}")
     # Loading has seeded the generator of the action space, from which the random actions before learning are drawn.
     model.action_space.np_random.bit_generator.state = action_generator
-    for wrapper, state in zip(_stateful_wrappers(venv), wrapper_states, strict=True):
+    for wrapper, state in zip(wrappers, wrapper_states, strict=True):
         wrapper.load_state_dict(state)
     return model
 
@@ -336,7 +348,7 @@ def _stateful_wrappers(venv: Any) -> list[Any]:
     """Return the wrappers and the vector environment that have a `state_dict`, outermost first."""
     found = []
     while isinstance(venv, VecEnv):
-        if "state_dict" in type(venv).__dict__:
+        if hasattr(type(venv), "state_dict"):
             found.append(venv)
         venv = getattr(venv, "venv", None)
     return found

@@ -21,19 +21,30 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.scenarios.families import families_of, is_built_in
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
-from leapnav.training.config import RunConfig
+from leapnav.experts.data.banks import build_bank
+from leapnav.training.config import TEST_BANK, RunConfig
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, evaluate
 
+TEST_COUNT, TEST_SEED = 100, 1  # of the bank for the evaluations of a family that is not built in
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
 # Settings that earlier versions did not have, with the values that correspond to them.
-NEW_SETTINGS = {"horizon": "fixed", "memory": "none", "levels": "fresh", "level_bank": None}
+NEW_SETTINGS: dict[str, Any] = {
+    "horizon": "fixed",
+    "observation": "lidar",
+    "memory": "none",
+    "actuation": "velocity",
+    "disturbance": 0.0,
+    "levels": "fresh",
+    "level_bank": None,
+}
+NEW_DAGGER_SETTINGS = {"takeovers": "schedule", "regret_threshold": 0.3}
 MEASURES = ("success", "collision", "soc", "regret")  # of an evaluation, for each family
 
 
@@ -46,6 +57,7 @@ class Run:
     | `policy.json`, `weights.pt` | the policy of the last evaluation, see `load_policy` |
     | `evaluations.jsonl` | one line per evaluation: step, seconds; success, collision, SOC and regret per family |
     | `tensorboard/` | logs |
+    | `test.bank` | scenarios of the evaluations, if the family is not built in |
     | `checkpoint/` | state to resume from; it contains pickle files, so resume only runs from a trusted source |
 
     Args:
@@ -85,7 +97,7 @@ class Run:
     @property
     def families(self) -> tuple[str, ...]:
         """The families of the run's scenarios."""
-        return tuple(FAMILIES) if self.config.family == ALL else (self.config.family,)
+        return families_of(self.config.family)
 
     @property
     def seconds(self) -> float:
@@ -103,6 +115,8 @@ class Run:
         for name, value in NEW_SETTINGS.items():
             if name in self._settings:
                 stored.setdefault(name, value)
+        if isinstance(stored.get("dagger"), dict):
+            stored["dagger"] = {**NEW_DAGGER_SETTINGS, **stored["dagger"]}
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
@@ -127,9 +141,7 @@ class Run:
         """
         count = None if final else self.config.evaluation_scenarios
         options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
-        robot, horizon = self.config.robot, self.config.horizon
-        banks = [ScenarioBank.shipped(family, "test", robot, horizon) for family in self.families]
-        evaluations = [evaluate(policy, bank, count=count, **options) for bank in banks]
+        evaluations = [evaluate(policy, self._bank(family), count=count, **options) for family in self.families]
         line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
         for family, evaluation in zip(self.families, evaluations, strict=True):
             line[family] = plain({name: getattr(evaluation, name) for name in MEASURES})
@@ -140,6 +152,14 @@ class Run:
         self.evaluations.append(line)
         self._write_evaluations()
         return evaluations
+
+    def _bank(self, family: str) -> ScenarioBank:
+        """Return the included test bank of a family; that of a family of one's own is built in the run directory."""
+        robot, horizon = self.config.robot, self.config.horizon
+        if is_built_in(family):
+            return ScenarioBank.shipped(family, "test", robot, horizon)
+        task: dict[str, Any] = {"robot": robot, "horizon": horizon, "seed": TEST_SEED}
+        return build_bank(family, TEST_COUNT, self.folder / TEST_BANK, **task, progress=False)
 
     def _write_evaluations(self) -> None:
         write_text(self.folder / "evaluations.jsonl", "".join(encode(line) + "\n" for line in self.evaluations))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, FAMILIES, check_family
+from leapnav.envs.scenarios.families import check_family, families_of
 from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.scores import Score, score
@@ -120,7 +120,7 @@ def compare(
             specs.append(_spec(label, f"{label}[{number}]", member, environment, seed))
     if isinstance(bank, str):
         check_family(bank)
-        banks = included_banks(specs, tuple(FAMILIES) if bank == ALL else (bank,))
+        banks = included_banks(specs, families_of(bank))
     else:
         banks = [bank] if isinstance(bank, ScenarioBank) else list(bank)
     return compare_policies(specs, banks, count=count, seed=seed, progress=progress)

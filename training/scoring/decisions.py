@@ -33,7 +33,8 @@ class Decisions:
         episode: the episode.
         steps (M + 1,): environment steps at the ends of the intervals, from 0 to that of the end of the episode.
         times (M + 1,): the same in s since the start of the episode.
-        regrets (M,): regret of each interval, in the unit of the cost. The sum is the regret of the level.
+        regrets (M,): regret of each interval, in the unit of the cost, not negative. The sum is the regret of the
+            level, unless penalties below the optimal cost make that lower.
         lost_at: time (s) of the first state from which no optimum exists any more; NaN if there is none. The interval
             before it has all of the remaining regret.
 
@@ -101,7 +102,8 @@ def regret(
     The regret of a decision is J(t2) - J(t1) + V(q(t2), t2) - V(q(t1), t1), with the cost J so far and the optimal cost
     V from the state of the robot. V comes from a new search at each of the states: a local optimum that is only tracked
     gives false regret where another one becomes better. Where the search finds a worse local optimum than at the
-    following state, V is bounded by the driven path followed by that optimum, so that no regret is negative.
+    following state, V is bounded by the driven path followed by that optimum, so that no regret is negative. With
+    motors, V is that of the ideal robot at the same pose.
 
     Args:
         policy, bank, count, environment, seed: see `evaluate`.
@@ -122,7 +124,7 @@ def regret(
     if not decisions:
         return PolicyRegret(evaluation, level_regrets(evaluation))
     found = decisions_of(evaluation, bank, resolution=resolution, workers=workers, progress=progress)
-    return PolicyRegret(evaluation, np.array([one.regrets.sum() for one in found]), tuple(found))
+    return PolicyRegret(evaluation, level_regrets(evaluation), tuple(found))
 
 
 def decisions_of(
@@ -156,8 +158,7 @@ def level_regrets(evaluation: Evaluation) -> np.ndarray:
 def _level_regret(episode: Episode, settings: EnvironmentSettings) -> float:
     if episode.success:
         return max(0.0, episode.cost - episode.optimal_cost)
-    truncated = settings.free_horizon and not episode.collision  # without a penalty
-    penalty = settings.collision_penalty * episode.collision + settings.miss_penalty * (not truncated)
+    penalty = settings.collision_penalty * episode.collision + settings.miss_penalty * (not episode.truncated)
     return episode.cost + penalty - episode.reference_cost
 
 

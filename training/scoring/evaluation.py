@@ -16,12 +16,12 @@ import numpy as np
 from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import Reference, ScenarioBank
-from leapnav.envs.scenarios.families import FAMILIES
+from leapnav.envs.scenarios.families import check_family
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
-from leapnav.envs.utils.validation import check_choice, in_words
+from leapnav.envs.utils.validation import in_words
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.problem.problem import Trajectory
@@ -113,6 +113,7 @@ class Episode:
         states (K + 1, n): the states before and after each environment step.
         costs (K + 1,): the cost J so far at these states.
         lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
+        truncated: whether the time limit of a free horizon ended the episode, without a penalty for the missed goal.
 
     """
 
@@ -131,6 +132,7 @@ class Episode:
     states: np.ndarray
     costs: np.ndarray
     lower_bound: float = math.nan
+    truncated: bool = False
 
     @property
     def optimal_cost(self) -> float:
@@ -282,10 +284,9 @@ def evaluate(
             f"returns a policy, got {type(policy).__name__}"
         )
     if not isinstance(bank, ScenarioBank):
-        if not isinstance(bank, str) or bank not in FAMILIES:
-            if not isinstance(bank, str):
-                raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
-            check_choice("family", bank, FAMILIES)
+        if not isinstance(bank, str):
+            raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
+        check_family(bank)
         given = environment or {}
         robot = check_robot(given.get("robot") or "unicycle")
         bank = ScenarioBank.shipped(bank, "test", robot.model, given.get("horizon") or "fixed")
@@ -341,6 +342,7 @@ def _play_batch(
                 collision=bool(last["collision"][i]),
                 episode_return=float(returns[i]),
                 clearance=float(clearances[i]),
+                truncated=bool(truncated[i]),
             )
             on_episode()
     venv.close()

@@ -23,11 +23,11 @@ from matplotlib.ticker import EngFormatter
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, FAMILIES, check_family
+from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of, is_built_in
 from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
-from leapnav.training.config import RunConfig, read_config
+from leapnav.training.config import TEST_BANK, RunConfig, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
 from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions
 from leapnav.training.scoring.evaluation import Episode, Evaluation
@@ -96,7 +96,7 @@ def write_report(
         raise ValueError("runs: expected at least one, got none")
     specs = [load_policy_spec(os.fspath(run), environment=environment, trust=trust) for run in runs]
     records = [_read_run(spec) for spec in specs if (Path(spec.name) / "config.json").is_file()]
-    banks = included_banks(specs, _report_families(family, records))
+    banks = _banks(specs, _report_families(family, records), records)
     baselines = [load_policy_spec(name) for name in BASELINES if name not in {spec.name for spec in specs}]
     comparison = compare_policies([*specs, *baselines], banks, count=count, seed=seed, progress=progress)
     groups = group_by_row(specs)
@@ -109,13 +109,23 @@ def write_report(
     return comparison
 
 
+def _banks(specs: Sequence[PolicySpec], families: Sequence[str], records: Sequence[_RunRecord]) -> list[ScenarioBank]:
+    """Return the test banks of families: the included ones, or those of the runs for families of one's own."""
+    own = {record.config.family: Path(record.spec.name) / TEST_BANK for record in records}
+    found = {name: own[name] for name in families if not is_built_in(name) and name in own}
+    included = included_banks(specs, [name for name in families if name not in found])
+    return [*included, *map(ScenarioBank, found.values())]
+
+
 def _report_families(family: str | None, records: Sequence[_RunRecord]) -> list[str]:
     """Return the families of a report, in the order of `FAMILIES`."""
     if family is not None:
         check_family(family)
     chosen = {family or "clutter"} if family is not None or not records else set()
-    chosen |= set() if family is not None else {name for record in records for name in _families(record.config)}
-    return [name for name in FAMILIES if name in chosen or ALL in chosen]
+    if family is None:
+        chosen |= {record.config.family for record in records}
+    found = {name for one in chosen for name in families_of(one)}
+    return sorted(found, key=lambda name: (*FAMILIES, name).index(name))
 
 
 def _write_page(
@@ -175,11 +185,6 @@ def _title(records: Sequence[_RunRecord]) -> str:
     return "Training runs" if len(records) > 1 else f"Training run {records[0].spec.name}"
 
 
-def _families(config: RunConfig) -> tuple[str, ...]:
-    """Return the families that a run was trained for."""
-    return tuple(FAMILIES) if config.family == ALL else (config.family,)
-
-
 def _split_cell(text: str) -> tuple[str, str]:
     """Return the value of a cell and its interval, which may be empty."""
     value, _, interval = text.partition("\n")
@@ -227,7 +232,7 @@ def _draw_curve(axes: Axes, records: Sequence[_RunRecord], axis: str, measure: s
     """Draw the mean over the seeds, and their range."""
     curves = []
     for record in records:
-        families, lines = _families(record.config), record.evaluations
+        families, lines = families_of(record.config.family), record.evaluations
         values = [float(np.mean([line[family][measure] for family in families])) for line in lines]
         curves.append((np.array([line[axis] for line in lines], dtype=float), np.array(values)))
     if axis == "seconds":
