@@ -6,8 +6,9 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
 from leapnav.envs.scenarios.cost import Cost
-from leapnav.envs.scenarios.families import FAMILIES, sample_scenario
+from leapnav.envs.scenarios.families import FAMILIES, register_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
+from leapnav.envs.scenarios.layouts import ScenarioLayout
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import Disturbance, Motor
@@ -37,8 +38,10 @@ __all__ = [
     "Scenario",
     "ScenarioBank",
     "ScenarioError",
+    "ScenarioLayout",
     "Shape",
     "Unicycle",
+    "register_family",
     "sample_scenario",
 ]
 

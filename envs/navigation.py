@@ -76,7 +76,7 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     | `motion` (`"motor"` only) | 0, 1 | velocity in the robot's frame: ahead, to the left | m/s | -20 to 20 |
     | | 2 | turn rate | rad/s | -20 to 20 |
     | `lidar` (`"lidar"` and `"geodesic"`) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
-    | `detours` (`"geodesic"` only) | k | how much longer than the shortest path to the goal a path is that starts along beam k, for at least 0.25 m | m | 0 to 3 |
+    | `detours` (`"geodesic"` only) | k | how much longer than the shortest path to the goal a path is that starts along beam k, for 0.25 m or more, or as far as there is room | m | 0 to 3 |
     | `distance` (`"geodesic"` only) | 0 | geodesic distance: length of the shortest path among the obstacles to the goal position | m | 0 to 2000 |
     | `walls` (`"map"` only) | 0 to 3 | distances to the left, bottom, right and top wall of the arena | m | -1000 to 1000 |
     | | 4, 5 | cosine and sine of the heading | 1 | -1 to 1 |

@@ -205,7 +205,8 @@ def test_invalid_requests_are_refused(ask):
     assert ask("/search")[0] == 405
     families = "open, clutter, polygons, rooms, slalom"
     for query, error in {
-        "family=moon": f"family: expected one of {families} or all, got 'moon'",
+        "family=moon": f"family: expected one of {families}, got 'moon'",
+        "family=antigravity:fly": f"family: expected one of {families}, got 'antigravity:fly'",
         "family=open&index=x": "index: expected an integer, got 'x'",
         "family=open&index=200": "index: expected an integer from 0 to 199, got 200",
         "family=open&index=-1": "index: expected an integer from 0 to 199, got -1",

@@ -43,7 +43,7 @@ from typing import Any, overload
 import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import collection_name
+from leapnav.envs.scenarios.families import CustomFamily, collection_name, find_family
 from leapnav.envs.scenarios.scenario import HORIZON, Scenario
 from leapnav.envs.shapes.field import check_field
 from leapnav.envs.utils.validation import check_choice, is_integer
@@ -270,6 +270,10 @@ class ScenarioBank(Sequence[Scenario]):
             ValueError: there is no such bank.
 
         """
+        if isinstance(find_family(family), CustomFamily):
+            raise ValueError(
+                f"family: no bank of {family!r} is included; build one with leapnav bank build, and pass it as bank"
+            )
         check_choice("family", family, cls.shipped_families(robot, horizon))
         check_choice("split", split, SPLITS)
         return _shipped(collection_name(family, robot, horizon), split)

@@ -1,267 +1,288 @@
-"""Random scenarios by family.
+"""Random scenarios by family: the built-in families, and those of users.
 
-A family is a function from a random generator to a layout. Robot, cost, poses and horizon are common to all families.
+A family is a function of a random generator that returns a layout or a whole scenario. Robot, cost, poses and horizon
+are sampled in the same way for all layouts.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from importlib import import_module
+from typing import Any, cast
 
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
-from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Box, ScenarioLayout, rounded
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS
-from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.clearance import clearances, footprint_clearances
 from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.validation import check_choice, suggestion
 
-ARENA = (0.0, 0.0, 10.0, 10.0)
 REFERENCE_SPEED = 0.8  # m/s: the horizon is the length of the shortest path divided by this speed
-MAX_HORIZON = 40.0  # s
+MAX_HORIZON = 40.0  # s, in an arena of 10 m; in larger ones in proportion to the longer side
 TIME_WEIGHT = 0.5  # cost per second if the horizon is free
 # Duration of an optimum with a free horizon, relative to the shortest path at the cruise speed: the median of the
 # families is 1.07 to 1.15, because it also turns.
 RELATIVE_DURATION = 1.1
-MIN_DISTANCE = 4.0  # m between start and goal
+MIN_DISTANCE = 0.4  # between start and goal, as a fraction of the shorter side of the arena
 MIN_POSE_CLEARANCE = 0.25  # m at the start and the goal
 PASSAGE_MARGIN = 0.1  # m on either side of the robot, in the narrowest passage that a scenario may require
 GRID_SPACING = 0.25  # m, of the grid on which the shortest path is computed
-DECIMALS = 4  # of every sampled number, so that scenario files stay short
+MAX_DRAWS = 10_000  # of a layout and poses, until start and goal are connected
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
+Sample = Callable[[np.random.Generator], ScenarioLayout | Scenario]
 
-Box = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
-ANYWHERE: Box = (0.5, 0.5, 9.5, 9.5)
+FAMILIES: dict[str, Sample] = dict(LAYOUTS)
+_REGISTERED: dict[str, Sample] = {}
+ALL = "all"  # the family is sampled, too
+ALL_FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")  # those that "all" stands for
 
 
 @dataclass(frozen=True)
-class ScenarioLayout:
-    """The obstacles of a random scenario, and the regions in which start and goal are sampled."""
+class CustomFamily:
+    """A family that is not built in, as other processes need it: its name and its function."""
 
-    obstacles: list[Obstacle]
-    start: Box = ANYWHERE
-    goal: Box = ANYWHERE
-
-
-def _open(rng: np.random.Generator) -> ScenarioLayout:
-    """The walls of the arena only."""
-    return ScenarioLayout([])
+    name: str
+    sample: Sample
 
 
-def _clutter(rng: np.random.Generator) -> ScenarioLayout:
-    """6 to 12 discs with radii from 0.3 to 1 m, which may overlap."""
-    return ScenarioLayout(
-        [
-            Obstacle(circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=_rounded(rng.uniform(0.3, 1.0))))
-            for _ in range(rng.integers(6, 13))
-        ]
+def register_family(name: str, sample: Sample) -> None:
+    """Register a family of scenarios under a name, which is accepted wherever a built-in family is.
+
+    A function in a module need not be registered: its family is "module:function".
+
+    Args:
+        name: letters, digits and underscores.
+        sample: function of a `numpy.random.Generator`, the only source of randomness. It returns a `ScenarioLayout`,
+            for which poses and horizon are sampled, or a `Scenario`, which is not changed, except for its name.
+
+    Raises:
+        TypeError: `sample` is not a function.
+        ValueError: the name is not valid, or that of a built-in family or of another function.
+
+    """
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise ValueError(f"name: expected letters, digits and underscores, got {name!r}")
+    if name in (*FAMILIES, ALL):
+        raise ValueError(f"name: {name!r} is a built-in family")
+    if not callable(sample):
+        raise TypeError(f"sample: expected a function of a random generator, got {type(sample).__name__}")
+    known = _REGISTERED.get(name)
+    if known is not None and _origin(known) != _origin(sample):  # a notebook may define the function again
+        raise ValueError(f"name: {name!r} is the name of {'.'.join(_origin(known))}")
+    _REGISTERED[name] = sample
+
+
+def _origin(sample: Sample) -> tuple[str, str]:
+    return sample.__module__, getattr(sample, "__qualname__", type(sample).__qualname__)
+
+
+def find_family(name: object) -> str | CustomFamily:
+    """Return the name of a built-in family or "all", or the function of another family.
+
+    Raises:
+        ValueError: there is no such family.
+
+    """
+    if isinstance(name, str):
+        if name in FAMILIES or name == ALL:
+            return name
+        if name in _REGISTERED:
+            return CustomFamily(name, _REGISTERED[name])
+        if ":" in name:
+            return CustomFamily(name, _import(name))
+    known = (*FAMILIES, ALL, *_REGISTERED)
+    raise ValueError(
+        f"family: expected one of {', '.join((*FAMILIES, *_REGISTERED))}, {ALL} or module:function, got {name!r}"
+        f"{suggestion(name, known)}"
     )
 
 
-def _polygons(rng: np.random.Generator) -> ScenarioLayout:
-    """4 to 8 convex polygons, which may overlap: 3/4 are rotated rectangles, 1/4 convex hulls of random points."""
-    return ScenarioLayout([_hull(rng) if rng.random() < 0.25 else _box(rng) for _ in range(rng.integers(4, 9))])
-
-
-def _box(rng: np.random.Generator) -> Obstacle:
-    half = np.array([rng.uniform(0.2, 0.8), rng.uniform(0.2, 1.2)])
-    angle = rng.uniform(-math.pi, math.pi)
-    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-    return _polygon(rng.uniform(1.0, 9.0, 2) + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ turn)
-
-
-def _hull(rng: np.random.Generator) -> Obstacle:
-    centre, reach = rng.uniform(1.0, 9.0, 2), rng.uniform(0.5, 1.0)
-    # One point in each sector, so that the hull is never very thin.
-    angles = (np.arange(6) + rng.uniform(0.0, 1.0, 6)) * math.pi / 3
-    points = centre + reach * rng.uniform(0.5, 1.0, (6, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
-    points = points.round(DECIMALS)
-    # Imported here because only fresh scenarios need it: it takes a third of a second.
-    from scipy.spatial import ConvexHull
-
-    return _polygon(points[ConvexHull(points).vertices])
-
-
-def _rooms(rng: np.random.Generator) -> ScenarioLayout:
-    """Four rooms with a door in each of the four walls, all of the same width (1.0 to 1.6 m).
-
-    In 3/4 of the scenarios, one of the doors is closed.
-    """
-    width = rng.uniform(1.0, 1.6)
-    closed = rng.integers(4) if rng.random() < 0.75 else None
-    walls = []
-    for index, (axis, begin) in enumerate(((1, 0.0), (1, 5.0), (0, 0.0), (0, 5.0))):
-        door = rng.uniform(begin + 0.5, begin + 4.5 - width)
-        ends = [(begin, begin + 5.0)] if index == closed else [(begin, door), (door + width, begin + 5.0)]
-        for low, high in ends:
-            corners = (4.9, low, 5.1, high) if axis == 1 else (low, 4.9, high, 5.1)
-            walls.append(_rectangle(*corners))
-    return ScenarioLayout(walls)
-
-
-def _slalom(rng: np.random.Generator) -> ScenarioLayout:
-    """2 to 4 walls between start and goal, alternately from above and below, with passages of 1.4 to 3.5 m."""
-    count = int(rng.integers(2, 5))
-    above = bool(rng.integers(2))
-    walls = []
-    for number in range(count):
-        left = 10.0 * (number + 1) / (count + 1) - 0.15 + rng.uniform(-0.4, 0.4)
-        length = 10.0 - rng.uniform(1.4, 3.5)
-        low, high = (10.0 - length, 10.0) if above else (0.0, length)
-        walls.append(_rectangle(left, low, left + 0.3, high))
-        above = not above
-    return ScenarioLayout(walls, start=(0.6, 1.0, 1.2, 9.0), goal=(8.8, 1.0, 9.4, 9.0))
-
-
-FAMILIES: dict[str, Callable[[np.random.Generator], ScenarioLayout]] = {
-    "open": _open,
-    "clutter": _clutter,
-    "polygons": _polygons,
-    "rooms": _rooms,
-    "slalom": _slalom,
-}
-
-
-ALL = "all"  # selects all families: the family is sampled, too
+def _import(name: str) -> Sample:
+    """Return the function that is named as module:function."""
+    module, _, function = name.partition(":")
+    try:
+        sample = getattr(import_module(module), function)
+    except ImportError as error:
+        raise ValueError(f"family: {name!r}: cannot import the module {module!r}: {error}") from None
+    except AttributeError:
+        raise ValueError(f"family: the module {module!r} has no function {function!r}") from None
+    if not callable(sample):
+        raise ValueError(f"family: {name!r} is not a function, but a {type(sample).__name__}")
+    return cast(Sample, sample)
 
 
 def check_family(family: object) -> None:
     """Check that a family exists.
 
     Raises:
-        ValueError: it is neither one of `FAMILIES` nor "all".
+        ValueError: it is neither built in nor registered nor a function in a module nor "all".
 
     """
-    if not isinstance(family, str) or family not in (*FAMILIES, ALL):
-        hint = suggestion(family, (*FAMILIES, ALL))
-        raise ValueError(f"family: expected one of {', '.join(FAMILIES)} or {ALL}, got {family!r}{hint}")
+    find_family(family)
+
+
+def is_built_in(family: str) -> bool:
+    """Return whether a family is built in; only for these are there included banks."""
+    return family in FAMILIES
+
+
+def families_of(family: str) -> tuple[str, ...]:
+    """Return the families that a name stands for: several for "all"."""
+    return ALL_FAMILIES if family == ALL else (family,)
 
 
 def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
-    """Return the name of the scenarios of a family for a robot model and a kind of horizon, such as "car-clutter"."""
-    return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), family])
+    """Return the name of the scenarios of a family for a robot model and a kind of horizon, such as "car-clutter".
+
+    Other characters than letters, digits and underscores in the name of the family become underscores.
+    """
+    name = re.sub(r"[^A-Za-z0-9_]", "_", family)
+    return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), name])
 
 
 def sample_scenario(
-    family: str,
+    family: str | CustomFamily,
     seed: int | np.random.Generator,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     horizon: str = "fixed",
 ) -> Scenario:
     """Sample a random scenario; the same family and seed give the same scenario.
 
-    Start and goal are at least 4 m apart and connected by a path with a margin of 0.1 m on either side of the robot.
-    The horizon is the length of the shortest such path divided by 0.8 m/s, and at most 40 s; or it is free with the
-    time weight 0.5, and the time limit is 3 times an estimate of the duration of the optimum.
+    Start and goal are at least 4 m apart (0.4 times the shorter side of the arena) and connected by a path with a
+    margin of 0.1 m on either side of the robot. The horizon is the length of the shortest such path divided by 0.8 m/s,
+    and at most 40 s (4 s per metre of the longer side of the arena); or it is free with the time weight 0.5, and the
+    time limit is 3 times an estimate of the duration of the optimum. A scenario that a family of one's own returns is
+    not changed, except for its name.
 
     Args:
-        family: one of `FAMILIES`, or "all" to sample the family, too.
+        family: one of `FAMILIES`; "all" to sample one of the families of `ALL_FAMILIES`, too; a registered family; or
+            "module:function".
         seed: an integer, or a random generator.
         robot: name of a robot model, a dict of its fields with `model`, or a robot. Robots with the same footprint
             get the same obstacles and poses.
         horizon: "fixed" or "free"; both have the same obstacles and poses.
 
     Raises:
-        ValueError: an argument is invalid.
+        TypeError: the function of the family returns something else.
+        ValueError: an argument is invalid, a scenario of the family has another robot or kind of horizon, or none of
+            its layouts connects start and goal.
 
     """
-    check_family(family)
+    chosen = family if isinstance(family, CustomFamily) else find_family(family)
     check_choice("horizon", horizon, HORIZONS)
     body = check_robot(robot)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
-    if family == ALL:
-        family = list(FAMILIES)[rng.integers(len(FAMILIES))]
-    name = family if isinstance(seed, np.random.Generator) else f"{family}-{seed}"
+    if chosen == ALL:
+        chosen = ALL_FAMILIES[rng.integers(len(ALL_FAMILIES))]
+    custom = chosen if isinstance(chosen, CustomFamily) else CustomFamily(chosen, FAMILIES[chosen])
+    name = custom.name if isinstance(seed, np.random.Generator) else f"{custom.name}-{seed}"
+    for _ in range(MAX_DRAWS):  # rejection sampling: the draws are independent
+        layout = custom.sample(rng)
+        if isinstance(layout, Scenario):
+            return _checked(layout, custom.name, body, horizon).model_copy(update={"name": name})
+        if not isinstance(layout, ScenarioLayout):
+            raise TypeError(
+                f"family: {custom.name!r}: expected a ScenarioLayout or a Scenario, got {type(layout).__name__}"
+            )
+        found = _sample_task(layout, rng, body, horizon)
+        if found is not None:
+            return Scenario(name=name, arena=layout.arena, robot=body, obstacles=tuple(layout.obstacles), **found)
+    raise ValueError(f"family: {custom.name!r}: no layout connects start and goal in {MAX_DRAWS} draws")
+
+
+def _checked(scenario: Scenario, family: str, robot: RobotModel, horizon: str) -> Scenario:
+    """Return a scenario of a family if it has the robot and the kind of horizon."""
+    if scenario.robot != robot:
+        raise ValueError(f"robot: expected that of the scenarios of {family!r}, {scenario.robot!r}, got {robot!r}")
+    if scenario.horizon_kind != horizon:
+        kind = scenario.horizon_kind
+        raise ValueError(f"horizon: expected that of the scenarios of {family!r}, {kind!r}, got {horizon!r}")
+    return scenario
+
+
+def _sample_task(
+    layout: ScenarioLayout, rng: np.random.Generator, body: RobotModel, horizon: str
+) -> dict[str, Any] | None:
+    """Return random poses, the horizon and the cost; None if the poses are too close or not connected."""
     discs, cost = body.discs(), Cost() if horizon == "fixed" else Cost(time_weight=TIME_WEIGHT)
-    while True:  # rejection sampling: the draws are independent, so it ends
-        layout = FAMILIES[family](rng)
-        areas = np.array([layout.start, layout.goal])
-        field = pack_field(
-            [obstacle.shape for obstacle in layout.obstacles],
-            ARENA,
-            float(discs[:, 1].max()),
-            cost.proximity_weight,
-            cost.proximity_scale,
-        )
-        poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
-        if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE or (
-            footprint_clearances(poses, discs, field).min() < MIN_POSE_CLEARANCE
-        ):
-            continue
-        length = _shortest_path(field, poses[0, :2], poses[1, :2])
-        if length is not None:
-            break
-    start, goal = ((*_point(pose), _rounded(pose[2])) for pose in poses)
-    times: dict[str, float | None] = {"horizon": round(min(length / REFERENCE_SPEED, MAX_HORIZON), 1)}
+    areas = layout.regions
+    field = pack_field(
+        [obstacle.shape for obstacle in layout.obstacles],
+        layout.arena,
+        float(discs[:, 1].max()),
+        cost.proximity_weight,
+        cost.proximity_scale,
+    )
+    poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
+    x_min, y_min, x_max, y_max = layout.arena
+    sides = x_max - x_min, y_max - y_min
+    if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE * min(sides) or (
+        footprint_clearances(poses, discs, field).min() < MIN_POSE_CLEARANCE
+    ):
+        return None
+    length = _shortest_path(layout.arena, field, poses[0, :2], poses[1, :2])
+    if length is None:
+        return None
+    start, goal = (tuple(rounded(value) for value in pose) for pose in poses)
+    longest = MAX_HORIZON * max(1.0, max(sides) / (ARENA[2] - ARENA[0]))
+    times: dict[str, Any] = {"horizon": round(min(length / REFERENCE_SPEED, longest), 1)}
     if horizon == "free":
         limit = TIME_LIMIT_FACTOR * RELATIVE_DURATION * length / cruise_speed(body, cost)
         times = {"horizon": None, "time_limit": round(limit, 1)}
-    return Scenario(
-        name=name,
-        arena=ARENA,
-        robot=body,
-        start=start,
-        goal=goal,
-        **times,
-        obstacles=tuple(layout.obstacles),
-        cost=cost,
-    )
+    return {"start": start, "goal": goal, "cost": cost, **times}
 
 
-def _rounded(value: float) -> float:
-    return round(float(value), DECIMALS)
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Grid points (P, 2) of an arena, and the tails, heads, middles and lengths of the edges in 16 directions."""
+
+    points: np.ndarray
+    tails: np.ndarray
+    heads: np.ndarray
+    middles: np.ndarray
+    lengths: np.ndarray
 
 
-def _rectangle(x_min: float, y_min: float, x_max: float, y_max: float) -> Obstacle:
-    return _polygon(np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]))
-
-
-def _polygon(vertices: np.ndarray) -> Obstacle:
-    return Obstacle(polygon=Polygon(vertices=tuple(_point(vertex) for vertex in vertices)))
-
-
-def _point(values: np.ndarray) -> tuple[float, float]:
-    return _rounded(values[0]), _rounded(values[1])
-
-
-def _grid_edges() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points of the grid, and the heads, tails and lengths of its edges (16 directions)."""
-    steps = np.arange(ARENA[0] + GRID_SPACING, ARENA[2], GRID_SPACING)
-    n = len(steps)
-    points = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    index = np.arange(n * n).reshape(n, n)
-    heads, tails, lengths = [], [], []
+@lru_cache(maxsize=8)
+def _grid(arena: Box) -> _Grid:
+    x_min, y_min, x_max, y_max = arena
+    columns = np.arange(x_min + GRID_SPACING, x_max, GRID_SPACING)
+    rows = np.arange(y_min + GRID_SPACING, y_max, GRID_SPACING)
+    points = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
+    index = np.arange(len(points)).reshape(len(columns), len(rows))
+    tails, heads, lengths = [], [], []
     for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)):
-        low, high = max(0, -dy), n - max(0, dy)
-        a = index[: n - dx, low:high]
-        heads.append(a.ravel())
-        tails.append(index[dx:, low + dy : high + dy].ravel())
+        low, high = max(0, -dy), len(rows) - max(0, dy)
+        a = index[: len(columns) - dx, low:high]
+        tails.append(a.ravel())
+        heads.append(index[dx:, low + dy : high + dy].ravel())
         lengths.append(np.full(a.size, GRID_SPACING * math.hypot(dx, dy)))
-    return points, np.concatenate(heads), np.concatenate(tails), np.concatenate(lengths)
+    tail, head = np.concatenate(tails), np.concatenate(heads)
+    return _Grid(points, tail, head, (points[tail] + points[head]) / 2, np.concatenate(lengths))
 
 
-_POINTS, _HEADS, _TAILS, _LENGTHS = _grid_edges()
-_MIDDLES = (_POINTS[_HEADS] + _POINTS[_TAILS]) / 2
-
-
-def _shortest_path(field: np.ndarray, start: np.ndarray, goal: np.ndarray) -> float | None:
+def _shortest_path(arena: Box, field: np.ndarray, start: np.ndarray, goal: np.ndarray) -> float | None:
     """Return the length (m) of the shortest path on the grid, with the passage margin; None if there is no path."""
-    free = clearances(_POINTS, field) > PASSAGE_MARGIN
-    ends = [int(np.argmin(np.where(free, np.sum((_POINTS - p) ** 2, axis=1), np.inf))) for p in (start, goal)]
-    usable = free[_HEADS] & free[_TAILS]
-    usable[usable] = clearances(_MIDDLES[usable], field) > PASSAGE_MARGIN
-    size = len(_POINTS)
+    grid = _grid(arena)
+    free = clearances(grid.points, field) > PASSAGE_MARGIN
+    ends = [int(np.argmin(np.where(free, np.sum((grid.points - p) ** 2, axis=1), np.inf))) for p in (start, goal)]
+    usable = free[grid.tails] & free[grid.heads]
+    usable[usable] = clearances(grid.middles[usable], field) > PASSAGE_MARGIN
+    size = len(grid.points)
     # Imported here because only fresh scenarios need it.
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
-    graph = csr_array((_LENGTHS[usable], (_HEADS[usable], _TAILS[usable])), shape=(size, size))
+    graph = csr_array((grid.lengths[usable], (grid.tails[usable], grid.heads[usable])), shape=(size, size))
     length = float(dijkstra(graph, directed=False, indices=ends[0])[ends[1]])
     if not math.isfinite(length):
         return None

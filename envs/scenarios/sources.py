@@ -11,7 +11,7 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, check_family, sample_scenario
+from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import HORIZONS
@@ -61,7 +61,8 @@ class ScenarioSource:
     Attributes:
         robot, horizon: the robot and the kind of horizon of new scenarios; those of the bank or of the fixed scenario
             if one is given.
-        family: name of the family; that of the bank if a bank is given.
+        family: name of the family; that of the bank if a bank is given. A family that is not built in has fresh
+            scenarios only.
         scenario: the fixed scenario, or None.
         bank: the scenario bank, or None.
 
@@ -72,6 +73,8 @@ class ScenarioSource:
 
     """
 
+    _custom: CustomFamily | None = None  # also of sources in checkpoints of earlier versions
+
     def __init__(
         self,
         family: str | None = None,
@@ -81,18 +84,21 @@ class ScenarioSource:
         robot: RobotModel | Mapping[str, Any] | str | None = None,
         horizon: str | None = None,
     ) -> None:
-        if family is not None:
-            check_family(family)
+        known_family = find_family(DEFAULT_FAMILY if family is None else family)
         arguments = (("scenario", scenario), ("bank", bank), ("split", split), ("family", family))
         given = [name for name, value in arguments if value is not None]
         if len(given) > 1 and given[0] in ("scenario", "bank"):
             raise ValueError(f"{given[1]}: cannot be combined with {given[0]}; pass one of the two")
-        family = family or DEFAULT_FAMILY
         if split is not None:
             check_choice("split", split, SPLITS)
         if family == ALL and split not in (None, "fresh"):
             raise ValueError(f"split: all families together have 'fresh' scenarios only, got {split!r}")
-        self.family = family
+        if isinstance(known_family, CustomFamily) and split not in (None, "fresh"):
+            raise ValueError(
+                f"split: the family {family!r} has 'fresh' scenarios only, got {split!r}; build a bank and pass bank="
+            )
+        self.family = family = family or DEFAULT_FAMILY
+        self._custom = known_family if isinstance(known_family, CustomFamily) else None
         self.scenario = None if scenario is None else as_scenario(scenario)
         self.bank: ScenarioBank | None = None
         if bank is not None:
@@ -105,7 +111,7 @@ class ScenarioSource:
         chosen = Unicycle() if robot is None else check_robot(robot)
         if horizon is not None:
             check_choice("horizon", horizon, HORIZONS)
-        if self.bank is None and scenario is None and split != "fresh" and family != ALL:
+        if self.bank is None and scenario is None and split != "fresh" and family != ALL and self._custom is None:
             self.bank = _shipped_bank(family, split, chosen, horizon or "fixed")
         given_by = (
             self.scenario.robot if self.scenario is not None else self.bank.robot if self.bank is not None else None
@@ -146,7 +152,9 @@ class ScenarioSource:
         """Sample the scenario of an episode, or its index in the bank."""
         if self.bank is not None:
             return int(rng.integers(len(self.bank)))
-        return sample_scenario(self.family, rng, self.robot, self.horizon) if self.scenario is None else self.scenario
+        if self.scenario is not None:
+            return self.scenario
+        return sample_scenario(self._custom or self.family, rng, self.robot, self.horizon)
 
 
 def _shipped_bank(family: str, split: str | None, robot: RobotModel, horizon: str) -> ScenarioBank | None:

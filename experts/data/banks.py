@@ -18,7 +18,7 @@ import leapnav
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
-from leapnav.envs.scenarios.families import FAMILIES, collection_name, sample_scenario
+from leapnav.envs.scenarios.families import ALL, CustomFamily, collection_name, find_family, sample_scenario
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, check_robot
 from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.progress import advance, progress_bar
@@ -84,7 +84,9 @@ def build_bank(
         OSError: `out` cannot be written.
 
     """
-    check_choice("family", family, FAMILIES)
+    if family == ALL:
+        raise ValueError(f"family: expected one family, got {family!r}")
+    chosen = find_family(family)
     body = check_robot(robot)
     check_choice("horizon", horizon, HORIZONS)
     check_at_least("count", count, 1)
@@ -104,7 +106,7 @@ def build_bank(
         settings["horizon"] = horizon
     pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="4 * n_jobs")
     with ResumableStore(_build_directory(target), "bank", settings, BankError) as store:
-        compute = partial(draw, family=family, seed=seed, robot=body, horizon=horizon)
+        compute = partial(draw, family=chosen, seed=seed, robot=body, horizon=horizon)
         reasons = _solve(store, pool, compute, count, progress)
         entries = [_entry(number, store.read(number)) for number, reason in reasons.items() if not reason]
         write_bank(
@@ -120,7 +122,9 @@ def build_bank(
     return ScenarioBank(target)
 
 
-def draw(number: int, family: str, seed: int, robot: RobotModel | None = None, horizon: str = "fixed") -> Arrays:
+def draw(
+    number: int, family: str | CustomFamily, seed: int, robot: RobotModel | None = None, horizon: str = "fixed"
+) -> Arrays:
     """One random scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
 
     Args:
@@ -133,7 +137,7 @@ def draw(number: int, family: str, seed: int, robot: RobotModel | None = None, h
     """
     body = robot or Unicycle()
     scenario = sample_scenario(family, np.random.default_rng([seed, number]), body, horizon)
-    name = collection_name(family, body.model, horizon)
+    name = collection_name(family if isinstance(family, str) else family.name, body.model, horizon)
     scenario = scenario.model_copy(update={"name": f"{name}-{seed}-{number}"})
     optimum = find_optimum(scenario)
     rejection = judge(optimum)

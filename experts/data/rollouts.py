@@ -20,7 +20,7 @@ import leapnav
 from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import check_family, sample_scenario
+from leapnav.envs.scenarios.families import CustomFamily, find_family, sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.files import write_text
@@ -125,7 +125,7 @@ def rollout(
         ModuleNotFoundError: `dask` is given without the extra `cluster`.
 
     """
-    check_family(family)
+    chosen = find_family(family)
     check_choice("horizon", horizon, HORIZONS)
     check_at_least("count", count, 1)
     check_at_least("recoveries", recoveries, 0)
@@ -153,7 +153,7 @@ def rollout(
     # The settings of the store exclude `count`: a longer rollout continues a shorter one.
     with ResumableStore(directory / WORK, "rollout", settings) as store:
         compute = partial(
-            _shard, family=family, seed=seed, recoveries=recoveries, noise=float(noise), robot=body, horizon=horizon
+            _shard, family=chosen, seed=seed, recoveries=recoveries, noise=float(noise), robot=body, horizon=horizon
         )
         with _backend(workers, dask) as pool:
             n_shards = _solve(store, pool, compute, family, count, progress)
@@ -332,7 +332,7 @@ def _shard(number: int, seed: int, **arguments: Any) -> Arrays:
 
 
 def _demonstrations(
-    family: str, seed: int, recoveries: int, noise: float, robot: RobotModel, horizon: str
+    family: str | CustomFamily, seed: int, recoveries: int, noise: float, robot: RobotModel, horizon: str
 ) -> list[Demonstration]:
     """The demonstrations of one scenario, its optimum first; empty without a certified optimum."""
     scenario = sample_scenario(family, seed, robot, horizon)
@@ -346,7 +346,7 @@ def _demonstrations(
         recovered = recovery(scenario, optimum, rng, f"{scenario.name}-recovery-{number}")
         if recovered is not None:
             episodes.append(recovered)
-    env = NavigateEnv(family, split="fresh", robot=robot, horizon=horizon)
+    env = NavigateEnv(scenario=scenario)
     noise_rng = np.random.default_rng([seed, 2])
     found = []
     for episode in episodes:

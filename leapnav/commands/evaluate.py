@@ -107,10 +107,10 @@ class Evaluate:
 
     def _banks(self, specs: Sequence[PolicySpec]) -> list[ScenarioBank]:
         from leapnav.envs.scenarios.bank import ScenarioBank
-        from leapnav.envs.scenarios.families import ALL, FAMILIES
+        from leapnav.envs.scenarios.families import check_family, families_of
         from leapnav.training.scoring.comparison import included_banks
 
         if self.bank is not None:
             return [ScenarioBank(self.bank)]
-        families = tuple(FAMILIES) if self.family == ALL else (self.family,)
-        return included_banks(specs, families, self.split, self.robot, self.horizon)
+        check_family(self.family)
+        return included_banks(specs, families_of(self.family), self.split, self.robot, self.horizon)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import check_family
+from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.utils.validation import check_choice, check_integer
@@ -152,7 +152,7 @@ def bank_scenario(family: str, index: int) -> Scenario:
         ValueError: the family is unknown, or the index is out of range.
 
     """
-    check_family(family)
+    check_choice("family", family, FAMILIES)  # a request must not import a module
     bank = ScenarioBank.shipped(family, "test")
     return bank[check_integer("index", index, 0, len(bank) - 1)]
 

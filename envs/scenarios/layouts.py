@@ -1,0 +1,138 @@
+"""Layouts of the built-in families: random obstacles, and the regions of start and goal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.shapes import Circle, Polygon
+
+ARENA = (0.0, 0.0, 10.0, 10.0)
+POSE_MARGIN = 0.5  # m between the walls and the regions of start and goal
+DECIMALS = 4  # of every sampled number, so that scenario files stay short
+
+Box = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
+
+
+@dataclass(frozen=True)
+class ScenarioLayout:
+    """The obstacles of a random scenario, and the regions in which start and goal are sampled.
+
+    Attributes:
+        obstacles: the obstacles.
+        start, goal: x_min, y_min, x_max, y_max (m) of the regions; None: the arena without a margin of 0.5 m.
+        arena: x_min, y_min, x_max, y_max (m) of the walls.
+
+    """
+
+    obstacles: Sequence[Obstacle]
+    start: Box | None = None
+    goal: Box | None = None
+    arena: Box = ARENA
+
+    @property
+    def regions(self) -> np.ndarray:
+        """The regions of start and goal (2, 4)."""
+        x_min, y_min, x_max, y_max = self.arena
+        inside = (x_min + POSE_MARGIN, y_min + POSE_MARGIN, x_max - POSE_MARGIN, y_max - POSE_MARGIN)
+        return np.array([self.start or inside, self.goal or inside])
+
+
+def _open(rng: np.random.Generator) -> ScenarioLayout:
+    """The walls of the arena only."""
+    return ScenarioLayout([])
+
+
+def _clutter(rng: np.random.Generator) -> ScenarioLayout:
+    """6 to 12 discs with radii from 0.3 to 1 m, which may overlap."""
+    return ScenarioLayout(
+        [
+            Obstacle(circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=rounded(rng.uniform(0.3, 1.0))))
+            for _ in range(rng.integers(6, 13))
+        ]
+    )
+
+
+def _polygons(rng: np.random.Generator) -> ScenarioLayout:
+    """4 to 8 convex polygons, which may overlap: 3/4 are rotated rectangles, 1/4 convex hulls of random points."""
+    return ScenarioLayout([_hull(rng) if rng.random() < 0.25 else _box(rng) for _ in range(rng.integers(4, 9))])
+
+
+def _box(rng: np.random.Generator) -> Obstacle:
+    half = np.array([rng.uniform(0.2, 0.8), rng.uniform(0.2, 1.2)])
+    angle = rng.uniform(-math.pi, math.pi)
+    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return _polygon(rng.uniform(1.0, 9.0, 2) + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ turn)
+
+
+def _hull(rng: np.random.Generator) -> Obstacle:
+    centre, reach = rng.uniform(1.0, 9.0, 2), rng.uniform(0.5, 1.0)
+    # One point in each sector, so that the hull is never very thin.
+    angles = (np.arange(6) + rng.uniform(0.0, 1.0, 6)) * math.pi / 3
+    points = centre + reach * rng.uniform(0.5, 1.0, (6, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    points = points.round(DECIMALS)
+    # Imported here because only fresh scenarios need it: it takes a third of a second.
+    from scipy.spatial import ConvexHull
+
+    return _polygon(points[ConvexHull(points).vertices])
+
+
+def _rooms(rng: np.random.Generator) -> ScenarioLayout:
+    """Four rooms with a door in each of the four walls, all of the same width (1.0 to 1.6 m).
+
+    In 3/4 of the scenarios, one of the doors is closed.
+    """
+    width = rng.uniform(1.0, 1.6)
+    closed = rng.integers(4) if rng.random() < 0.75 else None
+    walls = []
+    for index, (axis, begin) in enumerate(((1, 0.0), (1, 5.0), (0, 0.0), (0, 5.0))):
+        door = rng.uniform(begin + 0.5, begin + 4.5 - width)
+        ends = [(begin, begin + 5.0)] if index == closed else [(begin, door), (door + width, begin + 5.0)]
+        for low, high in ends:
+            corners = (4.9, low, 5.1, high) if axis == 1 else (low, 4.9, high, 5.1)
+            walls.append(_rectangle(*corners))
+    return ScenarioLayout(walls)
+
+
+def _slalom(rng: np.random.Generator) -> ScenarioLayout:
+    """2 to 4 walls between start and goal, alternately from above and below, with passages of 1.4 to 3.5 m."""
+    count = int(rng.integers(2, 5))
+    above = bool(rng.integers(2))
+    walls = []
+    for number in range(count):
+        left = 10.0 * (number + 1) / (count + 1) - 0.15 + rng.uniform(-0.4, 0.4)
+        length = 10.0 - rng.uniform(1.4, 3.5)
+        low, high = (10.0 - length, 10.0) if above else (0.0, length)
+        walls.append(_rectangle(left, low, left + 0.3, high))
+        above = not above
+    return ScenarioLayout(walls, start=(0.6, 1.0, 1.2, 9.0), goal=(8.8, 1.0, 9.4, 9.0))
+
+
+def rounded(value: float) -> float:
+    """Round a sampled number to `DECIMALS`."""
+    return round(float(value), DECIMALS)
+
+
+def _rectangle(x_min: float, y_min: float, x_max: float, y_max: float) -> Obstacle:
+    return _polygon(np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]))
+
+
+def _polygon(vertices: np.ndarray) -> Obstacle:
+    return Obstacle(polygon=Polygon(vertices=tuple(_point(vertex) for vertex in vertices)))
+
+
+def _point(values: np.ndarray) -> tuple[float, float]:
+    return rounded(values[0]), rounded(values[1])
+
+
+LAYOUTS: dict[str, Callable[[np.random.Generator], ScenarioLayout]] = {
+    "open": _open,
+    "clutter": _clutter,
+    "polygons": _polygons,
+    "rooms": _rooms,
+    "slalom": _slalom,
+}
