@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from dataclasses import fields
 from enum import Enum
@@ -18,8 +17,9 @@ from leapnav.envs.checks import check_actions, check_options, check_render_mode
 from leapnav.envs.goals import GoalConditioned
 from leapnav.envs.navigation import make_noise_generator
 from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.levels import LevelOutcome, LevelSampler, check_sampler, draw_level
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.scenarios.sources import LevelOutcome, LevelSampler, ScenarioSource, get_scenario
+from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
@@ -89,7 +89,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError("sampler: expected an environment with a bank, got one of fresh or fixed scenarios")
         self._sampler = sampler
         if sampler is not None:
-            _check_sampler(sampler, self._source.bank)
+            check_sampler(sampler, self._source.bank)
         self.settings = EnvironmentSettings(
             robot=self._source.robot.model,
             horizon=self._source.horizon,
@@ -206,12 +206,8 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def _draw(self, generator: np.random.Generator) -> Scenario | int:
         """Return a random scenario, or the index of one in the bank."""
-        if self._sampler is None:
-            return self._source.draw(generator)
-        index, count = operator.index(self._sampler.draw(generator)), len(self.bank or ())
-        if not 0 <= index < count:
-            raise IndexError(f"sampler: expected an index of the {count} scenarios of the bank, got {index}")
-        return index
+        sampler = self._sampler
+        return self._source.draw(generator) if sampler is None else draw_level(sampler, generator, len(self.bank or ()))
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold each robot's action for one control period.
@@ -427,26 +423,7 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
 
 
 # Arguments that are passed on to the settings.
-SETTING_NAMES = frozenset(field.name for field in fields(EnvironmentSettings)) - {
-    "goal_conditioned",
-    "robot",
-    "horizon",
-}
-
-
-def _check_sampler(sampler: Any, bank: ScenarioBank | None) -> None:
-    """Check that a level sampler has the methods, and is one for a bank.
-
-    Raises:
-        TypeError: a method is missing.
-        ValueError: the sampler is one for another bank.
-
-    """
-    if not all(callable(getattr(sampler, name, None)) for name in ("draw", "record")):
-        raise TypeError(f"sampler: expected an object with the methods draw and record, got {sampler!r}")
-    own = getattr(sampler, "bank", None)
-    if isinstance(own, ScenarioBank) and bank is not None and (own.path, len(own)) != (bank.path, len(bank)):
-        raise ValueError(f"sampler: expected one for the bank {bank.path}, got one for {own.path}")
+SETTING_NAMES = {field.name for field in fields(EnvironmentSettings)} - {"goal_conditioned", "robot", "horizon"}
 
 
 def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

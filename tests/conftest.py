@@ -8,6 +8,7 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from leapnav.envs.robots.base import MODELS
+from leapnav.envs.scenarios.families import REGISTERED
 from leapnav.envs.shapes.base import KINDS
 
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
@@ -81,8 +82,8 @@ def env():
 
 @pytest.fixture(autouse=True)
 def _registered():
-    """Forget the robot models and obstacle shapes that a test registers."""
-    registries = MODELS, KINDS
+    """Forget the robot models, obstacle shapes and families that a test registers."""
+    registries = MODELS, KINDS, REGISTERED
     before = [dict(registry) for registry in registries]
     yield
     for registry, content in zip(registries, before, strict=True):

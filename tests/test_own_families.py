@@ -11,7 +11,6 @@ from helpers import SMALL
 
 from leapnav.cli import main
 from leapnav.envs import Circle, NavigateEnv, Obstacle, Scenario, ScenarioBank, ScenarioLayout, register_family
-from leapnav.envs.scenarios import families
 from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.experts import build_bank, load_demonstrations, rollout
 from leapnav.training import PPOConfig, evaluate, train_ppo
@@ -26,12 +25,6 @@ def pillar(rng):
 
 answer = 42
 """
-
-
-@pytest.fixture(autouse=True)
-def registry(monkeypatch):
-    """A registry that forgets what a test registers."""
-    monkeypatch.setattr(families, "_REGISTERED", {})
 
 
 @pytest.fixture

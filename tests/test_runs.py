@@ -6,16 +6,12 @@ import sys
 import time
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.unwrapping import unwrap
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training import config as configuration
 from leapnav.training import load_policy, make_policy, shipped_policies
@@ -25,7 +21,6 @@ from leapnav.training.config import (
     CloningConfig,
     DAggerConfig,
     DAggerRunConfig,
-    LevelsName,
     PPOConfig,
     SACConfig,
     WarmStartConfig,
@@ -33,7 +28,6 @@ from leapnav.training.config import (
 )
 from leapnav.training.policies.actors import actor_parameters, copy_actor
 from leapnav.training.policies.files import read_description
-from leapnav.training.robots.level_samplers import SCORES, UniformSampler
 from leapnav.training.robots.rewards import GradedMiss
 from leapnav.training.robots.vec_env import environment_seed
 from leapnav.training.runs.imitation import train_bc, train_dagger
@@ -357,69 +351,6 @@ def test_ppos_robots_have_the_settings_of_the_run(tmp_path):
     assert make_training_env(sac(tmp_path)).get_attr("settings")[0].control_period == 0.05
 
 
-def test_a_run_learns_from_the_levels_that_a_sampler_chooses(tmp_path):
-    levels, names = LevelsOfEpisodes(), get_args(LevelsName)
-    assert names == ("fresh", "uniform", *SCORES)
-    train_ppo(ppo(tmp_path / "run", levels="positive_value_loss"), callback=levels, progress=False)
-    bank = ScenarioBank.shipped("open", "train")
-    assert levels.sampler.score == "positive_value_loss" and len(levels.sampler.scores) == len(bank)
-    assert (~np.isnan(levels.sampler.scores)).sum() >= 4 and levels.indices <= set(range(len(bank)))
-    robots = unwrap(make_training_env(ppo(tmp_path, levels="uniform", level_bank=bank.path)))[0]
-    assert robots.bank.path == bank.path and type(robots.sampler) is UniformSampler
-
-
-class CountingSteps(VecEnvWrapper):
-    """Counts the steps of the robots."""
-
-    steps = 0
-
-    def reset(self):
-        return self.venv.reset()
-
-    def step_wait(self):
-        self.steps += self.num_envs
-        return self.venv.step_wait()
-
-    def state_dict(self):
-        return {"steps": self.steps}
-
-    def load_state_dict(self, state):
-        self.steps = state["steps"]
-
-
-class CountingMore(CountingSteps):
-    """Inherits its state."""
-
-
-def test_a_wrapper_of_the_training_environment_is_part_of_the_run(tmp_path):
-    made = []
-
-    def wrapper(venv):
-        made.append(CountingMore(venv))
-        return made[-1]
-
-    config = ppo(tmp_path / "run")
-    train_ppo(config, wrapper=wrapper, progress=False)
-    train_ppo(replace(config, resume=True), wrapper=wrapper, progress=False)  # the run is finished
-    assert [counter.steps for counter in made] == [config.total_timesteps] * 2
-    with pytest.raises(ValueError, match="wrapper: the run has 2 wrappers with a state, got NavigateVecEnv"):
-        train_ppo(replace(config, resume=True), progress=False)
-    with pytest.raises(TypeError, match="wrapper: expected a function that returns a VecEnv, got NoneType"):
-        train_ppo(ppo(tmp_path / "other"), wrapper=lambda venv: None, progress=False)
-    assert not (tmp_path / "other").exists()
-
-
-def test_a_bank_of_levels_has_the_robot_and_the_horizon_of_the_run(tmp_path):
-    for arguments, message in (
-        ({"horizon": "free"}, "level_bank: horizon: expected 'fixed', got 'free'"),
-        ({"family": "clutter", "robot": "car"}, "level_bank: robot: expected 'unicycle', got 'car'"),
-    ):
-        bank = ScenarioBank.shipped(**{"family": "open", "split": "train", **arguments})
-        with pytest.raises(ValueError, match=message):
-            train_ppo(ppo(tmp_path / "run", levels="uniform", level_bank=bank.path), progress=False)
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_run_that_starts_from_a_policy_has_its_observation():
     for start in ("clutter", Path("clutter"), (Path("clutter"),)):
         config = PPOConfig.tuned("clutter", warm_start=start)
@@ -436,17 +367,6 @@ def test_dagger_with_another_memory_than_its_first_learner_is_refused(demos, tmp
     with pytest.raises(ValueError, match="policy: expected the memory 'stack', got 'none'"):
         train_dagger(config, progress=False)
     assert not (tmp_path / "run").exists()
-
-
-class LevelsOfEpisodes(BaseCallback):
-    """Collects the levels that are played."""
-
-    def _on_training_start(self):
-        self.indices, self.sampler = set(), unwrap(self.training_env)[0].sampler
-
-    def _on_step(self):
-        self.indices |= set(unwrap(self.training_env)[0].indices)
-        return True
 
 
 def test_demonstrations_have_one_reward_only(demos, tmp_path):

@@ -41,7 +41,7 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 Sample = Callable[[np.random.Generator], ScenarioLayout | Scenario]
 
 FAMILIES: dict[str, Sample] = dict(LAYOUTS)
-_REGISTERED: dict[str, Sample] = {}
+REGISTERED: dict[str, Sample] = {}
 ALL = "all"  # the family is sampled, too
 ALL_FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")  # those that "all" stands for
 
@@ -75,10 +75,10 @@ def register_family(name: str, sample: Sample) -> None:
         raise ValueError(f"name: {name!r} is a built-in family")
     if not callable(sample):
         raise TypeError(f"sample: expected a function of a random generator, got {type(sample).__name__}")
-    known = _REGISTERED.get(name)
+    known = REGISTERED.get(name)
     if known is not None and _origin(known) != _origin(sample):  # a notebook may define the function again
         raise ValueError(f"name: {name!r} is the name of {'.'.join(_origin(known))}")
-    _REGISTERED[name] = sample
+    REGISTERED[name] = sample
 
 
 def _origin(sample: Sample) -> tuple[str, str]:
@@ -95,13 +95,13 @@ def find_family(name: object) -> str | CustomFamily:
     if isinstance(name, str):
         if name in FAMILIES or name == ALL:
             return name
-        if name in _REGISTERED:
-            return CustomFamily(name, _REGISTERED[name])
+        if name in REGISTERED:
+            return CustomFamily(name, REGISTERED[name])
         if ":" in name:
             return CustomFamily(name, _import(name))
-    known = (*FAMILIES, ALL, *_REGISTERED)
+    known = (*FAMILIES, ALL, *REGISTERED)
     raise ValueError(
-        f"family: expected one of {', '.join((*FAMILIES, *_REGISTERED))}, {ALL} or module:function, got {name!r}"
+        f"family: expected one of {', '.join((*FAMILIES, *REGISTERED))}, {ALL} or module:function, got {name!r}"
         f"{suggestion(name, known)}"
     )
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,37 +18,6 @@ from leapnav.envs.utils.validation import check_choice, is_integer
 
 SPLITS = ("train", "test", "fresh")
 DEFAULT_FAMILY = "clutter"
-
-
-@dataclass(frozen=True)
-class LevelOutcome:
-    """The end of an episode in a scenario of a bank.
-
-    Attributes:
-        index: index of the scenario in the bank.
-        success, collision: outcome.
-        episode_return: minus the cost J and the penalties of the episode, without a shaped reward.
-        regret: the return of the optimum, -J*, minus that of the episode.
-
-    """
-
-    index: int
-    success: bool
-    collision: bool
-    episode_return: float
-    regret: float
-
-
-class LevelSampler(Protocol):
-    """Chooses the scenarios of a vector environment's episodes, see `leapnav.training.RegretSampler`."""
-
-    def draw(self, rng: np.random.Generator) -> int:
-        """Return the index in the bank of the scenario of the next episode."""
-        ...
-
-    def record(self, outcome: LevelOutcome) -> None:
-        """Store the outcome of an episode."""
-        ...
 
 
 class ScenarioSource:
