@@ -17,9 +17,15 @@ from leapnav.envs.checks import check_actions, check_options, check_render_mode
 from leapnav.envs.goals import GoalConditioned
 from leapnav.envs.navigation import make_noise_generator
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.levels import LevelOutcome, LevelSampler, check_sampler, draw_level
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
+from leapnav.envs.scenarios.sources import (
+    LevelOutcome,
+    LevelSampler,
+    ScenarioSource,
+    check_sampler,
+    draw_level,
+    get_scenario,
+)
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
@@ -194,7 +200,7 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             generator = self._generators[i]
             assert generator is not None  # seeded at the first reset
             choice = None if selected is None else selected[k]
-            choices.append(self._draw(generator) if choice is None else choice)
+            choices.append(draw_level(self._source, self._sampler, generator) if choice is None else choice)
         noise = [self._noise_generators[i] for i in indices] if self.settings.disturbed else []
         self._simulator.reset(robots, choices, self.bank, noise)
         for i, choice in zip(indices, choices, strict=True):
@@ -203,11 +209,6 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if self.render_mode is not None:
             for i in indices:
                 self._trails[i] = [tuple(self._simulator.poses[i].tolist())]
-
-    def _draw(self, generator: np.random.Generator) -> Scenario | int:
-        """Return a random scenario, or the index of one in the bank."""
-        sampler = self._sampler
-        return self._source.draw(generator) if sampler is None else draw_level(sampler, generator, len(self.bank or ()))
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold each robot's action for one control period.

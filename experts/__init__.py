@@ -22,7 +22,7 @@ from leapnav.experts.solve import solve
 if TYPE_CHECKING:
     from leapnav.experts.bounds.plotting import plot_tube
     from leapnav.experts.data.bank_bounds import prove_bank
-    from leapnav.experts.data.banks import build_bank
+    from leapnav.experts.data.banks import build_bank, build_bank_of
     from leapnav.experts.data.demonstrations import load_demonstrations
     from leapnav.experts.data.rollouts import check_dataset, rollout
     from leapnav.experts.plotting import plot_extremal
@@ -44,6 +44,7 @@ __all__ = [
     "Status",
     "Trajectory",
     "build_bank",
+    "build_bank_of",
     "certify",
     "check_dataset",
     "check_proof",
@@ -68,6 +69,7 @@ __all__ = [
 # Names whose modules import Minari, joblib or Matplotlib, which take up to a second; they are loaded at first use.
 _LAZY = {
     "build_bank": "leapnav.experts.data.banks",
+    "build_bank_of": "leapnav.experts.data.banks",
     "check_dataset": "leapnav.experts.data.rollouts",
     "load_demonstrations": "leapnav.experts.data.demonstrations",
     "plot_extremal": "leapnav.experts.plotting",

@@ -10,13 +10,14 @@ from itertools import islice
 from typing import cast
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import delayed
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import find_optimum
+from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
@@ -116,34 +117,36 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     return Opinion(scenario.name, cost, best, source, tried, len(search.doubts(best)))
 
 
-def verify_bank(bank: ScenarioBank, workers: int = 1, progress: bool = True) -> list[Opinion]:
+def verify_bank(
+    bank: ScenarioBank, workers: int = 1, progress: bool = True, *, dask: str | None = None
+) -> list[Opinion]:
     """Search all scenarios of a bank again, see `second_opinion`.
 
     Args:
         bank: the bank.
         workers: number of processes.
         progress: show a progress bar.
+        dask: address of a Dask scheduler whose workers are used instead, see `process_pool`.
 
     Returns:
         The results in the order of the bank.
 
     Raises:
         ValueError: workers < 1.
+        ModuleNotFoundError, OSError: see `process_pool`.
 
     """
     check_at_least("workers", workers, 1)
-    pool = Parallel(n_jobs=workers, return_as="generator", pre_dispatch="4 * n_jobs")
-    results = pool(delayed(_opinion)(bank, index) for index in range(len(bank)))
     opinions: list[Opinion] = []
-    with progress_bar(total=len(bank), label=f"Verifying {bank.path.stem}", unit="scenarios", show=progress) as bar:
-        for opinion in cast(Iterator[Opinion], results):
+    with (
+        process_pool(workers, dask, return_as="generator") as pool,
+        progress_bar(total=len(bank), label=f"Verifying {bank.path.stem}", unit="scenarios", show=progress) as bar,
+    ):
+        tasks = (delayed(second_opinion)(bank[i], float(bank.costs[i]), seed=i) for i in range(len(bank)))
+        for opinion in cast(Iterator[Opinion], pool(tasks)):
             opinions.append(opinion)
             bar.update()
     return opinions
-
-
-def _opinion(bank: ScenarioBank, index: int) -> Opinion:
-    return second_opinion(bank[index], float(bank.costs[index]), seed=index)
 
 
 def _steered(track: Trajectory, rng: np.random.Generator) -> Trajectory:

@@ -16,8 +16,7 @@ from pathlib import Path
 import h5py
 
 from leapnav.envs import FAMILIES, ScenarioBank
-from leapnav.envs.scenarios.bank import LOWER_BOUNDS
-from leapnav.envs.scenarios.families import collection_name
+from leapnav.envs.scenarios.bank import LOWER_BOUNDS, collection_name
 from leapnav.experts import build_bank
 
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"

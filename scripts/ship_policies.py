@@ -11,7 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-from leapnav.envs.scenarios.families import ALL, FAMILIES, collection_name
+from leapnav.envs.scenarios.bank import collection_name
+from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.training import DAggerRunConfig, evaluate, load_policy, policy_environment, save_policy, train_dagger
 from leapnav.training.config import RobotName
 from leapnav.training.policies.files import SHIPPED, read_description

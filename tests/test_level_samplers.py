@@ -4,7 +4,7 @@ import pytest
 from stable_baselines3 import PPO
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.levels import LevelOutcome
+from leapnav.envs.scenarios.sources import LevelOutcome
 from leapnav.training import (
     LevelScoring,
     PrioritizedSampler,

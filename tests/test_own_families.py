@@ -131,7 +131,7 @@ def test_the_command_line_finds_modules_in_the_current_directory(module, tmp_pat
 
 def test_without_a_bank_the_command_says_how_to_make_one(module, capsys):
     assert main(["evaluate", "go-to-goal", "--family", module]) == 2
-    message = "family: no bank of 'warehouse:pillar' is included; build one with leapnav bank build"
+    message = "got 'warehouse:pillar'; build a bank of another family with leapnav bank build, and pass it as bank"
     assert message in capsys.readouterr().err
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv
-from leapnav.experts import ExpertPolicy
+from leapnav.experts import ExpertPolicy, pools
 from leapnav.experts.data import rollouts
 from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
 from leapnav.experts.data.rollouts import DONE, RECORD, SHARD_SIZE, WORK, check_dataset, rollout
@@ -247,7 +247,7 @@ def test_a_dask_cluster_that_loses_a_worker_makes_the_same_dataset(whole, tmp_pa
 
 
 def test_without_dask_or_a_scheduler_a_cluster_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(rollouts, "DASK_TIMEOUT", 0.2)
+    monkeypatch.setattr(pools, "DASK_TIMEOUT", 0.2)
     with pytest.raises(OSError, match=r"127\.0\.0\.1:1"):
         rollout("open", 1, tmp_path / "one", dask="tcp://127.0.0.1:1", progress=False)
     monkeypatch.setitem(sys.modules, "dask.distributed", None)

@@ -24,8 +24,9 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 
 Attributes of the file: `format` ("leapnav-bank"), `version` (4), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
-leapnav that built the bank) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that of
-the other attributes).
+leapnav that built the bank), `given` (only of a bank of given scenarios; JSON: `scenarios`, their digest, and
+`rejected`, the reasons by name) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that
+of the other attributes).
 """  # noqa: E501 (tables)
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -43,7 +45,6 @@ from typing import Any, overload
 import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import CustomFamily, collection_name, find_family
 from leapnav.envs.scenarios.scenario import HORIZON, Scenario
 from leapnav.envs.shapes.field import check_field
 from leapnav.envs.utils.validation import check_choice, is_integer
@@ -70,7 +71,7 @@ TYPES = {
     "costates": "<f4",
     "lower_bounds": "<f8",
 }
-DURATIONS, LOWER_BOUNDS = "horizons", "lower_bounds"
+DURATIONS, LOWER_BOUNDS, GIVEN = "horizons", "lower_bounds", "given"
 OPTIONAL = (DURATIONS, LOWER_BOUNDS)  # datasets that not all banks have
 _TABLES = ("tasks", "certificates", "states", "controls", "costates")  # datasets with columns
 
@@ -114,7 +115,9 @@ class ScenarioBank(Sequence[Scenario]):
     Attributes:
         path: the file.
         family, seed: family and random seed of the scenarios.
-        drawn: number of scenarios drawn, admitted or not.
+        given: of a bank of given scenarios, the digest of these scenarios and the reasons why some were rejected, by
+            name; None if the scenarios are random.
+        drawn: number of scenarios drawn or given, admitted or not.
         rejected: number of scenarios that were not admitted, by reason.
         software: version of leapnav that built the bank.
         costs (n,): optimal costs J*.
@@ -138,6 +141,7 @@ class ScenarioBank(Sequence[Scenario]):
     seed: int
     drawn: int
     rejected: dict[str, int]
+    given: dict[str, Any] | None
     costs: np.ndarray
     second_costs: np.ndarray
     certificates: np.ndarray
@@ -170,6 +174,7 @@ class ScenarioBank(Sequence[Scenario]):
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
             self.seed, self.drawn = int(attributes["seed"]), int(attributes["drawn"])
             self.rejected = dict(json.loads(attributes["rejected"]))
+            self.given = dict(json.loads(attributes[GIVEN])) if GIVEN in attributes else None
             content = np.asarray(np.memmap(self.path, dtype="u1", mode="r"))
             arrays = {
                 name: content[start : start + size].view(TYPES[name]).reshape(shape)
@@ -270,11 +275,12 @@ class ScenarioBank(Sequence[Scenario]):
             ValueError: there is no such bank.
 
         """
-        if isinstance(find_family(family), CustomFamily):
+        known = cls.shipped_families(robot, horizon)
+        if family not in known:
             raise ValueError(
-                f"family: no bank of {family!r} is included; build one with leapnav bank build, and pass it as bank"
+                f"family: expected one of {', '.join(known)}, of which banks are included, got {family!r}; build a "
+                "bank of another family with leapnav bank build, and pass it as bank"
             )
-        check_choice("family", family, cls.shipped_families(robot, horizon))
         check_choice("split", split, SPLITS)
         return _shipped(collection_name(family, robot, horizon), split)
 
@@ -368,6 +374,15 @@ class ScenarioBank(Sequence[Scenario]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.path = state["path"]
         self._open()
+
+
+def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
+    """Return the name of the scenarios of a family for a robot model and a kind of horizon, such as "car-clutter".
+
+    Other characters than letters, digits and underscores in the name of the family become underscores.
+    """
+    name = re.sub(r"[^A-Za-z0-9_]", "_", family)
+    return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), name])
 
 
 @cache

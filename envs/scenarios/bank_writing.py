@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import Unicycle
-from leapnav.envs.scenarios.bank import DURATIONS, FORMAT, LOWER_BOUNDS, TYPES, VERSION, attribute_bytes, digest
+from leapnav.envs.scenarios.bank import DURATIONS, FORMAT, GIVEN, LOWER_BOUNDS, TYPES, VERSION, attribute_bytes, digest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import atomic_path
 
@@ -58,13 +58,14 @@ def write_bank(
     drawn: int,
     rejected: Mapping[str, int],
     software: str,
+    given: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a bank atomically; the same arguments give the same bytes.
 
     Args:
         path: the file.
         entries: the scenarios with their optima.
-        family, seed, drawn, rejected, software: see `ScenarioBank`.
+        family, seed, drawn, rejected, software, given: see `ScenarioBank`.
 
     Raises:
         ValueError: the scenarios have different robot models or kinds of horizon.
@@ -107,6 +108,7 @@ def write_bank(
         "drawn": drawn,
         "rejected": json.dumps(dict(sorted(rejected.items()))),
         "software": software,
+        **({} if given is None else {GIVEN: json.dumps(given, sort_keys=True)}),
     }
     checksums = {name: digest(array) for name, array in arrays.items()}
     # Alignment in the file makes the memory-mapped arrays aligned.

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
+from leapnav.envs.scenarios.files import read_scenarios
 from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Box, ScenarioLayout, rounded
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS
@@ -37,6 +39,7 @@ PASSAGE_MARGIN = 0.1  # m on either side of the robot, in the narrowest passage 
 GRID_SPACING = 0.25  # m, of the grid on which the shortest path is computed
 MAX_DRAWS = 10_000  # of a layout and poses, until start and goal are connected
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+BANK_ENDING, FILE_ENDING = ".bank", ".json"  # of names that stand for stored scenarios
 
 Sample = Callable[[np.random.Generator], ScenarioLayout | Scenario]
 
@@ -48,10 +51,48 @@ ALL_FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")  # those that 
 
 @dataclass(frozen=True)
 class CustomFamily:
-    """A family that is not built in, as other processes need it: its name and its function."""
+    """A family that is not built in, as other processes need it.
+
+    Attributes:
+        name: its name.
+        sample: its function.
+        names_scenarios: whether the scenarios keep the names that the function gives them.
+
+    """
 
     name: str
     sample: Sample
+    names_scenarios: bool = False
+
+
+@dataclass(frozen=True)
+class StoredScenarios:
+    """A family that draws one of the scenarios of a bank, or of scenario files."""
+
+    file: str
+
+    def __call__(self, rng: np.random.Generator) -> Scenario:
+        """Return a random one of the scenarios."""
+        scenarios = _stored(self.file)
+        return scenarios[int(rng.integers(len(scenarios)))]
+
+
+@lru_cache(maxsize=8)
+def _stored(file: str) -> Sequence[Scenario]:
+    """Return the scenarios of a bank or of scenario files.
+
+    Raises:
+        FileNotFoundError, ValueError: see `ScenarioBank` and `read_scenarios`; a bank without scenarios.
+
+    """
+    if not file.endswith(BANK_ENDING):
+        return read_scenarios(file)
+    from leapnav.envs.scenarios.bank import ScenarioBank  # takes long to import, and not every program uses one
+
+    bank = ScenarioBank(file)
+    if len(bank) == 0:
+        raise ValueError(f"family: expected at least one scenario, {file} has none")
+    return bank
 
 
 def register_family(name: str, sample: Sample) -> None:
@@ -86,9 +127,10 @@ def _origin(sample: Sample) -> tuple[str, str]:
 
 
 def find_family(name: object) -> str | CustomFamily:
-    """Return the name of a built-in family or "all", or the function of another family.
+    """Return the name of a built-in family or "all", or another family.
 
     Raises:
+        FileNotFoundError: the name is that of a file or a pattern, and there is no such file.
         ValueError: there is no such family.
 
     """
@@ -97,12 +139,16 @@ def find_family(name: object) -> str | CustomFamily:
             return name
         if name in REGISTERED:
             return CustomFamily(name, REGISTERED[name])
+        if name.endswith((BANK_ENDING, FILE_ENDING)):
+            path = str(Path(name).absolute())  # independent of the working directory, which differs between processes
+            _stored(path)
+            return CustomFamily(name, StoredScenarios(path), names_scenarios=True)
         if ":" in name:
             return CustomFamily(name, _import(name))
-    known = (*FAMILIES, ALL, *REGISTERED)
+    known = ", ".join((*FAMILIES, *REGISTERED, ALL))
     raise ValueError(
-        f"family: expected one of {', '.join((*FAMILIES, *REGISTERED))}, {ALL} or module:function, got {name!r}"
-        f"{suggestion(name, known)}"
+        f"family: expected one of {known}, module:function or a file (.bank, .json), got {name!r}"
+        f"{suggestion(name, (*FAMILIES, ALL, *REGISTERED))}"
     )
 
 
@@ -140,15 +186,6 @@ def families_of(family: str) -> tuple[str, ...]:
     return ALL_FAMILIES if family == ALL else (family,)
 
 
-def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
-    """Return the name of the scenarios of a family for a robot model and a kind of horizon, such as "car-clutter".
-
-    Other characters than letters, digits and underscores in the name of the family become underscores.
-    """
-    name = re.sub(r"[^A-Za-z0-9_]", "_", family)
-    return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), name])
-
-
 def sample_scenario(
     family: str | CustomFamily,
     seed: int | np.random.Generator,
@@ -164,8 +201,9 @@ def sample_scenario(
     not changed, except for its name.
 
     Args:
-        family: one of `FAMILIES`; "all" to sample one of the families of `ALL_FAMILIES`, too; a registered family; or
-            "module:function".
+        family: one of `FAMILIES`; "all" to sample one of the families of `ALL_FAMILIES`, too; a registered family;
+            "module:function"; or the file of a bank (`.bank`), a scenario file or a pattern of them (`.json`), of which
+            one scenario is drawn, with its name.
         seed: an integer, or a random generator.
         robot: name of a robot model, a dict of its fields with `model`, or a robot. Robots with the same footprint
             get the same obstacles and poses.
@@ -188,7 +226,8 @@ def sample_scenario(
     for _ in range(MAX_DRAWS):  # rejection sampling: the draws are independent
         layout = custom.sample(rng)
         if isinstance(layout, Scenario):
-            return _checked(layout, custom.name, body, horizon).model_copy(update={"name": name})
+            scenario = _checked(layout, custom.name, body, horizon)
+            return scenario if custom.names_scenarios else scenario.model_copy(update={"name": name})
         if not isinstance(layout, ScenarioLayout):
             raise TypeError(
                 f"family: {custom.name!r}: expected a ScenarioLayout or a Scenario, got {type(layout).__name__}"

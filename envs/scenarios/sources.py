@@ -1,10 +1,12 @@
-"""Sources of the scenarios of an environment's episodes."""
+"""Sources of the scenarios of an environment's episodes, and level samplers, which choose among those of a bank."""
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -18,6 +20,37 @@ from leapnav.envs.utils.validation import check_choice, is_integer
 
 SPLITS = ("train", "test", "fresh")
 DEFAULT_FAMILY = "clutter"
+
+
+@dataclass(frozen=True)
+class LevelOutcome:
+    """The end of an episode in a scenario of a bank.
+
+    Attributes:
+        index: index of the scenario in the bank.
+        success, collision: outcome.
+        episode_return: minus the cost J and the penalties of the episode, without a shaped reward.
+        regret: the return of the optimum, -J*, minus that of the episode.
+
+    """
+
+    index: int
+    success: bool
+    collision: bool
+    episode_return: float
+    regret: float
+
+
+class LevelSampler(Protocol):
+    """Chooses the scenarios of a vector environment's episodes, see `leapnav.training.RegretSampler`."""
+
+    def draw(self, rng: np.random.Generator) -> int:
+        """Return the index in the bank of the scenario of the next episode."""
+        ...
+
+    def record(self, outcome: LevelOutcome) -> None:
+        """Store the outcome of an episode."""
+        ...
 
 
 class ScenarioSource:
@@ -168,3 +201,33 @@ def get_scenario(choice: Scenario | int, bank: ScenarioBank | None) -> Scenario:
         return choice
     assert bank is not None  # an index always refers to a bank
     return bank[choice]
+
+
+def check_sampler(sampler: Any, bank: ScenarioBank | None) -> None:
+    """Check that a level sampler has the methods, and is one for a bank.
+
+    Raises:
+        TypeError: a method is missing.
+        ValueError: the sampler is one for another bank.
+
+    """
+    if not all(callable(getattr(sampler, name, None)) for name in ("draw", "record")):
+        raise TypeError(f"sampler: expected an object with the methods draw and record, got {sampler!r}")
+    own = getattr(sampler, "bank", None)
+    if isinstance(own, ScenarioBank) and bank is not None and (own.path, len(own)) != (bank.path, len(bank)):
+        raise ValueError(f"sampler: expected one for the bank {bank.path}, got one for {own.path}")
+
+
+def draw_level(source: ScenarioSource, sampler: LevelSampler | None, rng: np.random.Generator) -> Scenario | int:
+    """Return the scenario of an episode, or its index in the bank, that a sampler draws; without one, the source.
+
+    Raises:
+        IndexError: the sampler draws another index than that of a scenario of the bank.
+
+    """
+    if sampler is None:
+        return source.draw(rng)
+    index, count = operator.index(sampler.draw(rng)), len(source.bank or ())
+    if not 0 <= index < count:
+        raise IndexError(f"sampler: expected an index of the {count} scenarios of the bank, got {index}")
+    return index

@@ -10,7 +10,6 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from joblib import Parallel
 
 import leapnav
 from leapnav.envs.scenarios.bank import BankError, ScenarioBank, digest
@@ -18,7 +17,8 @@ from leapnav.envs.scenarios.bank_writing import write_lower_bounds
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.bounds.lower_bound import lower_bound
-from leapnav.experts.data.store import ONE, Arrays, ResumableStore, discard
+from leapnav.experts.data.store import Arrays, ResumableStore, discard
+from leapnav.experts.pools import process_pool
 from leapnav.experts.proofs.checker import check_proof
 from leapnav.experts.proofs.proof import ProofError, find_ends
 
@@ -96,9 +96,11 @@ def prove_bank(
     if not os.access(path, os.W_OK):  # before hours of work
         raise PermissionError(f"{path}: cannot be written")
     settings = {"software": leapnav.__version__, "bank": identity, "gap": gap, "time_limit": time_limit}
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="2 * n_jobs")
     compute = partial(prove, path=path, identity=identity, gap=gap, time_limit=time_limit)
-    with ResumableStore(path.with_name(f"{path.name}.bounds"), "bank-proof", settings, BankError) as store:
+    with (
+        ResumableStore(path.with_name(f"{path.name}.bounds"), "bank-proof", settings, BankError) as store,
+        process_pool(workers, pre_dispatch="2 * n_jobs") as pool,
+    ):
         bank = _open(path, identity)
         bank.verify_checksums()
         chosen = np.arange(len(bank) if count is None else min(count, len(bank)))
@@ -112,7 +114,7 @@ def prove_bank(
         missing = sorted({*chosen[~proved[chosen]].tolist(), *finished})
         found: dict[int, BankBound] = {}
         with progress_bar(total=len(missing), label="Proving", unit="scenarios", show=progress) as bar:
-            for index, arrays in store.complete(missing, compute, pool, bar):
+            for index, arrays in store.complete(missing, lambda index: partial(compute, index), pool, bar):
                 found[index] = _result(bank, index, arrays)
                 advance(bar, True)
         if found:

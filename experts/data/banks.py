@@ -1,30 +1,33 @@
-"""Building of scenario banks: random scenarios with certified optima, in parallel and resumable."""
+"""Building of scenario banks: scenarios with certified optima, in parallel and resumable."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from joblib import Parallel
 
 import leapnav
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank
+from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank, collection_name, digest
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
-from leapnav.envs.scenarios.families import ALL, CustomFamily, collection_name, find_family, sample_scenario
-from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, check_robot
+from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
+from leapnav.envs.scenarios.files import PathLike, check_collection, read_scenarios
+from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
-from leapnav.experts.data.store import ONE, Arrays, ResumableStore, discard
+from leapnav.experts.data.store import Arrays, Job, ResumableStore, discard
 from leapnav.experts.optimum import Optimum, find_optimum
+from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.extremal import Status
 
 
@@ -50,6 +53,83 @@ def judge(optimum: Optimum) -> Rejection | None:
     return Rejection.UNRESOLVED if optimum.doubts else None
 
 
+class ScenarioDraws(Protocol):
+    """The scenarios that a bank is built from, by number."""
+
+    @property
+    def available(self) -> int | None:
+        """The number of scenarios; None without a limit."""
+        ...
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """JSON values that determine the scenarios, among them `family` and `seed` of the bank."""
+        ...
+
+    def job(self, number: int) -> Job:
+        """Return the function that solves a scenario, see `solve_for_bank`."""
+        ...
+
+    def describe(self, reasons: Mapping[int, str]) -> dict[str, Any] | None:
+        """Return the attribute `given` of the bank, from the reasons of rejection of the solved scenarios."""
+        ...
+
+
+@dataclass(frozen=True)
+class RandomDraws:
+    """Random scenarios of a family; draw k uses a generator with the seed (seed, k)."""
+
+    family: str | CustomFamily
+    seed: int
+    robot: RobotModel
+    horizon: str
+    available: int | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """See `ScenarioDraws`."""
+        name = self.family if isinstance(self.family, str) else self.family.name
+        # Without the defaults, as before there were other robots.
+        robot = {} if self.robot == Unicycle() else {"robot": self.robot.model_dump(mode="json", exclude_none=True)}
+        horizon = {} if self.horizon == "fixed" else {"horizon": self.horizon}
+        return {"family": name, "seed": self.seed, **robot, **horizon}
+
+    def job(self, number: int) -> Job:
+        """See `ScenarioDraws`."""
+        return partial(draw, number, self.family, self.seed, self.robot, self.horizon)
+
+    def describe(self, reasons: Mapping[int, str]) -> None:
+        """See `ScenarioDraws`."""
+
+
+@dataclass(frozen=True)
+class GivenScenarios:
+    """Scenarios of one's own, under a name."""
+
+    name: str
+    scenarios: tuple[Scenario, ...]
+
+    @property
+    def available(self) -> int:
+        """See `ScenarioDraws`."""
+        return len(self.scenarios)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """See `ScenarioDraws`."""
+        texts = "\n".join(scenario.to_json() for scenario in self.scenarios)
+        return {"family": self.name, "seed": 0, "scenarios": digest(texts.encode())}
+
+    def job(self, number: int) -> Job:
+        """See `ScenarioDraws`."""
+        return partial(solve_for_bank, self.scenarios[number])
+
+    def describe(self, reasons: Mapping[int, str]) -> dict[str, Any]:
+        """See `ScenarioDraws`."""
+        rejected = {self.scenarios[number].name: reason for number, reason in reasons.items() if reason}
+        return {"scenarios": self.settings["scenarios"], "rejected": rejected}
+
+
 def build_bank(
     family: str,
     count: int,
@@ -59,6 +139,7 @@ def build_bank(
     horizon: str = "fixed",
     seed: int = 0,
     workers: int = 1,
+    dask: str | None = None,
     progress: bool = True,
 ) -> ScenarioBank:
     """Draw random scenarios, find their optima, and write the admitted ones to a bank.
@@ -76,12 +157,15 @@ def build_bank(
             the duration of its optimum.
         seed: seed of the bank; draw k uses a generator with the seed (seed, k).
         workers: number of processes.
+        dask: address of a Dask scheduler (`tcp://host:8786`) whose workers are used instead of local processes; they
+            need leapnav, but no access to `out`.
         progress: show a progress bar.
 
     Raises:
         ValueError: an argument is invalid.
         BankError: `out` is another bank, or its build directory belongs to another build, is damaged or is in use.
-        OSError: `out` cannot be written.
+        OSError: `out` cannot be written, or the scheduler cannot be reached; finished scenarios are kept.
+        ModuleNotFoundError: `dask` is given, and the extra `cluster` is not installed.
 
     """
     if family == ALL:
@@ -90,33 +174,80 @@ def build_bank(
     body = check_robot(robot)
     check_choice("horizon", horizon, HORIZONS)
     check_at_least("count", count, 1)
-    check_at_least("workers", workers, 1)
     check_at_least("seed", seed, 0)
+    draws = RandomDraws(chosen, seed, body, horizon)
+    expected = {"family": family, "seed": seed, "count": count, "robot": body, "horizon": horizon}
+    return _build(draws, count, Path(out), expected, workers=workers, dask=dask, progress=progress)
+
+
+def build_bank_of(
+    scenarios: PathLike | Sequence[Scenario | PathLike],
+    out: str | os.PathLike[str],
+    *,
+    workers: int = 1,
+    dask: str | None = None,
+    progress: bool = True,
+) -> ScenarioBank:
+    """Find the optima of given scenarios, and write the admitted ones to a bank.
+
+    The name of the file, without its ending, is the `family` of the bank; its `rejected_scenarios` are the names of the
+    scenarios that were not admitted, with the reasons. Interruptions and the number of workers do not change the bank,
+    see `build_bank`.
+
+    Args:
+        scenarios: scenarios with the same robot model and kind of horizon; or their files, see `read_scenarios`.
+        out: file of the bank. A complete bank of these scenarios is returned unchanged.
+        workers, dask, progress: see `build_bank`.
+
+    Raises:
+        ScenarioError: a scenario is invalid, or cannot be in a bank; two have the same name.
+        ValueError, BankError, OSError, ModuleNotFoundError: see `build_bank`.
+
+    """
     target = Path(out)
+    given = [scenarios] if isinstance(scenarios, (str, os.PathLike)) else list(scenarios)
+    files = [one for one in given if not isinstance(one, Scenario)]
+    found = [one for one in given if isinstance(one, Scenario)] + (read_scenarios(files) if files else [])
+    check_collection(found)
+    draws = GivenScenarios(target.stem, tuple(found))
+    expected = {"family": draws.name, "scenarios": draws.settings["scenarios"]}
+    return _build(draws, len(found), target, expected, workers=workers, dask=dask, progress=progress)
+
+
+def _build(
+    draws: ScenarioDraws,
+    count: int,
+    target: Path,
+    expected: Mapping[str, Any],
+    *,
+    workers: int,
+    dask: str | None,
+    progress: bool,
+) -> ScenarioBank:
+    """Build a bank of up to `count` scenarios, unless the expected one is complete."""
+    check_at_least("workers", workers, 1)
     if target.is_dir():
         raise IsADirectoryError(f"{target}: is a directory")
     if target.exists():
-        return _complete(target, family, count, seed, body, horizon)
+        return _complete(target, expected)
     if not target.absolute().parent.is_dir():
         raise FileNotFoundError(f"{target.parent}: no such directory")
-    settings = {"version": VERSION, "software": leapnav.__version__, "family": family, "seed": seed}
-    if body != Unicycle():  # as before there were other robots
-        settings["robot"] = body.model_dump(mode="json", exclude_none=True)
-    if horizon != "fixed":
-        settings["horizon"] = horizon
-    pool = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=ONE, pre_dispatch="4 * n_jobs")
-    with ResumableStore(_build_directory(target), "bank", settings, BankError) as store:
-        compute = partial(draw, family=chosen, seed=seed, robot=body, horizon=horizon)
-        reasons = _solve(store, pool, compute, count, progress)
+    settings = {"version": VERSION, "software": leapnav.__version__, **draws.settings}
+    with (
+        ResumableStore(_build_directory(target), "bank", settings, BankError) as store,
+        process_pool(workers, dask) as pool,
+    ):
+        reasons = _solve(store, pool, draws, count, progress)
         entries = [_entry(number, store.read(number)) for number, reason in reasons.items() if not reason]
         write_bank(
             target,
             entries,
-            family=family,
-            seed=seed,
+            family=settings["family"],
+            seed=settings["seed"],
             drawn=len(reasons),
             rejected=Counter(reason for reason in reasons.values() if reason),
             software=leapnav.__version__,
+            given=draws.describe(reasons),
         )
     discard(store.directory)
     return ScenarioBank(target)
@@ -125,7 +256,7 @@ def build_bank(
 def draw(
     number: int, family: str | CustomFamily, seed: int, robot: RobotModel | None = None, horizon: str = "fixed"
 ) -> Arrays:
-    """One random scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
+    """One random scenario with its optimum, see `solve_for_bank`.
 
     Args:
         number: index of the draw.
@@ -138,7 +269,14 @@ def draw(
     body = robot or Unicycle()
     scenario = sample_scenario(family, np.random.default_rng([seed, number]), body, horizon)
     name = collection_name(family if isinstance(family, str) else family.name, body.model, horizon)
-    scenario = scenario.model_copy(update={"name": f"{name}-{seed}-{number}"})
+    return solve_for_bank(scenario.model_copy(update={"name": f"{name}-{seed}-{number}", "time_limit": None}))
+
+
+def solve_for_bank(scenario: Scenario) -> Arrays:
+    """A scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
+
+    The time limit of a scenario with a free horizon and without a limit is 3 times the duration of its optimum.
+    """
     optimum = find_optimum(scenario)
     rejection = judge(optimum)
     if rejection is not None:
@@ -146,7 +284,7 @@ def draw(
     certificate = optimum.certificate
     assert certificate is not None
     duration = optimum.horizon
-    if scenario.horizon is None:
+    if scenario.horizon is None and scenario.time_limit is None:
         scenario = scenario.model_copy(update={"time_limit": round(TIME_LIMIT_FACTOR * duration, 1)})
     states, controls, costates = (values.astype("<f4") for values in optimum.evaluate(point_times(duration)))
     return {
@@ -164,17 +302,15 @@ def draw(
     }
 
 
-def _solve(
-    store: ResumableStore, pool: Parallel, compute: Callable[[int], Arrays], count: int, progress: bool
-) -> dict[int, str]:
-    """Complete the draws until `count` scenarios are admitted; return each draw's reason of rejection, in order."""
+def _solve(store: ResumableStore, pool: Parallel, draws: ScenarioDraws, count: int, progress: bool) -> dict[int, str]:
+    """Solve scenarios until `count` are admitted or none is left; return the reasons of rejection, in order."""
     reasons: dict[int, str] = {}
-    n_admitted = 0
+    n_admitted, available = 0, math.inf if draws.available is None else draws.available
     with progress_bar(total=count, label="Building the bank", unit="scenarios", show=progress) as bar:
-        while n_admitted < count:
-            # One draw for each missing scenario, so that the bank holds the first `count` admitted scenarios.
+        while n_admitted < count and len(reasons) < available:
+            # One for each missing scenario, so that the bank holds the first `count` admitted scenarios.
             numbers = range(len(reasons), len(reasons) + count - n_admitted)
-            for number, arrays in store.complete(numbers, compute, pool, bar):
+            for number, arrays in store.complete(numbers, draws.job, pool, bar):
                 reasons[number] = str(arrays["rejected"])
                 advance(bar, not reasons[number])
             n_admitted = sum(not reason for reason in reasons.values())
@@ -197,14 +333,19 @@ def _entry(number: int, arrays: Arrays) -> BankEntry:
     )
 
 
-def _complete(target: Path, family: str, count: int, seed: int, robot: RobotModel, horizon: str) -> ScenarioBank:
+def _complete(target: Path, expected: Mapping[str, Any]) -> ScenarioBank:
     """The bank at `target`, if it is the requested one."""
     bank = ScenarioBank(target)
-    expected: dict[str, Any] = {"family": family, "seed": seed, "count": count, "software": leapnav.__version__}
-    found: dict[str, Any] = {"family": bank.family, "seed": bank.seed, "count": len(bank), "software": bank.software}
-    expected["robot"], found["robot"] = robot, bank.robot
-    expected["horizon"], found["horizon"] = horizon, bank.horizon
-    for name, value in expected.items():
+    found = {
+        "family": bank.family,
+        "seed": bank.seed,
+        "count": len(bank),
+        "robot": bank.robot,
+        "horizon": bank.horizon,
+        "scenarios": (bank.given or {}).get("scenarios"),
+        "software": bank.software,
+    }
+    for name, value in {"scenarios": None, **expected, "software": leapnav.__version__}.items():
         if found[name] != value:
             raise BankError(f"{target}: exists, with {name} {found[name]!r} instead of {value!r}; choose another name")
     discard(_build_directory(target))  # left by a build that was interrupted after it had written the bank

@@ -19,7 +19,8 @@ import leapnav
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import ALL, FAMILIES, MAX_HORIZON, collection_name
+from leapnav.envs.scenarios.bank import collection_name
+from leapnav.envs.scenarios.families import ALL, FAMILIES, MAX_HORIZON
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.acting.feedback import Feedback

@@ -7,14 +7,13 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from joblib import Parallel, parallel_config
+from joblib import Parallel
 
 import leapnav
 from leapnav.envs.episodes import play_episode, replay
@@ -39,12 +38,12 @@ from leapnav.experts.data.demonstrations import (
 )
 from leapnav.experts.data.store import DISCARDED, Arrays, ResumableStore, discard
 from leapnav.experts.optimum import find_optimum
+from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.extremal import Extremal
 
 VERSION = 1  # format of the shards
 MIN_SEED = 2  # seeds 0 and 1 give the first scenarios of the included training and test banks
 SHARD_SIZE = 16  # scenarios per shard
-DASK_TIMEOUT = 30  # s to wait for a scheduler and its workers
 WORK = ".rollout"  # directory of an unfinished rollout
 DONE = WORK + DISCARDED  # the same directory while it is removed
 RECORD = "rollout.json"  # arguments and summary of a finished rollout, beside its dataset
@@ -155,7 +154,7 @@ def rollout(
         compute = partial(
             _shard, family=chosen, seed=seed, recoveries=recoveries, noise=float(noise), robot=body, horizon=horizon
         )
-        with _backend(workers, dask) as pool:
+        with process_pool(workers, dask) as pool:
             n_shards = _solve(store, pool, compute, family, count, progress)
         summary = _write(store, n_shards, directory, family, count, body, horizon)
         record = {**settings, "count": count, "summary": asdict(summary)}
@@ -264,21 +263,6 @@ def _prepare(directory: Path, force: bool) -> None:
     directory.mkdir(parents=True, exist_ok=True)  # before the computation, so that an impossible path fails at once
 
 
-@contextmanager
-def _backend(workers: int, dask: str | None) -> Iterator[Parallel]:
-    """Processes of this machine, or the workers of a Dask scheduler."""
-    if dask is None:
-        yield Parallel(n_jobs=workers, return_as="generator_unordered")
-        return
-    try:
-        from dask.distributed import Client
-    except ImportError:
-        raise ModuleNotFoundError('a Dask cluster needs dask: pip install "leapnav[cluster]"') from None
-    with Client(dask, timeout=DASK_TIMEOUT), parallel_config(backend="dask", wait_for_workers_timeout=DASK_TIMEOUT):
-        # One task per shard: if a worker is lost, only its current shards are computed again.
-        yield Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=cast(Any, 1))
-
-
 def _solve(
     store: ResumableStore, pool: Parallel, compute: Callable[[int], Arrays], family: str, count: int, progress: bool
 ) -> int:
@@ -287,7 +271,7 @@ def _solve(
     with progress_bar(total=count, label=f"Solving {family}", unit="scenarios", show=progress) as bar:
         while n_solved < count:  # repeated for the scenarios that had no certified optimum
             numbers = range(n_shards, n_shards + math.ceil((count - n_solved) / SHARD_SIZE))
-            for _, arrays in store.complete(numbers, compute, pool, bar):
+            for _, arrays in store.complete(numbers, lambda number: partial(compute, number), pool, bar):
                 solved = int(arrays["solved"].sum())
                 n_solved += solved
                 advance(bar, solved)

@@ -16,9 +16,7 @@ from tqdm.std import tqdm
 from leapnav.envs.utils.files import atomic_path, exclusive, write_text
 
 Arrays = Mapping[str, np.ndarray]
-# Joblib's batch size: with one task, an interruption loses only the tasks at work. Joblib declares a string but accepts
-# an integer.
-ONE = cast(str, 1)
+Job = Callable[[], Arrays]
 DISCARDED = "-done"  # added to the name of a directory that is being removed
 
 
@@ -117,14 +115,14 @@ class ResumableStore:
         return arrays
 
     def complete(
-        self, numbers: Iterable[int], compute: Callable[[int], Arrays], pool: Parallel, bar: tqdm[Any]
+        self, numbers: Iterable[int], job: Callable[[int], Job], pool: Parallel, bar: tqdm[Any]
     ) -> Iterator[tuple[int, Arrays]]:
         """Yield all shards of `numbers`: those that are stored first, then the missing ones as they are finished.
 
         Args:
             numbers: indices of the shards.
-            compute: the arrays of a shard; runs in the processes of the pool.
-            pool: with `return_as="generator_unordered"`.
+            job: returns a function without arguments that computes the arrays of a shard in a process of the pool.
+            pool: see `leapnav.experts.pools.process_pool`.
             bar: progress bar; its rate is measured from the first computation on.
 
         """
@@ -135,7 +133,7 @@ class ResumableStore:
             else:
                 missing.append(number)
         bar.unpause()
-        tasks = (delayed(_numbered)(compute, number) for number in missing)
+        tasks = (delayed(_numbered)(job(number), number) for number in missing)
         for number, arrays in cast(Iterator[tuple[int, Arrays]], pool(tasks)):
             self.write(number, arrays)
             yield number, arrays
@@ -153,5 +151,5 @@ def discard(directory: Path) -> None:
         shutil.rmtree(discarded)
 
 
-def _numbered(compute: Callable[[int], Arrays], number: int) -> tuple[int, Arrays]:
-    return number, compute(number)
+def _numbered(job: Job, number: int) -> tuple[int, Arrays]:
+    return number, job()

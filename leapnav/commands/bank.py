@@ -23,13 +23,16 @@ MIN_IMPROVEMENT = 1e-3
 
 @dataclass(frozen=True)
 class Build:
-    """Sample scenarios, find their optima, and write those with an unambiguous certificate to a bank.
+    """Sample scenarios, or read them; find their optima; and write those with an unambiguous certificate to a bank.
 
     The same command resumes an interrupted build.
     """
 
     out: Path
     """Output file of the bank."""
+    scenarios: tuple[str, ...] = ()
+    """Scenario files, directories of them, or quoted patterns such as "worlds/*.json"; they are used instead of sampled
+    scenarios, and the options from --family to --seed are not."""
     family: Family = "clutter"
     """Family of the scenarios."""
     robot: Robot = "unicycle"
@@ -42,19 +45,27 @@ class Build:
     """Seed of the bank; the included banks have 0 (training) and 1 (test)."""
     workers: int = os.cpu_count() or 1
     """Number of processes; the bank does not depend on it."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     json: Path | None = None
     """JSON file of the numbers of sampled and of rejected scenarios; "-" for standard output."""
 
     def run(self) -> int:
         """Build the bank."""
         check_outputs(self.json)
-        from leapnav.experts.data.banks import build_bank
+        from leapnav.experts.data.banks import build_bank, build_bank_of
 
-        announce(of_scenarios(self.family, self.count, self.workers), "finding the optima")
-        task = {"robot": self.robot, "horizon": self.horizon, "seed": self.seed}
-        bank = build_bank(self.family, self.count, self.out, **task, workers=self.workers)
+        if self.scenarios:
+            bank = build_bank_of(self.scenarios, self.out, workers=self.workers, dask=self.dask)
+            for name, reason in (bank.given or {})["rejected"].items():
+                print(f"{name}: rejected: {reason}")
+        else:
+            announce(of_scenarios(self.family, self.count, 1 if self.dask else self.workers), "finding the optima")
+            task = {"robot": self.robot, "horizon": self.horizon, "seed": self.seed}
+            bank = build_bank(self.family, self.count, self.out, **task, workers=self.workers, dask=self.dask)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
-        print(f"wrote {self.out}: {len(bank)} of {bank.drawn} sampled scenarios{f' ({rejected})' if rejected else ''}")
+        kind = "sampled" if bank.given is None else "given"
+        print(f"wrote {self.out}: {len(bank)} of {bank.drawn} {kind} scenarios{f' ({rejected})' if rejected else ''}")
         summary = {"scenarios": len(bank), "drawn": bank.drawn, "rejected": dict(bank.rejected)}
         write_json({"bank": str(self.out), **summary}, self.json)
         return 0
@@ -80,6 +91,8 @@ class Show:
     --verify; "-" for standard output."""
     workers: int = os.cpu_count() or 1
     """Number of processes of --verify."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers are used for --verify instead."""
 
     def run(self) -> int:
         """Print the summary, draw the picture and, with `verify`, search again."""
@@ -116,8 +129,9 @@ class Show:
         """Search again, print lower costs, and add the results to the rows."""
         from leapnav.experts.second_opinion import verify_bank
 
-        announce(SECONDS_PER_SECOND_OPINION * len(bank) / max(self.workers, 1), "searching every scenario again")
-        opinions = verify_bank(bank, workers=self.workers)
+        workers = 1 if self.dask else max(self.workers, 1)
+        announce(SECONDS_PER_SECOND_OPINION * len(bank) / workers, "searching every scenario again")
+        opinions = verify_bank(bank, workers=self.workers, dask=self.dask)
         improved = [opinion for opinion in opinions if opinion.improvement > MIN_IMPROVEMENT]
         for opinion in improved:
             print(
@@ -242,9 +256,10 @@ def _print_summary(bank: ScenarioBank) -> None:
     residual, defect, drift, _ = bank.certificates.max(axis=0)
     excess = bank.second_costs / bank.costs - 1
     kind = "" if bank.horizon == "fixed" else ", free horizon"
-    print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, seed {bank.seed}, leapnav {bank.software}")
+    source = f"seed {bank.seed}" if bank.given is None else "given"
+    print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, {source}, leapnav {bank.software}")
     print("  checksums          verified")
-    print(f"  sampled            {bank.drawn}")
+    print(f"  {'sampled' if bank.given is None else 'given  '}            {bank.drawn}")
     for reason, count in bank.rejected.items():
         print(f"  rejected           {count} ({reason})")
     print(f"  maximum residual   {residual:.1e}")

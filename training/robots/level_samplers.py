@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.levels import LevelOutcome
+from leapnav.envs.scenarios.sources import LevelOutcome
 from leapnav.envs.utils.validation import check_choice, check_fraction, check_positive
 
 ScoreName = Literal["positive_value_loss", "max_mc", "learnability", "exact_regret"]

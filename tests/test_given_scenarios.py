@@ -1,0 +1,141 @@
+"""Banks and families of one's own scenarios, from Python and from files."""
+
+import json
+import os
+import signal
+import threading
+import time
+from unittest import mock
+
+import pytest
+
+from leapnav.cli import main
+from leapnav.envs import (
+    BankError,
+    Circle,
+    NavigateEnv,
+    Obstacle,
+    Scenario,
+    ScenarioBank,
+    ScenarioError,
+    sample_scenario,
+)
+from leapnav.envs.scenarios.files import read_scenarios
+from leapnav.experts import build_bank_of, find_optimum, load_demonstrations, rollout
+from leapnav.training import evaluate, load_policy, policy_environment
+
+RING = [
+    Obstacle(circle=Circle(center=(8.0 + dx, 8.0 + dy), radius=0.4))
+    for dx in (-1, 0, 1)
+    for dy in (-1, 0, 1)
+    if dx or dy
+]
+
+
+def worlds(count=4):
+    """Scenarios, of which the last has no path to its goal."""
+    found = [sample_scenario("clutter", seed) for seed in range(5, 4 + count)]
+    closed = Scenario(
+        name="closed", arena=(0, 0, 10, 10), start=(1, 1, 0), goal=(8, 8, 0), horizon=15.0, obstacles=tuple(RING)
+    )
+    return [*found, closed]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    out = tmp_path / "worlds"
+    out.mkdir()
+    for number, scenario in enumerate(worlds()):
+        fields = scenario.to_dict()
+        if number == 0:
+            del fields["name"]
+        (out / f"{number}.json").write_text(json.dumps(fields))
+    return out
+
+
+def test_a_bank_of_given_scenarios_names_what_it_rejects(tmp_path):
+    given = worlds()
+    bank = build_bank_of(given, tmp_path / "mine.bank", progress=False)
+    assert (bank.family, len(bank), bank.drawn) == ("mine", 3, 4)
+    assert bank.given["rejected"] == {"closed": "no certified optimum"}
+    assert list(bank) == given[:3] and bank.costs[1] == find_optimum(given[1]).cost
+    content = bank.path.read_bytes()
+    assert build_bank_of(given, bank.path, progress=False).path.read_bytes() == content  # complete
+    with pytest.raises(BankError, match="exists, with scenarios"):
+        build_bank_of(given[:2], bank.path, progress=False)
+    (tmp_path / "more").mkdir()
+    assert build_bank_of(given, tmp_path / "more/mine.bank", workers=2, progress=False).path.read_bytes() == content
+
+
+def test_files_are_scenarios_of_a_bank_and_of_a_family(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bank", "build", "--scenarios", "worlds/*.json", "--out", "mine.bank", "--workers", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "closed: rejected: no certified optimum\nwrote mine.bank: 3 of 4 given scenarios (1 rejected: " in printed
+    bank = ScenarioBank("mine.bank")
+    assert [scenario.name for scenario in bank] == ["0", "clutter-6", "clutter-7"]
+    assert main(["bank", "show", "mine.bank", "--count", "0"]) == 0
+    assert "3 scenarios of mine, given, leapnav" in capsys.readouterr().out
+    evaluation = evaluate(load_policy("clutter"), bank, environment=policy_environment("clutter"), progress=False)
+    assert [episode.family for episode in evaluation] == ["mine"] * 3
+    for family in ("mine.bank", "worlds/[012].json"):
+        env = NavigateEnv(family)
+        names = {env.reset(seed=seed)[1]["scenario"].name for seed in range(12)}
+        assert names == {"0", "clutter-6", "clutter-7"}
+        rollout(family, 2, tmp_path / f"demos-{len(family)}", seed=3, progress=False)
+        assert {demo.scenario.name for demo in load_demonstrations(tmp_path / f"demos-{len(family)}")} <= names
+    assert read_scenarios(folder) == read_scenarios("worlds/*.json") == read_scenarios(sorted(folder.iterdir()))
+
+
+@pytest.mark.parametrize(
+    ("files", "error", "message"),
+    [
+        ("none/*.json", FileNotFoundError, r"none/\*\.json: no such scenario file"),
+        ([], ScenarioError, "scenarios: expected at least one, got none"),
+        ("broken.json", ScenarioError, "broken.json: .*horizon: expected a number > 0, got -1"),
+        (["a.json", "a.json"], ScenarioError, "scenarios: expected different names, 2 are named 'clutter-5'"),
+        (["a.json", "car.json"], ScenarioError, "'car-9': robot: expected that of 'clutter-5', 'unicycle', got 'car'"),
+        (
+            ["a.json", "free.json"],
+            ScenarioError,
+            "'free-9': horizon: expected that of 'clutter-5', 'fixed', got 'free'",
+        ),
+    ],
+)
+def test_files_that_cannot_be_a_bank_are_named(files, error, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = sample_scenario("clutter", 5)
+    first.to_json("a.json")
+    (tmp_path / "broken.json").write_text(json.dumps({**first.to_dict(), "horizon": -1}))
+    for name, arguments in (("car", {"robot": "car"}), ("free", {"horizon": "free"})):
+        sample_scenario("clutter", 9, **arguments).model_copy(update={"name": f"{name}-9"}).to_json(f"{name}.json")
+    with pytest.raises(error, match=message):
+        build_bank_of(files, "x.bank", progress=False)
+    assert not (tmp_path / "x.bank").exists() and not (tmp_path / "x.bank.build").exists()
+
+
+@mock.patch.dict(os.environ)  # Dask leaves OMP_NUM_THREADS=1 there, and processes started later compute other last bits
+def test_a_dask_cluster_that_loses_a_worker_builds_the_same_bank(tmp_path):
+    from dask.distributed import Client, LocalCluster
+
+    given, out = [sample_scenario("open", seed) for seed in range(5, 105)], tmp_path / "dask/given.bank"
+    out.parent.mkdir()
+    killed = []
+
+    def kill_one(client):
+        while not list(out.parent.glob("given.bank.build/shard-*.npz")):
+            time.sleep(0.01)
+        pid = next(iter(client.run(os.getpid).values()))
+        os.kill(pid, signal.SIGKILL)
+        killed.append(pid)
+
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        killer = threading.Thread(target=kill_one, args=(client,))
+        killer.start()
+        bank = build_bank_of(given, out, dask=cluster.scheduler_address, progress=False)
+        killer.join()
+    assert len(killed) == 1 and len(bank) > 90
+    assert bank.path.read_bytes() == build_bank_of(given, tmp_path / "given.bank", progress=False).path.read_bytes()
