@@ -38,7 +38,7 @@ BLOCKS = [
 ]
 # What the pages print; the blocks of a page build on each other.
 PRINTED = {
-    "banks.md": BANK.replace(r"\n200", rf" {NUMBER}\n200"),
+    "banks.md": BANK.replace(r"\n200", rf" {NUMBER}\n200") + r"mine 3 \{\}\n",
     "index.md": rf"True {NUMBER} times the optimal cost\nRolloutSummary\(demonstrations=50, .*\)\n{RATE}\n"
     r"True 3 True\n",
     "lower_bounds.md": r"True\n",

@@ -137,5 +137,18 @@ def test_a_dask_cluster_that_loses_a_worker_builds_the_same_bank(tmp_path):
         killer.start()
         bank = build_bank_of(given, out, dask=cluster.scheduler_address, progress=False)
         killer.join()
+        on_dask = evaluate(load_policy("open"), bank, timed=False, progress=False, dask=cluster.scheduler_address)
     assert len(killed) == 1 and len(bank) > 90
     assert bank.path.read_bytes() == build_bank_of(given, tmp_path / "given.bank", progress=False).path.read_bytes()
+    here = evaluate(load_policy("open"), bank, timed=False, progress=False)
+    assert [episode.to_dict() for episode in on_dask] == [episode.to_dict() for episode in here]
+
+
+def test_an_evaluation_does_not_depend_on_the_number_of_processes():
+    one, two = (
+        evaluate(load_policy("open"), "open", count=80, timed=False, workers=workers, progress=False)
+        for workers in (1, 2)
+    )
+    assert [episode.to_dict() for episode in one] == [episode.to_dict() for episode in two]
+    with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
+        evaluate(load_policy("open"), "open", workers=0)

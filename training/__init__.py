@@ -35,9 +35,10 @@ if TYPE_CHECKING:
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
     from leapnav.training.scoring.comparison import Comparison, compare
     from leapnav.training.scoring.decisions import Decisions, PolicyRegret, regret
-    from leapnav.training.scoring.evaluation import Episode, Evaluation, Policy, evaluate
+    from leapnav.training.scoring.evaluation import Policy, evaluate
     from leapnav.training.scoring.html_report import write_report
     from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores
+    from leapnav.training.scoring.results import Episode, Evaluation
     from leapnav.training.scoring.scores import Interval, Score, profile, score
 
 __all__ = [
@@ -120,7 +121,8 @@ _LAZY = {
     "runs.reinforcement": ("train_ppo", "train_sac"),
     "scoring.comparison": ("Comparison", "compare"),
     "scoring.decisions": ("Decisions", "PolicyRegret", "regret"),
-    "scoring.evaluation": ("Episode", "Evaluation", "Policy", "evaluate"),
+    "scoring.evaluation": ("Policy", "evaluate"),
+    "scoring.results": ("Episode", "Evaluation"),
     "scoring.html_report": ("write_report",),
     "scoring.reports": ("plot_episodes", "plot_scores", "print_scores"),
     "scoring.scores": ("Interval", "Score", "profile", "score"),

@@ -46,6 +46,10 @@ class Evaluate:
     env: EnvironmentOption = ()
     """Arguments of the environment (KEY=VALUE) with which a model of Stable-Baselines3 was trained; by default derived
     from its observation space, for a lidar."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes that search the optima for the poses reached; the scores do not depend on it."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     trust: bool = False
     """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
     json: Path | None = None
@@ -79,7 +83,8 @@ class Evaluate:
         banks = self._banks(specs)
         n_scenarios = sum(len(bank) if self.count is None else min(self.count, len(bank)) for bank in banks)
         announce(of_evaluation(self.policies, n_scenarios), "the evaluation")
-        comparison = compare_policies(specs, banks, count=self.count, seed=self.seed)
+        parallel = {"workers": self.workers, "dask": self.dask}
+        comparison = compare_policies(specs, banks, count=self.count, seed=self.seed, **parallel)
         print_scores(comparison)
         if self.json is not None:
             write_json(scores_to_dict(comparison), self.json)
@@ -100,7 +105,7 @@ class Evaluate:
 
         assert self.decisions is not None  # checked by `run`
         first = next(iter(comparison.runs.values()))[0]
-        found = costliest_decisions(first, comparison.banks, workers=os.cpu_count() or 1)
+        found = costliest_decisions(first, comparison.banks, workers=self.workers)
         print_decisions(found)
         plot_decisions(found, comparison.banks, self.decisions)
         print(f"wrote {self.decisions}")

@@ -15,7 +15,7 @@ from leapnav.durations import announce, of_training
 from leapnav.training.config import ALGORITHMS, BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig, read_config
 
 if TYPE_CHECKING:
-    from leapnav.training.scoring.evaluation import Evaluation
+    from leapnav.training.scoring.results import Evaluation
 
 HELP = """Train a policy: behaviour cloning of the expert, DAgger, or PPO or SAC, from scratch or from a warm start. The
 defaults shown are those tuned for --family (and for --warm-start); with --resume, those of the run."""

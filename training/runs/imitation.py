@@ -28,7 +28,7 @@ from leapnav.training.policies.network import make_policy
 from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
 from leapnav.training.runs.run import Run
-from leapnav.training.scoring.evaluation import Evaluation
+from leapnav.training.scoring.results import Evaluation
 from leapnav.training.threads import limit_threads
 
 DEMONSTRATION_STREAM = 1_000_000  # stream of the run's seed, larger than those of the rounds of DAgger

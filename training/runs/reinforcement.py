@@ -42,7 +42,7 @@ from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
 from leapnav.training.runs.imitation import momentum_of, observed_settings, show_scores
 from leapnav.training.runs.run import Run
-from leapnav.training.scoring.evaluation import Evaluation
+from leapnav.training.scoring.results import Evaluation
 from leapnav.training.threads import limit_threads
 
 Config = PPOConfig | SACConfig

@@ -28,7 +28,8 @@ from leapnav.experts.data.banks import build_bank
 from leapnav.training.config import TEST_BANK, RunConfig
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
-from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, evaluate
+from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
+from leapnav.training.scoring.results import Evaluation
 
 TEST_COUNT, TEST_SEED = 100, 1  # of the bank for the evaluations of a family that is not built in
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json

@@ -11,8 +11,9 @@ import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import check_family, families_of
-from leapnav.training.scoring.evaluation import Evaluation, PolicyOrFactory, evaluate
+from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
+from leapnav.training.scoring.results import Evaluation
 from leapnav.training.scoring.scores import Score, score
 
 if TYPE_CHECKING:
@@ -86,6 +87,8 @@ def compare(
     count: int | None = None,
     environment: Mapping[str, Any] | None = None,
     seed: int = 0,
+    workers: int = 1,
+    dask: str | None = None,
     progress: bool = True,
 ) -> Comparison:
     """Evaluate policies on the same scenarios, against the optimum.
@@ -104,6 +107,7 @@ def compare(
         count: number of scenarios of each bank, from the first; None: all.
         environment: arguments of the environment, such as `observation`, for the policies without their own.
         seed: random seed of the bootstrap intervals, the disturbances and the random policy.
+        workers, dask: see `evaluate`.
         progress: show progress bars.
 
     Raises:
@@ -123,7 +127,7 @@ def compare(
         banks = included_banks(specs, families_of(bank))
     else:
         banks = [bank] if isinstance(bank, ScenarioBank) else list(bank)
-    return compare_policies(specs, banks, count=count, seed=seed, progress=progress)
+    return compare_policies(specs, banks, count=count, seed=seed, workers=workers, dask=dask, progress=progress)
 
 
 def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | None, seed: int) -> PolicySpec:
@@ -187,6 +191,8 @@ def compare_policies(
     *,
     count: int | None = None,
     seed: int = 0,
+    workers: int = 1,
+    dask: str | None = None,
     progress: bool = True,
 ) -> Comparison:
     """Evaluate all policies on all scenarios of the banks.
@@ -196,6 +202,7 @@ def compare_policies(
         banks: the banks, at least one.
         count: number of scenarios of each bank; None: all.
         seed: random seed of the bootstrap intervals and the disturbances.
+        workers, dask: see `evaluate`.
         progress: show progress bars.
 
     Raises:
@@ -213,6 +220,8 @@ def compare_policies(
                     count=count,
                     environment=member.environment,
                     seed=seed,
+                    workers=workers,
+                    dask=dask,
                     label=f"{row if len(members) == 1 else member.name}: {bank.family}",
                     progress=progress,
                 )

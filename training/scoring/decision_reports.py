@@ -20,7 +20,7 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.utils.colors import FAILURE, OPTIMUM
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.decisions import Decisions, decisions_of, level_regrets
-from leapnav.training.scoring.evaluation import Evaluation
+from leapnav.training.scoring.results import Evaluation
 
 N_SHOWN = 8  # episodes in a picture
 COLOR_MAP = "viridis_r"

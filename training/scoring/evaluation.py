@@ -6,12 +6,13 @@ import inspect
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
+from joblib import delayed
 
 from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.navigation import NavigateEnv
@@ -21,18 +22,17 @@ from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
-from leapnav.envs.utils.validation import in_words
+from leapnav.envs.utils.validation import check_at_least, in_words
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
+from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
+from leapnav.training.scoring.results import Episode, Evaluation
 from leapnav.training.threads import limit_threads
 
-if TYPE_CHECKING:
-    import pandas
-
 BATCH_SIZE = 256  # episodes simulated in parallel
+MIN_PARALLEL = 64  # searches, below which starting processes takes longer
 MAX_TIMED_ACTIONS = 100
-_UNLISTED = ("states", "costs", "episode_return")  # not in the record of an episode
 MIN_REVERSE_SPEED = 0.05  # m/s; an optimum that reaches this speed backwards counts as reversing
 
 
@@ -95,156 +95,6 @@ class FunctionPolicy:
         return action
 
 
-@dataclass(frozen=True, eq=False)
-class Episode:
-    """The result of a policy on one scenario.
-
-    Attributes:
-        family, index, scenario: the scenario: its family, its index in the bank, its name.
-        success, collision: outcome of the episode.
-        cost: cost J of the episode.
-        episode_return: sum of the rewards.
-        reference_cost: optimal cost J* of the scenario.
-        reached_reference: optimal cost J* for the state that a successful episode has reached, see
-            `find_reached_optimum`; NaN for other episodes, and if no certified extremal was found.
-        clearance: minimum clearance of the episode (m).
-        reference_clearance: minimum clearance of the optimum (m).
-        reversing: whether the optimum contains backward driving.
-        states (K + 1, n): the states before and after each environment step.
-        costs (K + 1,): the cost J so far at these states.
-        lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
-        truncated: whether the time limit of a free horizon ended the episode, without a penalty for the missed goal.
-
-    """
-
-    family: str
-    index: int
-    scenario: str
-    success: bool
-    collision: bool
-    cost: float
-    episode_return: float
-    reference_cost: float
-    reached_reference: float
-    clearance: float
-    reference_clearance: float
-    reversing: bool
-    states: np.ndarray
-    costs: np.ndarray
-    lower_bound: float = math.nan
-    truncated: bool = False
-
-    @property
-    def optimal_cost(self) -> float:
-        """J* for the pose that a successful episode has reached, else J* of the scenario."""
-        return self.reference_cost if math.isnan(self.reached_reference) else self.reached_reference
-
-    @property
-    def soc(self) -> float:
-        """Success weighted by optimal cost: S J* / max(J, J*), with J* for the reached pose.
-
-        If that is not known, J* of the scenario is used.
-        """
-        if not self.success:
-            return 0.0
-        return self.optimal_cost / max(self.cost, self.optimal_cost)
-
-    @property
-    def ratio(self) -> float:
-        """Cost ratio J / J* of the performance profile, with J* as in `soc`; infinite for an unsuccessful episode."""
-        return self.cost / self.optimal_cost if self.success else math.inf
-
-    @property
-    def regret(self) -> float:
-        """Regret (J - J*) / J* of a successful episode, with J* for the reached pose; NaN if that is not known.
-
-        It is negative only if the episode is cheaper than the best optimum that the search found, or if the robot
-        slips: its path then violates the unicycle model.
-        """
-        return (self.cost - self.reached_reference) / self.reached_reference
-
-    @property
-    def true_regret(self) -> tuple[float, float]:
-        """Proved limits of J / J_0 - 1, where J_0 is the infimum of the cost of collision-free paths to the goal pose.
-
-        J_0 is between `lower_bound` and `reference_cost`. A robot may stop within the tolerances of the goal, so the
-        limits can be negative and need not contain `regret`, which refers to the pose reached. NaN if no lower bound is
-        known or the episode is no success; the upper limit is infinite if the lower bound is not positive.
-        """
-        if math.isnan(self.lower_bound) or not self.success:
-            return math.nan, math.nan
-        high = self.cost / self.lower_bound - 1.0 if self.lower_bound > 0 else math.inf
-        return self.cost / self.reference_cost - 1.0, high
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the attributes without the states and their costs, and SOC and regret."""
-        record = {name: value for name, value in vars(self).items() if name not in _UNLISTED}
-        return {**record, "return": self.episode_return, "soc": self.soc, "regret": self.regret}
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """The results of a policy on a bank.
-
-    Attributes:
-        episodes: the episodes, in the order of the bank.
-        milliseconds: median computation time of one action (ms).
-        settings: settings of the environment.
-
-    """
-
-    episodes: tuple[Episode, ...]
-    milliseconds: float
-    settings: EnvironmentSettings = field(default_factory=EnvironmentSettings)
-
-    def __repr__(self) -> str:
-        families = ", ".join(dict.fromkeys(episode.family for episode in self.episodes))
-        return (
-            f"<Evaluation: {len(self)} episodes ({families}), success {100 * self.success:.1f} %, collision "
-            f"{100 * self.collision:.1f} %, SOC {self.soc:.3f}, median regret {100 * self.regret:.2f} %>"
-        )
-
-    def to_dataframe(self) -> pandas.DataFrame:
-        """Return a pandas data frame with one row per episode and the columns of `Episode.to_dict`.
-
-        Raises:
-            ImportError: pandas is not installed.
-
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError('to_dataframe needs pandas: pip install "leapnav[pandas]"') from error
-        return pandas.DataFrame([episode.to_dict() for episode in self.episodes])
-
-    def __len__(self) -> int:
-        return len(self.episodes)
-
-    def __iter__(self) -> Iterator[Episode]:
-        return iter(self.episodes)
-
-    @property
-    def success(self) -> float:
-        """Success rate."""
-        return float(np.mean([episode.success for episode in self.episodes]))
-
-    @property
-    def collision(self) -> float:
-        """Collision rate."""
-        return float(np.mean([episode.collision for episode in self.episodes]))
-
-    @property
-    def soc(self) -> float:
-        """Mean success weighted by optimal cost."""
-        return float(np.mean([episode.soc for episode in self.episodes]))
-
-    @property
-    def regret(self) -> float:
-        """Median regret of the successful episodes; NaN if there are none."""
-        values = [episode.regret for episode in self.episodes if episode.success]
-        return float(np.nanmedian(values)) if values else math.nan
-
-
 @limit_threads
 def evaluate(
     policy: PolicyOrFactory,
@@ -254,6 +104,8 @@ def evaluate(
     environment: Mapping[str, Any] | None = None,
     seed: int = 0,
     timed: bool = True,
+    workers: int = 1,
+    dask: str | None = None,
     label: str = "Evaluating",
     progress: bool = True,
 ) -> Evaluation:
@@ -270,14 +122,20 @@ def evaluate(
         environment: arguments of the environment, such as `observation`.
         seed: random seed of the disturbances.
         timed: measure the computation time of an action; otherwise `milliseconds` is NaN.
+        workers: number of processes that search the optima for the poses reached, which takes most of the time; the
+            results do not depend on it.
+        dask: address of a Dask scheduler (`tcp://host:8786`) whose workers are used for that instead. Requires the
+            extra `cluster`.
         label: label of the progress bar.
         progress: show a progress bar.
 
     Raises:
         TypeError: `policy` is neither a policy nor a function that returns one.
         ValueError: an argument is invalid, or the policy expects other observations.
+        ModuleNotFoundError, OSError: the Dask scheduler cannot be used.
 
     """
+    check_at_least("workers", workers, 1)
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
             "policy: expected an object with `predict`, a function of an observation, or a function of `env` that "
@@ -298,7 +156,14 @@ def evaluate(
     with progress_bar(total=len(indices), label=label, unit="episodes", show=progress) as bar:
         for first in range(0, len(indices), BATCH_SIZE):
             batch = indices[first : first + BATCH_SIZE]
-            episodes += _play_batch(policy, bank, batch, arguments, seed, bar.update)
+            episodes += _play_batch(policy, bank, batch, arguments, seed)
+            bar.update(sum(not episode.success for episode in episodes[first:]))
+        reached = [i for i, episode in enumerate(episodes) if episode.success]
+        with process_pool(workers if len(reached) >= MIN_PARALLEL else 1, dask, return_as="generator") as pool:
+            tasks = (delayed(_optimal_cost_to)(*_search(episodes[i], bank)) for i in reached)
+            for i, cost in zip(reached, cast(Iterator[float], pool(tasks)), strict=True):
+                episodes[i] = replace(episodes[i], reached_reference=cost)
+                bar.update()
     milliseconds = _median_milliseconds(policy, bank, arguments) if timed else math.nan
     task = {"robot": bank.robot.model, "horizon": bank.horizon}
     return Evaluation(tuple(episodes), milliseconds, EnvironmentSettings(**{**arguments, **task}))
@@ -310,9 +175,8 @@ def _play_batch(
     indices: Sequence[int],
     arguments: Mapping[str, Any],
     seed: int,
-    on_episode: Callable[[], Any],
 ) -> list[Episode]:
-    """Play scenarios of a bank in parallel, one robot for each."""
+    """Play scenarios of a bank in parallel, one robot for each; the optima for the poses reached are not searched."""
     count = len(indices)
     venv = NavigateVectorEnv(count, bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
     policy = _policy_for(policy_or_factory, venv, venv.single_observation_space)
@@ -344,7 +208,6 @@ def _play_batch(
                 clearance=float(clearances[i]),
                 truncated=bool(truncated[i]),
             )
-            on_episode()
     venv.close()
     return [episode for episode in episodes if episode is not None]
 
@@ -358,15 +221,15 @@ def _make_episode(
     bank: ScenarioBank, index: int, states: np.ndarray, costs: np.ndarray, *, success: bool, **outcome: Any
 ) -> Episode:
     """Combine the outcome of an episode with the reference of its scenario."""
-    scenario, reference, cost = bank[index], bank.reference(index), float(costs[-1])
+    scenario, reference = bank[index], bank.reference(index)
     return Episode(
         family=bank.family,
         index=index,
         scenario=scenario.name,
         success=success,
-        cost=cost,
+        cost=float(costs[-1]),
         reference_cost=reference.cost,
-        reached_reference=_optimal_cost_to(states[-1], scenario, reference, cost) if success else math.nan,
+        reached_reference=math.nan,
         reference_clearance=reference.certificate[3],
         reversing=bool(_speeds(reference).min() < -MIN_REVERSE_SPEED),
         states=states,
@@ -382,9 +245,15 @@ def _speeds(reference: Reference) -> np.ndarray:
     return (step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)) / np.diff(reference.times)
 
 
-def _optimal_cost_to(state: np.ndarray, scenario: Scenario, reference: Reference, cost: float) -> float:
-    """Return J* for the pose that a successful episode has reached; NaN if no certified extremal is found."""
+def _search(episode: Episode, bank: ScenarioBank) -> tuple[Scenario, np.ndarray, float, Trajectory]:
+    """Return the scenario, the final state and the cost of an episode, and the optimum of the scenario as a guess."""
+    reference = bank.reference(episode.index)
     guess = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
+    return bank[episode.index], episode.states[-1], episode.cost, guess
+
+
+def _optimal_cost_to(scenario: Scenario, state: np.ndarray, cost: float, guess: Trajectory) -> float:
+    """Return J* for the pose that a successful episode has reached; NaN if no certified extremal is found."""
     optimum = find_reached_optimum(scenario, state, cost, guess)
     return optimum.cost if optimum.success else math.nan
 

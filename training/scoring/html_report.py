@@ -30,9 +30,9 @@ from leapnav.envs.utils.json_utils import encode
 from leapnav.training.config import TEST_BANK, RunConfig, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
 from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions
-from leapnav.training.scoring.evaluation import Episode, Evaluation
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.reports import COLUMNS, NEGATIVE_REGRET, cell, draw_profiles, plot_episodes, row_name
+from leapnav.training.scoring.results import Episode, Evaluation
 
 BASELINES = ("expert", "go-to-goal", "random")  # in the order of the table
 CLEARANCE_BINS = (0.0, 0.05, 0.1, 0.2, math.inf)  # bin edges of the optimum's clearance (m)

@@ -23,7 +23,7 @@ from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.comparison import Comparison
-from leapnav.training.scoring.evaluation import Episode
+from leapnav.training.scoring.results import Episode
 from leapnav.training.scoring.scores import Bracket, Interval, Score, profile
 
 RATIOS = np.concatenate([np.linspace(1.0, 1.2, 81), np.linspace(1.2, 2.0, 41)[1:]])  # of the profiles

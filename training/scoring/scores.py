@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import trim_mean
 
-from leapnav.training.scoring.evaluation import Evaluation
+from leapnav.training.scoring.results import Evaluation
 
 N_RESAMPLES = 2000  # bootstrap resamples of an interval
 CONFIDENCE = 0.95

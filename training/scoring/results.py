@@ -1,0 +1,167 @@
+"""Results of an evaluation: an episode of a policy, and all episodes on a bank."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from leapnav.envs.settings import EnvironmentSettings
+
+if TYPE_CHECKING:
+    import pandas
+
+_UNLISTED = ("states", "costs", "episode_return")  # not in the record of an episode
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """The result of a policy on one scenario.
+
+    Attributes:
+        family, index, scenario: the scenario: its family, its index in the bank, its name.
+        success, collision: outcome of the episode.
+        cost: cost J of the episode.
+        episode_return: sum of the rewards.
+        reference_cost: optimal cost J* of the scenario.
+        reached_reference: optimal cost J* for the state that a successful episode has reached, see
+            `find_reached_optimum`; NaN for other episodes, and if no certified extremal was found.
+        clearance: minimum clearance of the episode (m).
+        reference_clearance: minimum clearance of the optimum (m).
+        reversing: whether the optimum contains backward driving.
+        states (K + 1, n): the states before and after each environment step.
+        costs (K + 1,): the cost J so far at these states.
+        lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
+        truncated: whether the time limit of a free horizon ended the episode, without a penalty for the missed goal.
+
+    """
+
+    family: str
+    index: int
+    scenario: str
+    success: bool
+    collision: bool
+    cost: float
+    episode_return: float
+    reference_cost: float
+    reached_reference: float
+    clearance: float
+    reference_clearance: float
+    reversing: bool
+    states: np.ndarray
+    costs: np.ndarray
+    lower_bound: float = math.nan
+    truncated: bool = False
+
+    @property
+    def optimal_cost(self) -> float:
+        """J* for the pose that a successful episode has reached, else J* of the scenario."""
+        return self.reference_cost if math.isnan(self.reached_reference) else self.reached_reference
+
+    @property
+    def soc(self) -> float:
+        """Success weighted by optimal cost: S J* / max(J, J*), with J* for the reached pose.
+
+        If that is not known, J* of the scenario is used.
+        """
+        if not self.success:
+            return 0.0
+        return self.optimal_cost / max(self.cost, self.optimal_cost)
+
+    @property
+    def ratio(self) -> float:
+        """Cost ratio J / J* of the performance profile, with J* as in `soc`; infinite for an unsuccessful episode."""
+        return self.cost / self.optimal_cost if self.success else math.inf
+
+    @property
+    def regret(self) -> float:
+        """Regret (J - J*) / J* of a successful episode, with J* for the reached pose; NaN if that is not known.
+
+        It is negative only if the episode is cheaper than the best optimum that the search found, or if the robot
+        slips: its path then violates the unicycle model.
+        """
+        return (self.cost - self.reached_reference) / self.reached_reference
+
+    @property
+    def true_regret(self) -> tuple[float, float]:
+        """Proved limits of J / J_0 - 1, where J_0 is the infimum of the cost of collision-free paths to the goal pose.
+
+        J_0 is between `lower_bound` and `reference_cost`. A robot may stop within the tolerances of the goal, so the
+        limits can be negative and need not contain `regret`, which refers to the pose reached. NaN if no lower bound is
+        known or the episode is no success; the upper limit is infinite if the lower bound is not positive.
+        """
+        if math.isnan(self.lower_bound) or not self.success:
+            return math.nan, math.nan
+        high = self.cost / self.lower_bound - 1.0 if self.lower_bound > 0 else math.inf
+        return self.cost / self.reference_cost - 1.0, high
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes without the states and their costs, and SOC and regret."""
+        record = {name: value for name, value in vars(self).items() if name not in _UNLISTED}
+        return {**record, "return": self.episode_return, "soc": self.soc, "regret": self.regret}
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The results of a policy on a bank.
+
+    Attributes:
+        episodes: the episodes, in the order of the bank.
+        milliseconds: median computation time of one action (ms).
+        settings: settings of the environment.
+
+    """
+
+    episodes: tuple[Episode, ...]
+    milliseconds: float
+    settings: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+
+    def __repr__(self) -> str:
+        families = ", ".join(dict.fromkeys(episode.family for episode in self.episodes))
+        return (
+            f"<Evaluation: {len(self)} episodes ({families}), success {100 * self.success:.1f} %, collision "
+            f"{100 * self.collision:.1f} %, SOC {self.soc:.3f}, median regret {100 * self.regret:.2f} %>"
+        )
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas data frame with one row per episode and the columns of `Episode.to_dict`.
+
+        Raises:
+            ImportError: pandas is not installed.
+
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError('to_dataframe needs pandas: pip install "leapnav[pandas]"') from error
+        return pandas.DataFrame([episode.to_dict() for episode in self.episodes])
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.episodes)
+
+    @property
+    def success(self) -> float:
+        """Success rate."""
+        return float(np.mean([episode.success for episode in self.episodes]))
+
+    @property
+    def collision(self) -> float:
+        """Collision rate."""
+        return float(np.mean([episode.collision for episode in self.episodes]))
+
+    @property
+    def soc(self) -> float:
+        """Mean success weighted by optimal cost."""
+        return float(np.mean([episode.soc for episode in self.episodes]))
+
+    @property
+    def regret(self) -> float:
+        """Median regret of the successful episodes; NaN if there are none."""
+        values = [episode.regret for episode in self.episodes if episode.success]
+        return float(np.nanmedian(values)) if values else math.nan
