@@ -26,6 +26,8 @@ from leapnav.commands.scenario.prove import CheckProof, Prove
 from leapnav.commands.scenario.solve import Solve
 from leapnav.commands.train import TrainCommand, train_command
 from leapnav.commands.watch import Watch
+from leapnav.commands.worlds.benchmark import Benchmark
+from leapnav.commands.worlds.import_worlds import Import
 from leapnav.outputs import FAILED, json_on_stdout
 from leapnav.usage import parse_or_explain
 
@@ -36,9 +38,11 @@ COMMANDS = {
     "prove": Prove,
     "check-proof": CheckProof,
     "bank": Bank,
+    "import": Import,
     "rollout": Rollout,
     "train": TrainCommand,  # `parse` replaces it by a class whose defaults are those of the family
     "evaluate": Evaluate,
+    "benchmark": Benchmark,
     "report": Report,
     "export": Export,
     "watch": Watch,

@@ -30,7 +30,7 @@ matplotlib.use("svg")
 import matplotlib.pyplot as plt
 
 FAMILY, N_LEVELS, LEVEL_SEED = "clutter", 2000, 782
-STEPS, SEEDS = 1_000_000, 3
+STEPS, SEEDS = 500_000, 3
 STAGES = (0.0, 0.1, 0.25, 0.5, 1.0)  # fractions of a run at which the scores of all levels are computed
 # Of each level, with the noise of training. The scores and what they are compared with are computed from different
 # episodes, so that their errors are independent.
@@ -69,7 +69,7 @@ def configuration(levels: str, seed: int, runs: Path) -> PPOConfig:
     """Return the settings of a run: the defaults of PPO from scratch, except the levels and the number of steps."""
     bank = None if levels == "fresh" else runs / "levels.bank"
     changes: dict[str, Any] = {"levels": levels, "level_bank": bank, "total_timesteps": STEPS, "seed": seed}
-    intervals = {"evaluate_every": STEPS // 8, "evaluation_scenarios": 200}
+    intervals = {"evaluate_every": STEPS // 5, "evaluation_scenarios": 200}
     return PPOConfig.tuned(FAMILY, out=runs / f"{levels}-{seed}", **changes, **intervals)
 
 

@@ -7,6 +7,7 @@ import threading
 import time
 from unittest import mock
 
+import numpy as np
 import pytest
 
 from leapnav.cli import main
@@ -57,7 +58,7 @@ def test_a_bank_of_given_scenarios_names_what_it_rejects(tmp_path):
     given = worlds()
     bank = build_bank_of(given, tmp_path / "mine.bank", progress=False)
     assert (bank.family, len(bank), bank.drawn) == ("mine", 3, 4)
-    assert bank.given["rejected"] == {"closed": "no certified optimum"}
+    assert bank.given["rejected"] == {"closed": "no certified optimum"} and bank.given["doubtful"] == {}
     assert list(bank) == given[:3] and bank.costs[1] == find_optimum(given[1]).cost
     content = bank.path.read_bytes()
     assert build_bank_of(given, bank.path, progress=False).path.read_bytes() == content  # complete
@@ -65,6 +66,16 @@ def test_a_bank_of_given_scenarios_names_what_it_rejects(tmp_path):
         build_bank_of(given[:2], bank.path, progress=False)
     (tmp_path / "more").mkdir()
     assert build_bank_of(given, tmp_path / "more/mine.bank", workers=2, progress=False).path.read_bytes() == content
+
+
+def test_doubtful_optima_are_admitted_on_request(tmp_path):
+    # Draw 39 of the included test bank, which does not contain it.
+    touched = sample_scenario("polygons", np.random.default_rng([1, 39])).model_copy(update={"name": "touched"})
+    strict = build_bank_of([touched], tmp_path / "strict.bank", progress=False)
+    assert len(strict) == 0 and strict.given["rejected"] == {"touched": "a cheaper extremal touches"}
+    bank = build_bank_of([touched], tmp_path / "all.bank", doubtful=True, progress=False)
+    assert bank[0] == touched and bank.given["doubtful"] == {"touched": "a cheaper extremal touches"}
+    assert bank.certificates[0, 0] < 1e-8 < bank.certificates[0, 3]
 
 
 def test_files_are_scenarios_of_a_bank_and_of_a_family(folder, tmp_path, capsys, monkeypatch):

@@ -25,7 +25,7 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 Attributes of the file: `format` ("leapnav-bank"), `version` (4), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
 leapnav that built the bank), `given` (only of a bank of given scenarios; JSON: `scenarios`, their digest, and
-`rejected`, the reasons by name) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that
+`rejected` and `doubtful`, the reasons by name) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that
 of the other attributes).
 """  # noqa: E501 (tables)
 
@@ -115,8 +115,8 @@ class ScenarioBank(Sequence[Scenario]):
     Attributes:
         path: the file.
         family, seed: family and random seed of the scenarios.
-        given: of a bank of given scenarios, the digest of these scenarios and the reasons why some were rejected, by
-            name; None if the scenarios are random.
+        given: of a bank of given scenarios, `scenarios`, the digest of all of them, and the reasons by name why some
+            were `rejected` or are `doubtful`, see `leapnav.experts.build_bank_of`; None if the scenarios are random.
         drawn: number of scenarios drawn or given, admitted or not.
         rejected: number of scenarios that were not admitted, by reason.
         software: version of leapnav that built the bank.

@@ -53,6 +53,14 @@ def judge(optimum: Optimum) -> Rejection | None:
     return Rejection.UNRESOLVED if optimum.doubts else None
 
 
+@dataclass(frozen=True)
+class Result:
+    """What is known of a solved scenario: why it is rejected, and why its optimum is doubtful; empty texts if not."""
+
+    rejected: str
+    doubt: str
+
+
 class ScenarioDraws(Protocol):
     """The scenarios that a bank is built from, by number."""
 
@@ -70,8 +78,8 @@ class ScenarioDraws(Protocol):
         """Return the function that solves a scenario, see `solve_for_bank`."""
         ...
 
-    def describe(self, reasons: Mapping[int, str]) -> dict[str, Any] | None:
-        """Return the attribute `given` of the bank, from the reasons of rejection of the solved scenarios."""
+    def describe(self, results: Mapping[int, Result]) -> dict[str, Any] | None:
+        """Return the attribute `given` of the bank."""
         ...
 
 
@@ -98,7 +106,7 @@ class RandomDraws:
         """See `ScenarioDraws`."""
         return partial(draw, number, self.family, self.seed, self.robot, self.horizon)
 
-    def describe(self, reasons: Mapping[int, str]) -> None:
+    def describe(self, results: Mapping[int, Result]) -> None:
         """See `ScenarioDraws`."""
 
 
@@ -108,6 +116,7 @@ class GivenScenarios:
 
     name: str
     scenarios: tuple[Scenario, ...]
+    doubtful: bool = False
 
     @property
     def available(self) -> int:
@@ -118,16 +127,19 @@ class GivenScenarios:
     def settings(self) -> dict[str, Any]:
         """See `ScenarioDraws`."""
         texts = "\n".join(scenario.to_json() for scenario in self.scenarios)
-        return {"family": self.name, "seed": 0, "scenarios": digest(texts.encode())}
+        doubtful = {"doubtful": True} if self.doubtful else {}
+        return {"family": self.name, "seed": 0, "scenarios": digest(texts.encode()), **doubtful}
 
     def job(self, number: int) -> Job:
         """See `ScenarioDraws`."""
-        return partial(solve_for_bank, self.scenarios[number])
+        return partial(solve_for_bank, self.scenarios[number], self.doubtful)
 
-    def describe(self, reasons: Mapping[int, str]) -> dict[str, Any]:
+    def describe(self, results: Mapping[int, Result]) -> dict[str, Any]:
         """See `ScenarioDraws`."""
-        rejected = {self.scenarios[number].name: reason for number, reason in reasons.items() if reason}
-        return {"scenarios": self.settings["scenarios"], "rejected": rejected}
+        named = {self.scenarios[number].name: result for number, result in results.items()}
+        rejected = {name: result.rejected for name, result in named.items() if result.rejected}
+        doubts = {name: result.doubt for name, result in named.items() if result.doubt and not result.rejected}
+        return {"scenarios": self.settings["scenarios"], "rejected": rejected, "doubtful": doubts}
 
 
 def build_bank(
@@ -184,6 +196,7 @@ def build_bank_of(
     scenarios: PathLike | Sequence[Scenario | PathLike],
     out: str | os.PathLike[str],
     *,
+    doubtful: bool = False,
     workers: int = 1,
     dask: str | None = None,
     progress: bool = True,
@@ -197,6 +210,8 @@ def build_bank_of(
     Args:
         scenarios: scenarios with the same robot model and kind of horizon; or their files, see `read_scenarios`.
         out: file of the bank. A complete bank of these scenarios is returned unchanged.
+        doubtful: also admit scenarios with a certified optimum for which the search found a cheaper solution that
+            touches an obstacle or was not certified; the `doubtful` of `bank.given` are their names, with the reasons.
         workers, dask, progress: see `build_bank`.
 
     Raises:
@@ -209,7 +224,7 @@ def build_bank_of(
     files = [one for one in given if not isinstance(one, Scenario)]
     found = [one for one in given if isinstance(one, Scenario)] + (read_scenarios(files) if files else [])
     check_collection(found)
-    draws = GivenScenarios(target.stem, tuple(found))
+    draws = GivenScenarios(target.stem, tuple(found), doubtful)
     expected = {"family": draws.name, "scenarios": draws.settings["scenarios"]}
     return _build(draws, len(found), target, expected, workers=workers, dask=dask, progress=progress)
 
@@ -237,17 +252,17 @@ def _build(
         ResumableStore(_build_directory(target), "bank", settings, BankError) as store,
         process_pool(workers, dask) as pool,
     ):
-        reasons = _solve(store, pool, draws, count, progress)
-        entries = [_entry(number, store.read(number)) for number, reason in reasons.items() if not reason]
+        results = _solve(store, pool, draws, count, progress)
+        entries = [_entry(number, store.read(number)) for number, result in results.items() if not result.rejected]
         write_bank(
             target,
             entries,
             family=settings["family"],
             seed=settings["seed"],
-            drawn=len(reasons),
-            rejected=Counter(reason for reason in reasons.values() if reason),
+            drawn=len(results),
+            rejected=Counter(result.rejected for result in results.values() if result.rejected),
             software=leapnav.__version__,
-            given=draws.describe(reasons),
+            given=draws.describe(results),
         )
     discard(store.directory)
     return ScenarioBank(target)
@@ -272,14 +287,15 @@ def draw(
     return solve_for_bank(scenario.model_copy(update={"name": f"{name}-{seed}-{number}", "time_limit": None}))
 
 
-def solve_for_bank(scenario: Scenario) -> Arrays:
+def solve_for_bank(scenario: Scenario, doubtful: bool = False) -> Arrays:
     """A scenario with its optimum, as arrays of a shard; "rejected" is empty if it is admitted.
 
-    The time limit of a scenario with a free horizon and without a limit is 3 times the duration of its optimum.
+    A doubtful optimum is admitted only on request, with the reason in "doubt". The time limit of a scenario with a free
+    horizon and without a limit is 3 times the duration of its optimum.
     """
     optimum = find_optimum(scenario)
     rejection = judge(optimum)
-    if rejection is not None:
+    if rejection is not None and not (doubtful and optimum.success):
         return {"rejected": np.array(rejection.value)}
     certificate = optimum.certificate
     assert certificate is not None
@@ -289,6 +305,7 @@ def solve_for_bank(scenario: Scenario) -> Arrays:
     states, controls, costates = (values.astype("<f4") for values in optimum.evaluate(point_times(duration)))
     return {
         "rejected": np.array(""),
+        **({} if rejection is None else {"doubt": np.array(rejection.value)}),
         "scenario": np.frombuffer(scenario.to_json().encode(), dtype="u1"),
         **({"horizon": np.array(duration)} if scenario.horizon is None else {}),
         "cost": np.array(optimum.cost),
@@ -302,19 +319,21 @@ def solve_for_bank(scenario: Scenario) -> Arrays:
     }
 
 
-def _solve(store: ResumableStore, pool: Parallel, draws: ScenarioDraws, count: int, progress: bool) -> dict[int, str]:
-    """Solve scenarios until `count` are admitted or none is left; return the reasons of rejection, in order."""
-    reasons: dict[int, str] = {}
+def _solve(
+    store: ResumableStore, pool: Parallel, draws: ScenarioDraws, count: int, progress: bool
+) -> dict[int, Result]:
+    """Solve scenarios until `count` are admitted or none is left; return the results in order."""
+    results: dict[int, Result] = {}
     n_admitted, available = 0, math.inf if draws.available is None else draws.available
     with progress_bar(total=count, label="Building the bank", unit="scenarios", show=progress) as bar:
-        while n_admitted < count and len(reasons) < available:
+        while n_admitted < count and len(results) < available:
             # One for each missing scenario, so that the bank holds the first `count` admitted scenarios.
-            numbers = range(len(reasons), len(reasons) + count - n_admitted)
+            numbers = range(len(results), len(results) + count - n_admitted)
             for number, arrays in store.complete(numbers, draws.job, pool, bar):
-                reasons[number] = str(arrays["rejected"])
-                advance(bar, not reasons[number])
-            n_admitted = sum(not reason for reason in reasons.values())
-    return dict(sorted(reasons.items()))
+                results[number] = Result(str(arrays["rejected"]), str(arrays.get("doubt", "")))
+                advance(bar, not results[number].rejected)
+            n_admitted = sum(not result.rejected for result in results.values())
+    return dict(sorted(results.items()))
 
 
 def _entry(number: int, arrays: Arrays) -> BankEntry:

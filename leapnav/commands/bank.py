@@ -33,6 +33,8 @@ class Build:
     scenarios: tuple[str, ...] = ()
     """Scenario files, directories of them, or quoted patterns such as "worlds/*.json"; they are used instead of sampled
     scenarios, and the options from --family to --seed are not."""
+    doubtful: bool = False
+    """Also admit files with a certified optimum for which a cheaper solution touches or was not certified."""
     family: Family = "clutter"
     """Family of the scenarios."""
     robot: Robot = "unicycle"
@@ -56,9 +58,12 @@ class Build:
         from leapnav.experts.data.banks import build_bank, build_bank_of
 
         if self.scenarios:
-            bank = build_bank_of(self.scenarios, self.out, workers=self.workers, dask=self.dask)
-            for name, reason in (bank.given or {})["rejected"].items():
-                print(f"{name}: rejected: {reason}")
+            parallel = {"workers": self.workers, "dask": self.dask}
+            bank = build_bank_of(self.scenarios, self.out, doubtful=self.doubtful, **parallel)
+            assert bank.given is not None
+            for kind in ("rejected", "doubtful"):
+                for name, reason in bank.given[kind].items():
+                    print(f"{name}: {kind}: {reason}")
         else:
             announce(of_scenarios(self.family, self.count, 1 if self.dask else self.workers), "finding the optima")
             task = {"robot": self.robot, "horizon": self.horizon, "seed": self.seed}

@@ -22,6 +22,7 @@ from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.experts.plotting import draw_scenario
+from leapnav.training.scoring.barn import BarnScore
 from leapnav.training.scoring.comparison import Comparison
 from leapnav.training.scoring.results import Episode
 from leapnav.training.scoring.scores import Bracket, Interval, Score, profile
@@ -71,6 +72,18 @@ def print_scores(comparison: Comparison, console: Console | None = None) -> None
             console.print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
     if len(comparison.families) > 1:
         console.print(_family_table(comparison))
+
+
+def print_barn_scores(scores: Sequence[BarnScore]) -> None:
+    """Print the scores of the BARN challenge."""
+    table = Table(title="BARN challenge", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("policy", min_width=6, overflow="fold")
+    for title in ("success %", "time s", "score"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for row in scores:
+        seconds = f"{row.seconds:.1f}" if math.isfinite(row.seconds) else "-"
+        table.add_row(row.policy, f"{100 * row.success:.1f}", seconds, f"{row.score:.4f}")
+    Console().print(table)
 
 
 def _bracket_text(bracket: Bracket) -> str:

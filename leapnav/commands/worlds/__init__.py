@@ -1,0 +1,1 @@
+"""Commands for the worlds of other benchmarks."""

@@ -1,0 +1,87 @@
+"""`leapnav import`: scenario files from the worlds of other benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from leapnav.commands.options import Horizon, Robot
+
+if TYPE_CHECKING:
+    from leapnav.envs.scenarios.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class ImportBarn:
+    """Read the worlds of the BARN challenge (https://github.com/Daffan/the-barn-challenge, MIT licence)."""
+
+    folder: tyro.conf.Positional[Path]
+    """Directory of the files world_N.world, or a clone of the repository."""
+    out: Path
+    """Output directory of the scenario files."""
+    robot: Robot = "unicycle"
+    """Model of the robot."""
+    horizon: Horizon = "fixed"
+    """Fixed or free horizon."""
+
+    def run(self) -> int:
+        """Write the scenario files."""
+        from leapnav.envs.worlds.barn import read_barn
+
+        return _write(read_barn(self.folder, robot=self.robot, horizon=self.horizon), self.out)
+
+
+@dataclass(frozen=True)
+class ImportMovingAI:
+    """Read problems on a map of the Moving AI Lab (https://movingai.com/benchmarks, ODC Attribution License)."""
+
+    file: tyro.conf.Positional[Path]
+    """Map file (.map)."""
+    scen: Path
+    """Scenario file (.map.scen)."""
+    out: Path
+    """Output directory of the scenario files."""
+    count: int | None = None
+    """Number of problems, evenly spaced in the file; by default all."""
+    cell_size: float = 1.0
+    """Side length of a cell (m)."""
+    robot: Robot = "unicycle"
+    """Model of the robot."""
+
+    def run(self) -> int:
+        """Write the scenario files."""
+        from leapnav.envs.worlds.movingai import read_movingai_problems
+
+        scenarios = read_movingai_problems(
+            self.file, self.scen, count=self.count, cell_size=self.cell_size, robot=self.robot
+        )
+        return _write(scenarios, self.out)
+
+
+@dataclass(frozen=True)
+class Import:
+    """Read the worlds of another benchmark from your own download, and write them as scenario files."""
+
+    source: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[ImportBarn, tyro.conf.subcommand("barn")]
+        | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
+    ]
+
+    def run(self) -> int:
+        """Read the worlds."""
+        return self.source.run()
+
+
+def _write(scenarios: Sequence[Scenario], out: Path) -> int:
+    """Write scenarios to files with their names."""
+    out.mkdir(parents=True, exist_ok=True)
+    for scenario in scenarios:
+        scenario.to_json(out / f"{scenario.name}.json")
+    print(
+        f"wrote {len(scenarios)} scenarios to {out}; next: leapnav bank build --scenarios {out} --out {out.name}.bank"
+    )
+    return 0
