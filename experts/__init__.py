@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from leapnav.experts.bounds.plotting import plot_tube
     from leapnav.experts.data.bank_bounds import prove_bank
     from leapnav.experts.data.banks import build_bank, build_bank_of
+    from leapnav.experts.data.cards import data_card
     from leapnav.experts.data.demonstrations import load_demonstrations
     from leapnav.experts.data.rollouts import check_dataset, rollout
     from leapnav.experts.plotting import plot_extremal
@@ -49,6 +50,7 @@ __all__ = [
     "check_dataset",
     "check_proof",
     "continuation",
+    "data_card",
     "differential_drive",
     "find_optimum",
     "find_reached_optimum",
@@ -70,6 +72,7 @@ __all__ = [
 _LAZY = {
     "build_bank": "leapnav.experts.data.banks",
     "build_bank_of": "leapnav.experts.data.banks",
+    "data_card": "leapnav.experts.data.cards",
     "check_dataset": "leapnav.experts.data.rollouts",
     "load_demonstrations": "leapnav.experts.data.demonstrations",
     "plot_extremal": "leapnav.experts.plotting",

@@ -9,7 +9,9 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import yaml
 
+import leapnav
 from leapnav.cli import main
 from leapnav.envs import (
     BankError,
@@ -22,7 +24,7 @@ from leapnav.envs import (
     sample_scenario,
 )
 from leapnav.envs.scenarios.files import read_scenarios
-from leapnav.experts import build_bank_of, find_optimum, load_demonstrations, rollout
+from leapnav.experts import build_bank_of, data_card, find_optimum, load_demonstrations, rollout
 from leapnav.training import evaluate, load_policy, policy_environment
 
 RING = [
@@ -58,7 +60,7 @@ def test_a_bank_of_given_scenarios_names_what_it_rejects(tmp_path):
     given = worlds()
     bank = build_bank_of(given, tmp_path / "mine.bank", progress=False)
     assert (bank.family, len(bank), bank.drawn) == ("mine", 3, 4)
-    assert bank.given["rejected"] == {"closed": "no certified optimum"} and bank.given["doubtful"] == {}
+    assert bank.given["rejected"] == {"closed": "no certified optimum"} and "doubtful" not in bank.given
     assert list(bank) == given[:3] and bank.costs[1] == find_optimum(given[1]).cost
     content = bank.path.read_bytes()
     assert build_bank_of(given, bank.path, progress=False).path.read_bytes() == content  # complete
@@ -68,6 +70,25 @@ def test_a_bank_of_given_scenarios_names_what_it_rejects(tmp_path):
     assert build_bank_of(given, tmp_path / "more/mine.bank", workers=2, progress=False).path.read_bytes() == content
 
 
+def test_a_data_card_says_where_the_scenarios_come_from(tmp_path, capsys):
+    sources = {"origin": "a laboratory", "licence": "cc-by-4.0"}
+    bank = build_bank_of([sample_scenario("open", 5)], tmp_path / "lab.bank", **sources, progress=False)
+    assert main(["bank", "show", str(bank.path), "--card"]) == 0
+    card = capsys.readouterr().out
+    assert card == data_card(bank) and not list(tmp_path.glob("*.png"))
+    _, metadata, text = card.split("---\n", 2)
+    assert yaml.safe_load(metadata)["license"] == "cc-by-4.0"
+    for line in (
+        "| origin | a laboratory |",
+        "| scenarios | 1, of 1 given |",
+        f"| software | leapnav {leapnav.__version__} |",
+    ):
+        assert line in text
+    assert text.count("BLAKE2b of ") == len(bank.checksums) >= 12
+    shipped = data_card(ScenarioBank.shipped("clutter", "test"))
+    assert "sampled by leapnav, family `clutter`, seed 1" in shipped and 'license: "mit"' in shipped
+
+
 def test_doubtful_optima_are_admitted_on_request(tmp_path):
     # Draw 39 of the included test bank, which does not contain it.
     touched = sample_scenario("polygons", np.random.default_rng([1, 39])).model_copy(update={"name": "touched"})
@@ -75,6 +96,8 @@ def test_doubtful_optima_are_admitted_on_request(tmp_path):
     assert len(strict) == 0 and strict.given["rejected"] == {"touched": "a cheaper extremal touches"}
     bank = build_bank_of([touched], tmp_path / "all.bank", doubtful=True, progress=False)
     assert bank[0] == touched and bank.given["doubtful"] == {"touched": "a cheaper extremal touches"}
+    with pytest.raises(BankError, match="exists, with doubtful True instead of False"):
+        build_bank_of([touched], tmp_path / "all.bank", progress=False)
     assert bank.certificates[0, 0] < 1e-8 < bank.certificates[0, 3]
 
 

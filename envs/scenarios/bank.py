@@ -128,6 +128,7 @@ class ScenarioBank(Sequence[Scenario]):
         tasks (n, K): see `leapnav.envs.scenarios.scenario`.
         horizon: kind of the horizon of all scenarios, "fixed" or "free".
         horizons (n,): durations of the optima (s).
+        checksums: BLAKE2b digests of the datasets, and of the attributes.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -180,7 +181,7 @@ class ScenarioBank(Sequence[Scenario]):
                 name: content[start : start + size].view(TYPES[name]).reshape(shape)
                 for name, (start, size, shape) in locations.items()
             }
-            self._checksums: dict[str, str] = dict(json.loads(attributes.pop("checksums")))
+            self.checksums: dict[str, str] = dict(json.loads(attributes.pop("checksums")))
             self._verify("attributes", attribute_bytes(attributes))
             for name, array in arrays.items():
                 if array.nbytes <= MAX_VERIFIED_ON_OPENING:
@@ -230,7 +231,7 @@ class ScenarioBank(Sequence[Scenario]):
             BankError: they differ.
 
         """
-        if digest(content) != self._checksums.get(name):
+        if digest(content) != self.checksums.get(name):
             raise BankError(f"{self.path}: damaged: the checksum of {name} differs; copy or build the bank again")
 
     def _array(self, name: str) -> np.ndarray:

@@ -27,6 +27,7 @@ from leapnav.envs.utils.validation import check_choice
 START, GOAL = (-2.25, 3.0, 1.57), (-2.25, 13.0)
 GOAL_DISTANCE = 1.0  # m from the goal, at which the challenge counts a success
 CELL, LEFT, BOTTOM = 0.15, -4.575, 5.075  # m: the grid of the path files, and its position in the world
+ORIGIN, LICENCE = "BARN challenge, https://github.com/Daffan/the-barn-challenge", "mit"
 PATHS = "path_files"  # directory of the paths, beside the worlds or beside their directory
 
 

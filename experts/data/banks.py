@@ -117,6 +117,8 @@ class GivenScenarios:
     name: str
     scenarios: tuple[Scenario, ...]
     doubtful: bool = False
+    origin: str = ""
+    licence: str = ""
 
     @property
     def available(self) -> int:
@@ -138,8 +140,10 @@ class GivenScenarios:
         """See `ScenarioDraws`."""
         named = {self.scenarios[number].name: result for number, result in results.items()}
         rejected = {name: result.rejected for name, result in named.items() if result.rejected}
-        doubts = {name: result.doubt for name, result in named.items() if result.doubt and not result.rejected}
-        return {"scenarios": self.settings["scenarios"], "rejected": rejected, "doubtful": doubts}
+        found = {"scenarios": self.settings["scenarios"], "rejected": rejected}
+        if self.doubtful:
+            found["doubtful"] = {name: result.doubt for name, result in named.items() if result.doubt}
+        return {**found, "origin": self.origin, "licence": self.licence}
 
 
 def build_bank(
@@ -197,6 +201,8 @@ def build_bank_of(
     out: str | os.PathLike[str],
     *,
     doubtful: bool = False,
+    origin: str = "",
+    licence: str = "",
     workers: int = 1,
     dask: str | None = None,
     progress: bool = True,
@@ -212,6 +218,7 @@ def build_bank_of(
         out: file of the bank. A complete bank of these scenarios is returned unchanged.
         doubtful: also admit scenarios with a certified optimum for which the search found a cheaper solution that
             touches an obstacle or was not certified; the `doubtful` of `bank.given` are their names, with the reasons.
+        origin, licence: where the scenarios come from and their licence, for the data card.
         workers, dask, progress: see `build_bank`.
 
     Raises:
@@ -224,8 +231,8 @@ def build_bank_of(
     files = [one for one in given if not isinstance(one, Scenario)]
     found = [one for one in given if isinstance(one, Scenario)] + (read_scenarios(files) if files else [])
     check_collection(found)
-    draws = GivenScenarios(target.stem, tuple(found), doubtful)
-    expected = {"family": draws.name, "scenarios": draws.settings["scenarios"]}
+    draws = GivenScenarios(target.stem, tuple(found), doubtful, origin, licence)
+    expected = {"family": draws.name, "scenarios": draws.settings["scenarios"], "doubtful": doubtful}
     return _build(draws, len(found), target, expected, workers=workers, dask=dask, progress=progress)
 
 
@@ -362,9 +369,10 @@ def _complete(target: Path, expected: Mapping[str, Any]) -> ScenarioBank:
         "robot": bank.robot,
         "horizon": bank.horizon,
         "scenarios": (bank.given or {}).get("scenarios"),
+        "doubtful": "doubtful" in (bank.given or {}),
         "software": bank.software,
     }
-    for name, value in {"scenarios": None, **expected, "software": leapnav.__version__}.items():
+    for name, value in {"scenarios": None, "doubtful": False, **expected, "software": leapnav.__version__}.items():
         if found[name] != value:
             raise BankError(f"{target}: exists, with {name} {found[name]!r} instead of {value!r}; choose another name")
     discard(_build_directory(target))  # left by a build that was interrupted after it had written the bank

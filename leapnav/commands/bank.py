@@ -35,6 +35,10 @@ class Build:
     scenarios, and the options from --family to --seed are not."""
     doubtful: bool = False
     """Also admit files with a certified optimum for which a cheaper solution touches or was not certified."""
+    origin: str = ""
+    """Where the files come from, for the data card."""
+    licence: str = ""
+    """Licence of the files, for the data card."""
     family: Family = "clutter"
     """Family of the scenarios."""
     robot: Robot = "unicycle"
@@ -58,11 +62,12 @@ class Build:
         from leapnav.experts.data.banks import build_bank, build_bank_of
 
         if self.scenarios:
+            sources = {"origin": self.origin, "licence": self.licence}
             parallel = {"workers": self.workers, "dask": self.dask}
-            bank = build_bank_of(self.scenarios, self.out, doubtful=self.doubtful, **parallel)
+            bank = build_bank_of(self.scenarios, self.out, doubtful=self.doubtful, **sources, **parallel)
             assert bank.given is not None
             for kind in ("rejected", "doubtful"):
-                for name, reason in bank.given[kind].items():
+                for name, reason in bank.given.get(kind, {}).items():
                     print(f"{name}: {kind}: {reason}")
         else:
             announce(of_scenarios(self.family, self.count, 1 if self.dask else self.workers), "finding the optima")
@@ -91,6 +96,8 @@ class Show:
     """Number of scenarios in the picture, evenly spaced in the bank; 0 for no picture."""
     verify: bool = False
     """Search every scenario again with about 100 times the effort (seconds each) and report lower costs."""
+    card: bool = False
+    """Print the data card of the bank, as Markdown for the Hugging Face Hub, and nothing else."""
     json: Path | None = None
     """JSON file of name, cost, horizon (s), clearance (m) and lower bound of every scenario, and of the results of
     --verify; "-" for standard output."""
@@ -103,6 +110,7 @@ class Show:
         """Print the summary, draw the picture and, with `verify`, search again."""
         from leapnav.envs.scenarios.bank import ScenarioBank
         from leapnav.envs.utils.validation import check_at_least
+        from leapnav.experts.data.cards import data_card
         from leapnav.experts.plotting import plot_bank
 
         bank = ScenarioBank(_find(self.file))
@@ -110,6 +118,9 @@ class Show:
         check_at_least("count", self.count, 0)
         check_outputs(self.json, plot)
         bank.verify_checksums()
+        if self.card:
+            print(data_card(bank), end="")
+            return 0
         _print_summary(bank)
         if self.count > 0:
             plot_bank(bank, plot, self.count)

@@ -48,7 +48,7 @@ class Benchmark:
     def run(self) -> int:
         """Build the bank, play the episodes and report the scores."""
         check_outputs(self.json)
-        from leapnav.envs.worlds.barn import path_lengths, read_barn
+        from leapnav.envs.worlds.barn import LICENCE, ORIGIN, path_lengths, read_barn
         from leapnav.experts.data.banks import build_bank_of
         from leapnav.training.scoring.barn import barn_scores
         from leapnav.training.scoring.comparison import compare_policies
@@ -57,7 +57,7 @@ class Benchmark:
 
         specs = [load_policy_spec(name) for name in self.policy]
         scenarios = read_barn(self.folder, robot=self.robot, horizon=self.horizon)
-        bank = build_bank_of(scenarios, self.bank, doubtful=True, workers=self.workers)
+        bank = build_bank_of(scenarios, self.bank, doubtful=True, origin=ORIGIN, licence=LICENCE, workers=self.workers)
         assert bank.given is not None
         for name, reason in bank.given["rejected"].items():
             print(f"{name}: left out: {reason}")
