@@ -103,13 +103,34 @@ def rectangles(blocked: np.ndarray) -> list[tuple[int, int, int, int]]:
             exposed |= free[line : line + height, column : column + width]
     uncovered = blocked & exposed
     found = []
-    while uncovered.any():
-        line, column = map(int, np.unravel_index(np.argmax(uncovered), blocked.shape))
+    for line, column in np.argwhere(uncovered).tolist():
+        if not uncovered[line, column]:  # covered in the meantime
+            continue
         widest, tallest = _grow(blocked, line, column), _grow(blocked.T, column, line)
         candidates = [widest, (tallest[1], tallest[0], tallest[3], tallest[2])]
         best = max(candidates, key=lambda r: int(uncovered[r[0] : r[2], r[1] : r[3]].sum()))
         uncovered[best[0] : best[2], best[1] : best[3]] = False
         found.append(best)
+    return found
+
+
+def rectangle_vertices(
+    blocked: np.ndarray, cell_size: float, origin: tuple[float, float] = (0.0, 0.0)
+) -> list[tuple[tuple[float, float], ...]]:
+    """Return the vertices (m) of the rectangles that cover the blocked cells, see `rectangles`.
+
+    Args:
+        blocked (height, width): bool; the first line is the top of the map.
+        cell_size: side length of a cell (m).
+        origin: position of the lower left corner of the map (m).
+
+    """
+    height, (x, y) = len(blocked), origin
+    found = []
+    for top, left, bottom, right in rectangles(blocked):
+        x_min, x_max = x + cell_size * left, x + cell_size * right
+        low, high = y + cell_size * (height - bottom), y + cell_size * (height - top)
+        found.append(((x_min, low), (x_max, low), (x_max, high), (x_min, high)))
     return found
 
 

@@ -22,7 +22,7 @@ from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.faults import ScenarioError, fault, one_line, read_text, shorten, unique_keys
-from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangles
+from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangle_vertices
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.base import KINDS
@@ -370,12 +370,7 @@ class Scenario(Frozen):
         blocked = read_movingai(path)
         height, width = blocked.shape
         fields.setdefault("name", Path(path).stem)
-        obstacles = []
-        for top, left, bottom, right in rectangles(blocked):
-            low, high = cell_size * (height - bottom), cell_size * (height - top)
-            x_min, x_max = cell_size * left, cell_size * right
-            vertices = ((x_min, low), (x_max, low), (x_max, high), (x_min, high))
-            obstacles.append(Obstacle(polygon=Polygon(vertices=vertices)))
+        obstacles = [Obstacle(polygon=Polygon(vertices=part)) for part in rectangle_vertices(blocked, cell_size)]
         arena = (0.0, 0.0, cell_size * width, cell_size * height)
         scenario = cls(arena=arena, start=start, goal=goal, horizon=horizon, obstacles=tuple(obstacles), **fields)
         # Validation has checked the poses against the obstacles, but some blocked cells are omitted from those.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -63,12 +63,40 @@ class ImportMovingAI:
 
 
 @dataclass(frozen=True)
+class ImportRosMap:
+    """Sample poses on an occupancy grid of ROS (map server, Nav2)."""
+
+    file: tyro.conf.Positional[Path]
+    """YAML file of the map; its image is beside it."""
+    out: Path
+    """Output directory of the scenario files."""
+    count: int = 100
+    """Number of scenarios."""
+    seed: int = 0
+    """First seed: scenario i has seed SEED + i."""
+    unknown: Literal["occupied", "free"] = "occupied"
+    """What unknown cells count as."""
+    robot: Robot = "unicycle"
+    """Model of the robot."""
+    horizon: Horizon = "fixed"
+    """Fixed or free horizon."""
+
+    def run(self) -> int:
+        """Write the scenario files."""
+        from leapnav.envs.worlds.ros_map import read_ros_map, sample_on_map
+
+        grid = read_ros_map(self.file, unknown=self.unknown)
+        return _write(sample_on_map(grid, self.count, seed=self.seed, robot=self.robot, horizon=self.horizon), self.out)
+
+
+@dataclass(frozen=True)
 class Import:
     """Read the worlds of another benchmark from your own download, and write them as scenario files."""
 
     source: tyro.conf.OmitSubcommandPrefixes[
         Annotated[ImportBarn, tyro.conf.subcommand("barn")]
         | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
+        | Annotated[ImportRosMap, tyro.conf.subcommand("ros-map")]
     ]
 
     def run(self) -> int:
