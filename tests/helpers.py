@@ -1,7 +1,14 @@
 """Helpers of several tests: problems and scenarios with known costs, and the stored reference data."""
 
 import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import sympy as sp
@@ -97,3 +104,31 @@ class FastClock:
 
     def tick(self, fps):
         assert fps == 20
+
+
+@contextmanager
+def cluster_that_loses_a_worker(folder: Path, pattern: str) -> Iterator[str]:
+    """Provide the address of a Dask cluster with two workers, of which one is killed when a file matches a pattern."""
+    from dask.distributed import Client, LocalCluster
+
+    killed = []
+
+    def kill_one(client):
+        while not list(folder.glob(pattern)):
+            time.sleep(0.01)
+        pid = next(iter(client.run(os.getpid).values()))
+        os.kill(pid, signal.SIGKILL)
+        killed.append(pid)
+
+    with (
+        mock.patch.dict(
+            os.environ
+        ),  # Dask leaves OMP_NUM_THREADS=1, with which later processes compute other last bits
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        killer = threading.Thread(target=kill_one, args=(client,))
+        killer.start()
+        yield cluster.scheduler_address
+        killer.join()
+    assert len(killed) == 1

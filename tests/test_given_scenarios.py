@@ -1,15 +1,11 @@
 """Banks and families of one's own scenarios, from Python and from files."""
 
 import json
-import os
-import signal
-import threading
-import time
-from unittest import mock
 
 import numpy as np
 import pytest
 import yaml
+from helpers import cluster_that_loses_a_worker
 
 import leapnav
 from leapnav.cli import main
@@ -148,31 +144,13 @@ def test_files_that_cannot_be_a_bank_are_named(files, error, message, tmp_path, 
     assert not (tmp_path / "x.bank").exists() and not (tmp_path / "x.bank.build").exists()
 
 
-@mock.patch.dict(os.environ)  # Dask leaves OMP_NUM_THREADS=1 there, and processes started later compute other last bits
 def test_a_dask_cluster_that_loses_a_worker_builds_the_same_bank(tmp_path):
-    from dask.distributed import Client, LocalCluster
-
     given, out = [sample_scenario("open", seed) for seed in range(5, 105)], tmp_path / "dask/given.bank"
     out.parent.mkdir()
-    killed = []
-
-    def kill_one(client):
-        while not list(out.parent.glob("given.bank.build/shard-*.npz")):
-            time.sleep(0.01)
-        pid = next(iter(client.run(os.getpid).values()))
-        os.kill(pid, signal.SIGKILL)
-        killed.append(pid)
-
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        killer = threading.Thread(target=kill_one, args=(client,))
-        killer.start()
-        bank = build_bank_of(given, out, dask=cluster.scheduler_address, progress=False)
-        killer.join()
-        on_dask = evaluate(load_policy("open"), bank, timed=False, progress=False, dask=cluster.scheduler_address)
-    assert len(killed) == 1 and len(bank) > 90
+    with cluster_that_loses_a_worker(out.parent, "given.bank.build/shard-*.npz") as address:
+        bank = build_bank_of(given, out, dask=address, progress=False)
+        on_dask = evaluate(load_policy("open"), bank, timed=False, progress=False, dask=address)
+    assert len(bank) > 90
     assert bank.path.read_bytes() == build_bank_of(given, tmp_path / "given.bank", progress=False).path.read_bytes()
     here = evaluate(load_policy("open"), bank, timed=False, progress=False)
     assert [episode.to_dict() for episode in on_dask] == [episode.to_dict() for episode in here]

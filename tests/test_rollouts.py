@@ -6,13 +6,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
-from unittest import mock
 
 import h5py
 import numpy as np
 import pytest
+from helpers import cluster_that_loses_a_worker
 
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv
@@ -219,29 +218,10 @@ def test_what_a_killed_process_left_of_a_file_is_removed(tmp_path):
         assert 0 not in store
 
 
-@mock.patch.dict(os.environ)  # Dask leaves OMP_NUM_THREADS=1 there, and processes started later compute other last bits
 def test_a_dask_cluster_that_loses_a_worker_makes_the_same_dataset(whole, tmp_path):
-    from dask.distributed import Client, LocalCluster
-
     out = tmp_path / "out"
-    killed = []
-
-    def kill_one(client):
-        while not list(out.glob(f"{WORK}/shard-*.npz")):
-            time.sleep(0.01)
-        pid = next(iter(client.run(os.getpid).values()))
-        os.kill(pid, signal.SIGKILL)
-        killed.append(pid)
-
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        killer = threading.Thread(target=kill_one, args=(client,))
-        killer.start()
-        summary = rollout("open", 60, out, seed=3, recoveries=1, dask=cluster.scheduler_address, progress=False)
-        killer.join()
-    assert len(killed) == 1
+    with cluster_that_loses_a_worker(out, f"{WORK}/shard-*.npz") as address:
+        summary = rollout("open", 60, out, seed=3, recoveries=1, dask=address, progress=False)
     assert summary.demonstrations > 100
     assert contents(out) == contents(whole)
 

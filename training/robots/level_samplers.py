@@ -146,7 +146,7 @@ class PrioritizedSampler(UniformSampler):
         if not self._reported and self.plays.sum() >= PLAYS_WITHOUT_SCORE * len(self.plays):
             self._reported = True
             gym.logger.warn(
-                f"the levels have no scores {self.score!r}, so all are drawn alike; use the callback LevelScoring, or "
+                f"the levels have no scores {self.score!r}, so all are equally likely; use LevelScoring, or "
                 "call score_rollout after each rollout"
             )
 
