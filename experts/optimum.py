@@ -22,10 +22,11 @@ from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.search.candidates import Candidate, CandidateSearch, shortest_durations
+from leapnav.experts.search.candidates import LATTICE_ERROR, Candidate, CandidateSearch, shortest_durations
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
+from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 from leapnav.experts.search.shortest_paths import LATTICE_KERNELS
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.newton import solve_nodes
@@ -33,11 +34,13 @@ from leapnav.experts.transcription import arcs_descent, descent
 
 N_ELSEWHERE = 4  # additional candidates far from the others: inexpensive, and the most distinct alternatives
 MAX_ROUNDS = 4
-# Refinement, margin (m) and extent of the lattices, tried in this order while nothing is certified or a better path may
-# have been missed. All candidates may lead through a passage that is too narrow, or in which the optimum is close to
-# contact; a margin closes it. A passage or a short path may need smaller cells. The last lattice covers the whole arena
-# if the others were cropped.
-LATTICES = ((1, None, False), (1, 0.05, False), (2, None, False), (2, 0.05, False), (1, None, True))
+# Refinement and margin (m) of the lattices, tried in this order while nothing is certified or a better path may have
+# been missed. All candidates may lead through a passage that is too narrow, or in which the optimum is close to
+# contact; a margin closes it. A passage or a short path may need smaller cells.
+LATTICES: tuple[tuple[int, float | None], ...] = ((1, None), (1, 0.05), (2, None), (2, 0.05))
+# Distance (m) from start to goal above which shortest paths in the plane are the candidates, margins (m) of their
+# lattices, and number of paths of each.
+LONG_DISTANCE, PLANE_MARGINS, N_PLANE_PATHS = 40.0, (None, 0.05), 4
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
 # Most families need 1/15 of it, slalom occasionally 4/3; among hundreds of obstacles one candidate takes 1/3. With
 # 10,000, one scenario of the included banks would lose its second-best optimum.
@@ -120,7 +123,8 @@ KERNELS = (
 class Grids(NamedTuple):
     """Sampled data of a scenario, computed at first use: lattices by their arguments, and whether a path exists."""
 
-    lattice: Callable[..., Lattice]
+    lattice: Callable[[int, float | None], Lattice]
+    plane: Callable[[float | None], Lattice]
     connected: Callable[[], bool]
 
 
@@ -159,7 +163,11 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
     search = LocalOptima(scenario, problem, ALTERNATIVES_BUDGET * candidates)
-    grids = Grids(cache(partial(Lattice, scenario)), cache(partial(is_connected, scenario)))
+    grids = Grids(
+        cache(partial(Lattice, scenario)),
+        cache(partial(plane_lattice, scenario)),
+        cache(partial(is_connected, scenario)),
+    )
     failed = _search(search, grids, candidates, thorough)
     if not search.certified and search.closed_places:  # a closed place may block the only path
         search.reopen_places()
@@ -233,12 +241,11 @@ def shortest_horizon(scenario: Scenario) -> float | None:
 def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) -> Status | None:
     """Search the lattices until a better path is unlikely; return the reason of a failure, or None."""
     scenario = search.scenario
-    shortest_time, cropped = np.inf, False
-    for refinement, margin, whole in LATTICES[: None if thorough else 1]:
-        lattice = grids.lattice(refinement, margin, whole=whole).without(search.closed_places)
-        if whole and (search.certified or not cropped):
-            break
-        cropped = cropped or lattice.cropped
+    if math.dist(scenario.start[:2], scenario.goal[:2]) > LONG_DISTANCE:
+        return _search_plane(search, grids, thorough)
+    shortest_time = np.inf
+    for refinement, margin in LATTICES[: None if thorough else 1]:
+        lattice = grids.lattice(refinement, margin).without(search.closed_places)
         search.reset_failure_budget()
         found: CandidateSearch | None = None
         paths: Iterator[Candidate] = iter(())
@@ -252,11 +259,7 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
             if not batch:
                 break
             taken += batch
-            # A free horizon is never too short.
-            durations = [
-                0.0 if scenario.horizon is None else float(shortest_durations(c.poses, scenario).sum()) for c in batch
-            ]
-            shortest_time = min(shortest_time, *durations)
+            shortest_time = min(shortest_time, *(_shortest_time(c, scenario) for c in batch))
             search.add(Trajectory(c.times, c.poses) for c in batch)
             if not thorough:
                 break
@@ -267,14 +270,51 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
             if search.closed_places != closed:  # other candidates would use the same passage
                 closed = search.closed_places.copy()
                 lattice, found = lattice.without(search.closed_places), None
+        if lattice.cropped and shortest_time == np.inf:
+            return _search_plane(search, grids, thorough)
         # Lattice paths may lead through passages that are slightly too narrow, so this is checked separately.
         if thorough and not search.certified and not grids.connected():
             return Status.NO_PATH
+    return _reason(search, shortest_time)
+
+
+def _search_plane(search: LocalOptima, grids: Grids, thorough: bool) -> Status | None:
+    """Search a large arena for shortest paths in the plane; return the reason of a failure, or None."""
+    scenario, shortest_time = search.scenario, np.inf
+    for margin in PLANE_MARGINS[: None if thorough else 1]:
+        lattice = grids.plane(margin).without(search.closed_places)
+        for _ in range(MAX_ROUNDS):
+            search.reset_failure_budget()
+            closed, cheapest = search.closed_places.copy(), np.inf
+            for candidate in islice(PlaneSearch(lattice).candidates(), N_PLANE_PATHS):
+                cheapest = min(cheapest, candidate.cost)
+                if search.certified and candidate.cost > LATTICE_ERROR * cheapest:
+                    break
+                shortest_time = min(shortest_time, _shortest_time(candidate, scenario))
+                search.add([Trajectory(candidate.times, candidate.poses)])
+            if search.closed_places == closed or not thorough:
+                break
+            lattice = lattice.without(search.closed_places)
+        if search.certified:
+            return None
+        if thorough and not grids.connected():
+            return Status.NO_PATH
+    return _reason(search, shortest_time)
+
+
+def _shortest_time(candidate: Candidate, scenario: Scenario) -> float:
+    """Return the duration (s) of a path at the limits of the robot; 0 with a free horizon, which is never too short."""
+    return 0.0 if scenario.horizon is None else float(shortest_durations(candidate.poses, scenario).sum())
+
+
+def _reason(search: LocalOptima, shortest_time: float) -> Status | None:
+    """Return the reason of a failure, or None if there is another one or none."""
     if search.certified:
         return None
     if shortest_time == np.inf:
         return Status.NO_PATH
-    return Status.HORIZON_TOO_SHORT if scenario.horizon is not None and shortest_time > scenario.horizon else None
+    horizon = search.scenario.horizon
+    return Status.HORIZON_TOO_SHORT if horizon is not None and shortest_time > horizon else None
 
 
 def _result(search: LocalOptima) -> Optimum:

@@ -44,7 +44,9 @@ CIRCLES, RECORDS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # indices into the packe
 # Indices into the record of a shape other than circle and polygon.
 KIND, LENGTH, CENTRE, RIM, REACH, ROUNDING, N_VERTICES, VERTICES = 0, 1, 2, 4, 5, 6, 7, 8
 MAX_OBSTACLES_WITHOUT_GRID = 16  # fewer obstacles are evaluated faster one by one
-MAX_GRID_CELLS = 16  # per axis
+# Number of cells per axis: MIN_GRID_CELLS, or more in a large arena, whose cells are at most REACHES_PER_CELL times as
+# large as the reach of an obstacle.
+MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
 LANES = 8  # doubles in a vector register of 512 bits
 FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
 OUTLINE_MARGIN = 1.02  # factor of the circle through the outline, between whose points a shape may be larger
@@ -242,23 +244,44 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
     corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
     corners += [polygon[:, 3:] for polygon in polygons]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-    size = float(np.max(high - low)) / (1 if are_few else MAX_GRID_CELLS)
+    side = float(np.max(high - low))
+    count = min(max(math.ceil(side / (REACHES_PER_CELL * reach)), MIN_GRID_CELLS), MAX_GRID_CELLS)
+    size = side / (1 if are_few else count)
     shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
-    nearest = np.clip(circles[:, :2], first[:, None], first[:, None] + size)
-    near_circles = np.linalg.norm(nearest - circles[:, :2], axis=2) - circles[:, 2] < reach
-    near_polygons = np.empty((len(first), len(polygons)), dtype=bool)
+    near_circles: list[list[int]] = [[] for _ in first]
+    near_polygons: list[list[int]] = [[] for _ in first]
+    everywhere = np.arange(len(first))
+    for k, (x, y, radius) in enumerate(circles.tolist()):
+        box = np.array([[x, y]]) + (radius + reach) * np.array([[-1.0], [1.0]])
+        cells = everywhere if count == MIN_GRID_CELLS else _cells_in(box, low, size, shape)
+        nearest = np.clip((x, y), first[cells], first[cells] + size)
+        for cell in cells[np.linalg.norm(nearest - (x, y), axis=1) - radius < reach].tolist():
+            near_circles[cell].append(k)
     for k, polygon in enumerate(polygons):
+        cells = everywhere if count == MIN_GRID_CELLS else _cells_in(_offset(polygon, reach), low, size, shape)
         # The minimum over the cell of the distance to each half-plane; the maximum of these is a lower bound for the
         # distance to the polygon.
         lowest = np.minimum(polygon[:, :2] * size, 0.0).sum(axis=1) - polygon[:, 2]
-        near_polygons[:, k] = (first @ polygon[:, :2].T + lowest).max(axis=1) < reach
-    cells = [
-        _pack_cell(circles[a], [polygons[k] for k in np.flatnonzero(b)])
-        for a, b in zip(near_circles, near_polygons, strict=True)
-    ]
+        for cell in cells[(first[cells] @ polygon[:, :2].T + lowest).max(axis=1) < reach].tolist():
+            near_polygons[cell].append(k)
+    cells = [_pack_cell(circles[a], [polygons[k] for k in b]) for a, b in zip(near_circles, near_polygons, strict=True)]
     offsets = 5 + len(first) + np.cumsum([0, *map(len, cells[:-1])])
     return np.concatenate([low, [size], shape, offsets, *cells])
+
+
+def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarray) -> np.ndarray:
+    """Return the indices of the cells that the bounding box of points (n, 2) meets, or of the closest cells."""
+    first = np.clip(((points.min(axis=0) - low) / size).astype(int), 0, shape - 1)
+    last = np.clip(((points.max(axis=0) - low) / size).astype(int), 0, shape - 1)
+    columns, lines = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
+    return (columns[:, None] * shape[1] + lines).ravel()
+
+
+def _offset(polygon: np.ndarray, distance: float) -> np.ndarray:
+    """Return the vertices (m, 2) of a polygon whose edges are moved outwards by a distance (m)."""
+    normals, before = polygon[:, :2], np.roll(polygon[:, :2], 1, axis=0)
+    return polygon[:, 3:] + distance * (normals + before) / (1.0 + (normals * before).sum(axis=1, keepdims=True))
 
 
 def _pack_cell(circles: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray:

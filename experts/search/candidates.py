@@ -102,7 +102,7 @@ class CandidateSearch:
         if len(self._meetings) == 0:
             return
         nodes = path_through(self._meetings[0], self._from_start.parent, self._to_goal.parent)
-        lengths, phi = lattice.metric_lengths(lattice.poses(nodes))
+        lengths, phi = lattice.metric_lengths(self._poses(nodes))
         horizon = lattice.scenario.horizon
         if horizon is None:
             return
@@ -161,13 +161,13 @@ class CandidateSearch:
 
     def _distinct(self, taken: Iterable[Candidate], cells: int, headings: int) -> Iterator[Candidate]:
         """Yield paths through nodes that are farther than the given distance from all paths before."""
-        marked = np.zeros(self.lattice.columns * self.lattice.lines * HEADINGS, dtype=bool)
+        marked = np.zeros(len(self._from_start.cost), dtype=bool)
         for candidate in taken:
-            mark(marked, candidate.nodes, self.lattice.lines, cells, headings)
+            self._mark(marked, candidate.nodes, cells, headings)
         for node in self._meetings:
             if not marked[node]:
                 candidate = self._candidate(int(node))
-                mark(marked, candidate.nodes, self.lattice.lines, cells, headings)
+                self._mark(marked, candidate.nodes, cells, headings)
                 yield candidate
 
     def _first_energy(self) -> float:
@@ -192,7 +192,7 @@ class CandidateSearch:
     def _plane_distance(self, energy: float) -> float:
         """Return the cost of the shortest path if rotation were free; infinite if there is none."""
         scenario, metric = self.lattice.scenario, self._metric(energy)
-        cost = _plane_costs(metric, self.lattice.nodes_around(*scenario.start, metric.plane))
+        cost = cell_costs(metric, self.lattice.nodes_around(*scenario.start, metric.plane))
         targets = self.lattice.nodes_around(*scenario.goal, metric.plane).nodes // HEADINGS
         return float(cost[targets].min()) if len(targets) else math.inf
 
@@ -212,7 +212,7 @@ class CandidateSearch:
         scenario, metric = self.lattice.scenario, self._metric(self.energy)
         seeds = self.lattice.nodes_around(*scenario.start, metric.plane)
         ends = self.lattice.nodes_around(*scenario.goal, metric.plane)
-        bound = _plane_costs(metric, seeds)
+        bound = cell_costs(metric, seeds)
         limits = Limits(self._reach, self.slack, math.inf)
         grow = tree if self.lattice.moves.rotating and len(metric.speed) == 1 else general_tree
         cost_behind, behind, limit = grow(metric, ends, seeds, bound, False, limits)
@@ -220,10 +220,18 @@ class CandidateSearch:
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
         self._meetings = meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit)
 
+    def _poses(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the poses (N + 2, 3) along nodes (N,)."""
+        return self.lattice.poses(nodes)
+
+    def _mark(self, marked: np.ndarray, nodes: np.ndarray, cells: int, headings: int) -> None:
+        """Mark the nodes within a distance of a path."""
+        mark(marked, nodes, self.lattice.lines, cells, headings)
+
     def _candidate(self, node: int) -> Candidate:
         """Return the path through a node."""
         nodes = path_through(node, self._from_start.parent, self._to_goal.parent)
-        poses, horizon = self.lattice.poses(nodes), self.lattice.scenario.horizon
+        poses, horizon = self._poses(nodes), self.lattice.scenario.horizon
         lengths, phi = self.lattice.metric_lengths(poses)
         # The time of a path of length zero (the goal is the start) is distributed evenly.
         lengths = np.maximum(lengths, 1e-9)
@@ -248,7 +256,7 @@ def best_candidate(lattice: Lattice) -> Candidate | None:
     return next(CandidateSearch(lattice).candidates(), None)
 
 
-def _plane_costs(metric: Metric, seeds: Nodes) -> np.ndarray:
+def cell_costs(metric: Metric, seeds: Nodes) -> np.ndarray:
     """Return the costs of the cells from those of the seeds if rotation were free."""
     cells = np.unique(seeds.nodes // HEADINGS)
     return plane_costs(metric, Nodes(cells, np.zeros(len(cells))))

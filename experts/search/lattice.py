@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import label
@@ -21,8 +22,9 @@ from leapnav.experts.search.shortest_paths import Nodes
 # Smallest and largest cell (m), and number of cells from start to goal: small enough for manoeuvres over a short
 # distance. The obstacles are sampled at half of this resolution.
 MIN_CELL, MAX_CELL, CELLS_PER_DISTANCE = 0.05, 0.2, 20
-# Smallest spacing (m) and largest number of points per side of the grid that decides whether a path exists.
-MIN_SPACING, MAX_POINTS = 0.02, 600
+# Smallest spacing (m), and first and largest number of points per side of the grid that decides whether a path exists.
+MIN_SPACING, FIRST_POINTS, MAX_POINTS = 0.02, 150, 5000
+CROSS, SQUARE = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]]), np.ones((3, 3), dtype=int)  # neighbours of a point
 MAX_CELLS = 250  # per side; larger arenas have larger cells
 # Largest depth in an obstacle (robot radii) of a lattice point: a passage that just admits the robot may lie between
 # two points, but no wall is thinner than the robot.
@@ -56,7 +58,8 @@ class Lattice:
         scenario: the scenario.
         refinement: factor by which the cells are smaller than usual.
         margin: smallest clearance (m) of a lattice point; None tolerates a small depth, see TOLERATED_DEPTH.
-        whole: whether to cover all of a large arena, with large cells.
+        max_cells: largest number of cells per side.
+        whole: whether to cover all obstacles of a large arena, with large cells if necessary.
 
     Attributes:
         scenario: the scenario.
@@ -77,6 +80,8 @@ class Lattice:
         scenario: Scenario,
         refinement: int = 1,
         margin: float | None = None,
+        *,
+        max_cells: int = MAX_CELLS,
         whole: bool = False,
     ) -> None:
         self.scenario = scenario
@@ -88,12 +93,15 @@ class Lattice:
         cell = min(max(distance / CELLS_PER_DISTANCE, MIN_CELL), MAX_CELL, robot.max_lattice_cell()) / refinement
         x, y, _ = scenario.start
         if not whole:  # limits the search to the surroundings of start and goal, so that the cells stay small
-            half = max(cell * MAX_CELLS / 2, 0.75 * distance)
+            half = max(cell * max_cells / 2, 0.75 * distance)
             middle = (x + scenario.goal[0]) / 2, (y + scenario.goal[1]) / 2
-            x_min, x_max = max(x_min, middle[0] - half), min(x_max, middle[0] + half)
-            y_min, y_max = max(y_min, middle[1] - half), min(y_max, middle[1] + half)
-        self.cropped = (x_min, y_min, x_max, y_max) != tuple(scenario.arena)
-        self.cell = max(cell, (x_max - x_min) / MAX_CELLS, (y_max - y_min) / MAX_CELLS)
+            low, high = np.subtract(middle, half), np.add(middle, half)
+        else:
+            low, high = _occupied(scenario)
+        x_min, y_min = np.maximum((x_min, y_min), low).tolist()
+        x_max, y_max = np.minimum((x_max, y_max), high).tolist()
+        self.cropped = not whole and (x_min, y_min, x_max, y_max) != tuple(scenario.arena)
+        self.cell = max(cell, (x_max - x_min) / max_cells, (y_max - y_min) / max_cells)
         speed_weight, turn_weight = robot.metric(scenario.cost)
         # If rotation had almost no cost, all headings of a cell would be equivalent, and the search would not end.
         turn_weight = max(turn_weight, speed_weight * (MIN_TURN_LENGTH * self.cell) ** 2)
@@ -196,30 +204,81 @@ class Lattice:
 
 
 def is_connected(scenario: Scenario) -> bool:
-    """Return whether a collision-free path may exist from start to goal, at the resolution of a fine grid.
+    """Return whether a collision-free path may exist from start to goal.
 
     A path of the robot is also one of a disc around (x, y) in its footprint, which can rotate in place, so that only
-    the position matters.
+    the position matters. The squares around the points of a grid contain a path of the disc only if the clearance is
+    above minus half of their diagonal, so that False is certain if such squares do not connect start and goal. True is
+    certain if points with positive clearance do. Otherwise the grid is refined; passages that differ from the disc by
+    less than MIN_SPACING are closed.
     """
     discs = scenario.discs
     radius = max(float((discs[:, 1] - np.abs(discs[:, 0])).max()), 1e-3)
-    x_min, y_min, x_max, y_max = scenario.arena
-    spacing = max(MIN_SPACING, (x_max - x_min) / MAX_POINTS, (y_max - y_min) / MAX_POINTS)
-    connected = False
-    for x, y, _ in (scenario.start, scenario.goal):
+    low, high = _occupied(scenario)
+    side = float((high - low).max())
+    spacing = max(MIN_SPACING, side / FIRST_POINTS)
+    while True:
         # The grid is aligned with the start and then with the goal, because the point closest to a pose that is not on
         # the grid may be inside an obstacle.
-        left, below = int((x - x_min) / spacing), int((y - y_min) / spacing)
-        columns, lines = left + int((x_max - x) / spacing) + 1, below + int((y_max - y) / spacing) + 1
-        origin = x - left * spacing, y - below * spacing
-        free = sample_grid(scenario.field, radius, PointGrid(*origin, spacing, columns, lines), spacing)[1] > 0
-        other = scenario.goal if (x, y) == scenario.start[:2] else scenario.start
-        at = min(max(round((other[0] - origin[0]) / spacing), 0), columns - 1)
-        up = min(max(round((other[1] - origin[1]) / spacing), 0), lines - 1)
-        # A pose very close to a wall may have no free neighbour on the grid.
-        for i, j in ((left, below), (at, up)):
-            free[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = True
-        regions = np.empty(free.shape, dtype=np.int32)
-        label(free, structure=np.ones((3, 3)), output=regions)
-        connected = connected or bool(regions[left, below] == regions[at, up])
-    return connected
+        for pose, other in ((scenario.start, scenario.goal), (scenario.goal, scenario.start)):
+            at = _AlignedGrid.around(pose, low, high, spacing)
+            clearance = sample_grid(scenario.field, radius, at.points, 2.0 * spacing)[1]
+            ends = (at.first, at.cell_of(other))
+            if not _joins(clearance > -math.sqrt(0.5) * spacing, ends, structure=CROSS):
+                return False
+            free = clearance > 0
+            for i, j in ends:  # a pose very close to a wall may have no free neighbour on the grid
+                free[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = True
+            if _joins(free, ends, structure=SQUARE):
+                return True
+        if spacing <= MIN_SPACING:
+            return False
+        if side > MAX_POINTS * spacing / 2:
+            return True
+        spacing = max(MIN_SPACING, spacing / 2)
+
+
+class _AlignedGrid(NamedTuple):
+    """A grid of points, one of which is a given position, with the index of that point."""
+
+    points: PointGrid
+    first: tuple[int, int]
+
+    @classmethod
+    def around(cls, pose: Sequence[float | None], low: np.ndarray, high: np.ndarray, spacing: float) -> _AlignedGrid:
+        """Return the grid from `low` to `high` (m) that contains the position of a pose."""
+        at = np.array(pose[:2], dtype=float)
+        before, after = (np.ceil(gap / spacing).astype(int) for gap in (at - low, high - at))
+        columns, lines = (before + after + 1).tolist()
+        i, j = before.tolist()
+        x, y = (at - before * spacing).tolist()
+        return cls(PointGrid(x, y, spacing, columns, lines), (i, j))
+
+    def cell_of(self, pose: Sequence[float | None]) -> tuple[int, int]:
+        """Return the index of the point closest to the position of a pose."""
+        grid = self.points
+        at = np.rint((np.array(pose[:2], dtype=float) - (grid.x0, grid.y0)) / grid.spacing).astype(int)
+        i, j = np.clip(at, 0, (grid.columns - 1, grid.lines - 1)).tolist()
+        return i, j
+
+
+def _joins(free: np.ndarray, ends: tuple[tuple[int, int], tuple[int, int]], structure: np.ndarray) -> bool:
+    """Return whether two points are in the same region of free points."""
+    regions = np.empty(free.shape, dtype=np.int32)
+    label(free, structure=structure, output=regions)
+    first, second = regions[ends[0]], regions[ends[1]]
+    return bool(first == second) and first > 0
+
+
+def _occupied(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners (2,) of the part of the arena that contains all obstacles and poses, with a margin around it.
+
+    Outside of it there is nothing to avoid, and no shortest path leaves it.
+    """
+    outlines = [obstacle.shape.outline() for obstacle in scenario.obstacles]
+    points = np.concatenate([*outlines, [scenario.start[:2], scenario.goal[:2]]])
+    margin = RELEVANT_DISTANCE * scenario.cost.proximity_scale + 2.0 * float(np.abs(scenario.discs).sum(axis=1).max())
+    x_min, y_min, x_max, y_max = scenario.arena
+    low = np.maximum(points.min(axis=0) - margin, (x_min, y_min))
+    high = np.minimum(points.max(axis=0) + margin, (x_max, y_max))
+    return low, high

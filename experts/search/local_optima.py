@@ -31,6 +31,8 @@ NEWTON_ITERATIONS, FIRST_ITERATIONS, EXPENSIVE_ITERATIONS = 25, 14, 10
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
 INTERVALS_PER_SEGMENT, MIN_SEGMENTS = 8, 8
 MAX_ATTEMPTS = 3
+# A long refined path: number of intervals above which it is one, attempts that it omits, and intervals per segment.
+LONG_PATH, SKIPPED_ATTEMPTS, INTERVALS_PER_SEGMENT_OF_LONG_PATH = 2048, 2, 3
 # Two paths are duplicates if they stay within this distance of each other (m, and rad for the heading) ...
 DUPLICATE_DISTANCE = 0.15
 # ... and two extremals are duplicates if, in addition, their costs agree to this relative tolerance.
@@ -234,13 +236,17 @@ class LocalOptima:
         is_expensive = self._is_expensive(direct, REFINED_ERROR)
         if is_expensive:  # not the optimum
             n_attempts = 1
-        for attempt in range(n_attempts):
+        # On a long path, some place is too coarse for the first attempts.
+        first = SKIPPED_ATTEMPTS if len(direct.controls) > LONG_PATH else 0
+        for attempt in range(n_attempts + first):
             if attempt > 0:
                 direct = self._optimise(problem, direct.refined())
                 for extremal in (*self.certified, *self.refused):
                     if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
                         return extremal, total
-            iterations = NEWTON_ITERATIONS if attempt == n_attempts - 1 else FIRST_ITERATIONS
+            if attempt < first:
+                continue
+            iterations = NEWTON_ITERATIONS if attempt == n_attempts + first - 1 else FIRST_ITERATIONS
             iterations = EXPENSIVE_ITERATIONS if is_expensive else iterations
             times, nodes = _shooting_nodes(problem, direct, 2**attempt)
             status, rows, evaluations = _polish(problem, times, nodes, iterations)
@@ -354,7 +360,8 @@ def _shooting_nodes(
 
     """
     intervals = len(direct.controls)
-    segments = max(round(intervals / (INTERVALS_PER_SEGMENT * refinement)), MIN_SEGMENTS) * refinement
+    per_segment = INTERVALS_PER_SEGMENT if intervals <= LONG_PATH * refinement else INTERVALS_PER_SEGMENT_OF_LONG_PATH
+    segments = max(round(intervals / (per_segment * refinement)), MIN_SEGMENTS) * refinement
     at = np.rint(np.linspace(0, intervals, segments + 1)).astype(int)
     times, nodes = direct.times[at], np.concatenate([direct.states[at], direct.costates[at]], axis=1)
     arrays = problem.arrays

@@ -168,6 +168,32 @@ def plane_costs(metric, seeds):
     return cost
 
 
+@kernel(INDICES(METRIC, VECTOR))
+def plane_parents(metric, cost):
+    """Return the predecessor of each cell (-1 for none) on the shortest paths with the costs of `plane_costs`."""
+    speed = metric.plane
+    lines, stride = (speed.shape[1] + 1) // 2, speed.shape[1]
+    flat = speed.ravel()
+    parent = np.full(len(cost), -1, dtype=np.int32)
+    for node in range(len(cost)):
+        if cost[node] == np.inf:
+            continue
+        here = 2 * (node // lines) * stride + 2 * (node % lines)
+        lowest = np.inf
+        for k in range(HEADINGS):
+            dx, dy = DIRECTIONS[k, 0], DIRECTIONS[k, 1]
+            before = node + dx * lines + dy
+            if before < 0 or before >= len(cost) or cost[before] >= cost[node]:
+                continue
+            middle = dx * stride + dy
+            length = math.sqrt(metric.speed_weight * (dx * dx + dy * dy)) * metric.cell / 6.0
+            total = cost[before] + length * (flat[here] + 4.0 * flat[here + middle] + flat[here + 2 * middle])
+            # Seeds have a lower cost than any path through their neighbours.
+            if total < lowest and total <= cost[node] * (1.0 + 1e-9):
+                lowest, parent[node] = total, before
+    return parent
+
+
 @kernel(tuple_of(VECTOR, INDICES, float64)(METRIC, NODES, NODES, VECTOR, boolean, LIMITS))
 def tree(metric, seeds, ends, rest, exact, limits):
     """Compute the tree of shortest paths from the seeds by A* search with the lower bounds `rest`.
@@ -328,4 +354,4 @@ def energy_of(lengths, phi, horizon):
     return math.exp(0.5 * (low + high))
 
 
-LATTICE_KERNELS = (plane_costs, tree, meeting_nodes, path_through, mark, energy_of)
+LATTICE_KERNELS = (plane_costs, plane_parents, tree, meeting_nodes, path_through, mark, energy_of)

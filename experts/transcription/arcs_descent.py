@@ -21,6 +21,7 @@ from leapnav.experts.transcription.arcs_riccati import backward
 from leapnav.experts.transcription.quadratic_model import MODEL, Model, Regularisation, end_multipliers
 
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of the horizon (s)
+INTERVALS_OF_PART = 512  # a path with more intervals is long
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
 END_PENALTY, PENALTY = 1e4, 300.0
 MAX_STEP_LENGTHS = 5  # step lengths that the line search tries: 1, 1/2, ...
@@ -99,7 +100,9 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
     h, limits = problem.h, problem.limits
     intervals = len(h)
     horizon = h.sum()
-    first_shift, max_shift = FIRST_SHIFT / horizon**2, MAX_SHIFT / horizon**2
+    # The curvature that the shift must exceed is that of a part of a long path.
+    part = horizon * min(1.0, INTERVALS_OF_PART / intervals)
+    first_shift, max_shift = FIRST_SHIFT / horizon**2, MAX_SHIFT / part**2
     expansion = Expansion(
         np.empty((intervals + 1, 5)),
         np.empty((intervals, 2)),

@@ -27,8 +27,9 @@ from leapnav.experts.problem.system import differential_drive, unicycle
 from leapnav.experts.transcription import arcs, arcs_descent, descent, midpoint
 
 INTERVALS_PER_STEP = 2.0  # intervals per step of a lattice path (0.2 to 0.45 m)
-MIN_INTERVALS, MAX_INTERVALS = 32, 1024
+MIN_INTERVALS, MAX_INTERVALS = 32, 32_768
 MAX_ITERATIONS = 40
+INTERVALS_PER_LIMIT = 256  # a path with n times as many intervals may take n times as many iterations
 MIN_GRAM = 1e-9  # keeps B'B regular where the fields are linearly dependent
 HAMILTONIAN_POINTS = 9  # of a path, along which the Hamiltonian is almost constant
 MIN_TIME_FACTOR = 0.8  # smallest factor by which a free horizon changes at once
@@ -127,9 +128,11 @@ def optimise(
         problem: the problem of a scenario, with the winding of the goal heading chosen.
         guess: initial guess; its states, controls and costates need not be consistent.
         speed_weight: cost weight of the squared speed, the unit of the costs; None for that of the first control.
-        max_iterations: number of iterations after which the result has not converged.
+        max_iterations: number of iterations after which the result has not converged, for a path of up to
+            2 INTERVALS_PER_LIMIT intervals.
 
     """
+    max_iterations *= max(1, len(guess.controls) // INTERVALS_PER_LIMIT)
     arrays = problem.arrays
     speed_weight = speed_weight or problem.control_weight[0]
     scale = max(math.dist(problem.start[:2], arrays.goal[:2]) / 5.0, 0.1)
