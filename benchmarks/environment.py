@@ -15,7 +15,8 @@ from gymnasium.utils.performance import benchmark_step, benchmark_vector_step
 from tqdm.auto import tqdm
 
 import leapnav  # noqa: F401
-from leapnav.envs import FAMILIES, NavigateVectorEnv, ScenarioBank
+from leapnav.envs import NavigateVectorEnv, ScenarioBank
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import find_optimum
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.data.banks import build_bank
@@ -93,7 +94,7 @@ def replay(bank: ScenarioBank, plans: list[np.ndarray], **arguments: object) -> 
 def measure_replays() -> None:
     print(f"\n{'optima driven open-loop':28}{'velocity':>20}{'disturbed 0.1':>20}{'motor':>20}")
     print(f"{'':28}{'success, J/J*':>20}{'success, J/J*':>20}{'success, J/J*':>20}")
-    for family in FAMILIES:
+    for family in ALL_FAMILIES:
         bank = ScenarioBank.shipped(family, "test")
         plans = [plan_actions(find_optimum(s), s, 0.05) for s in tqdm(bank, desc=f"Solving {family}", leave=False)]
         cells = [replay(bank, plans, **arguments) for arguments in ({}, {"disturbance": 0.1}, {"actuation": "motor"})]

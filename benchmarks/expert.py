@@ -6,7 +6,8 @@ import time
 import numpy as np
 from tqdm.auto import tqdm
 
-from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, ScenarioBank
+from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import ExpertPolicy
 
 EPISODES, ROBOTS, ROUNDS = 100, 256, 25
@@ -78,12 +79,12 @@ def main() -> None:
     ratio = looped / batched
     print(f"{ROBOTS} robots: {batched:.1f} ms as a batch, {looped:.1f} ms in a loop, ratio {ratio:.2f} (target 1.5)\n")
     print(f"{'':10}{'feedback':>10}{'median ms':>12}{'99 % ms':>10}{'first ms':>10}   (targets 2 and 30)")
-    for family in FAMILIES:
+    for family in ALL_FAMILIES:
         for feedback in ("resolve", "gains"):
             median, slow, first = measure_time(family, feedback)
             print(f"{family:10}{feedback:>10}{median:12.3f}{slow:10.2f}{first:10.1f}")
     print(f"\n{f'successes of {EPISODES}, median regret':32}" + "".join(f"{name:>24}" for name, _ in SETTINGS))
-    for family in FAMILIES:
+    for family in ALL_FAMILIES:
         cells = [measure_success(family, settings) for _, settings in tqdm(SETTINGS, desc=family, leave=False)]
         print(f"{family:32}" + "".join(f"{f'{success}, {100 * regret:.3f} %':>24}" for success, regret in cells))
 

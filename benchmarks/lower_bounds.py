@@ -20,7 +20,8 @@ from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from leapnav.envs import FAMILIES, Scenario, ScenarioBank
+from leapnav.envs import Scenario, ScenarioBank
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import Optimum, check_proof, find_optimum, lower_bound
 from leapnav.experts.second_opinion import second_opinion
 
@@ -97,7 +98,7 @@ def main() -> None:
     table = Table(title=f"gap {100 * arguments.gap:g} % in {arguments.time_limit:g} s: median, 90th percentile")
     for column in ("scenarios", "proved", "gap (%)", "proof (s)", "check / proof", "proof / second opinion"):
         table.add_column(column, justify="left" if column == "scenarios" else "right")
-    for family in FAMILIES:
+    for family in ALL_FAMILIES:
         cases = bank_cases(family, arguments.count)
         table.add_row(*measure(family, cases, arguments.gap, arguments.time_limit))
     if arguments.worlds > 0:

@@ -18,7 +18,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from leapnav.envs import FAMILIES, Scenario, Unicycle, sample_scenario
+from leapnav.envs import Scenario, Unicycle, sample_scenario
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.scenarios.scenario import Circle, Obstacle, Polygon
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import OptimalControlProblem, Trajectory, build_bank, find_optimum
@@ -40,7 +41,7 @@ def compare(count: int) -> None:
     for column in columns:
         table.add_column(column, justify="right")
     find_optimum(sample_scenario("clutter", 0))  # loads the kernels
-    for family in FAMILIES:
+    for family in ALL_FAMILIES:
         ours, theirs, built, costs, others = [], [], [], [], []
         for seed in range(700, 700 + count):
             scenario = sample_scenario(family, seed)

@@ -89,12 +89,12 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
     if not ends:
         raise SolveError(followed[0].extremal, task.name if isinstance(task, Scenario) else "")
     has_state_cost = problem.field is not None or problem.state_cost != 0
-    if has_state_cost:  # the durations alone do not rank the paths, and costs need the same weights
-        solved = max(end.solved for end in ends)
-        best = min((end for end in ends if end.solved == solved), key=lambda end: end.extremal.cost)
+    tolerances = [0.5 * len(bounds) * weight for weight in weights]
+    if has_state_cost:  # the durations alone do not rank the paths; a lower bound of the limit of the costs does
+        best = min(ends, key=lambda end: end.extremal.cost / (1.0 + tolerances[end.solved - 1]))
     else:
         best = min(ends, key=lambda end: end.extremal.horizon)
-    tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
+    tolerance = tolerances[best.solved - 1]
     lower_bound = np.nan if has_state_cost else best.extremal.cost / (1.0 + tolerance)
     structure = switching_structure(best.extremal, bounds)
     return MinimumTime(best.extremal, best.extremal.horizon, tolerance, lower_bound, *structure)

@@ -11,7 +11,16 @@ from collections.abc import Sequence
 from leapnav.training.config import DEFAULT_EPOCHS, BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig
 
 # Seconds of one core to find, execute and store the optimum of a scenario.
-SECONDS_PER_SCENARIO = {"open": 0.03, "clutter": 0.05, "polygons": 0.06, "rooms": 0.08, "slalom": 0.15, "all": 0.08}
+SECONDS_PER_SCENARIO = {
+    "open": 0.03,
+    "clutter": 0.05,
+    "polygons": 0.06,
+    "rooms": 0.08,
+    "slalom": 0.15,
+    "maze": 0.4,
+    "corridors": 0.4,
+    "all": 0.08,
+}
 SECONDS_PER_SECOND_OPINION = 4.0
 SECONDS_PER_EXPERT_EPISODE, SECONDS_PER_EPISODE = 0.1, 0.01  # of an evaluation
 SECONDS_OF_DEMO = 300.0

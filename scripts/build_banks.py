@@ -15,8 +15,9 @@ from pathlib import Path
 
 import h5py
 
-from leapnav.envs import FAMILIES, ScenarioBank
+from leapnav.envs import ScenarioBank
 from leapnav.envs.scenarios.bank import LOWER_BOUNDS, collection_name
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import build_bank
 
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
@@ -24,14 +25,18 @@ BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
 SPLITS = {"train": (400, 0), "test": (200, 1)}
 # Robots besides the unicycle: models, families, and number of scenarios of each split.
 ROBOTS, ROBOT_FAMILIES, ROBOT_COUNT = ("car", "dynamic_unicycle"), ("clutter", "rooms"), 200
+LARGE_FAMILIES, LARGE_COUNT = ("maze", "corridors"), 200  # fixed horizon only
 
 
 def build(directory: Path, workers: int) -> None:
-    for family in FAMILIES:
+    for family in ALL_FAMILIES:
         for split, (count, seed) in SPLITS.items():
             build_bank(family, count, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
             path = directory / f"{collection_name(family, horizon='free')}-{split}.bank"
             build_bank(family, count, path, horizon="free", seed=seed, workers=workers)
+    for family in LARGE_FAMILIES:
+        for split, (_, seed) in SPLITS.items():
+            build_bank(family, LARGE_COUNT, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
     for robot in ROBOTS:
         for family in ROBOT_FAMILIES:
             for split, (_, seed) in SPLITS.items():

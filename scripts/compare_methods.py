@@ -13,7 +13,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from leapnav.envs import FAMILIES, ScenarioBank
+from leapnav.envs import ScenarioBank
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import rollout
 from leapnav.training import BCConfig, PPOConfig, SACConfig, train_bc, train_ppo, train_sac
 from leapnav.training.scoring.comparison import compare_policies
@@ -30,7 +31,7 @@ SINGLE_SEED = {
     "bc": ("slalom",),
     "scratch": ("clutter", "polygons", "rooms", "slalom"),
     "warm": ("clutter", "polygons", "rooms", "slalom"),
-    **dict.fromkeys(("sac", "sacwarm"), tuple(FAMILIES)),
+    **dict.fromkeys(("sac", "sacwarm"), tuple(ALL_FAMILIES)),
 }
 N_EVALUATIONS = 8  # during a run of PPO or SAC
 ROWS = {
@@ -89,7 +90,7 @@ def main() -> None:
     """Train the methods and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, default=Path("runs/methods"))
-    parser.add_argument("--families", nargs="+", default=FAMILIES, choices=FAMILIES)
+    parser.add_argument("--families", nargs="+", default=ALL_FAMILIES, choices=ALL_FAMILIES)
     parser.add_argument("--only", nargs="+", default=METHODS, choices=METHODS, help="methods to train")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds of runs that take less than ten minutes")
     parser.add_argument("--table", action="store_true", help="print the table without training")

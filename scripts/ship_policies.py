@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import cast
 
 from leapnav.envs.scenarios.bank import collection_name
-from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES
 from leapnav.training import DAggerRunConfig, evaluate, load_policy, policy_environment, save_policy, train_dagger
 from leapnav.training.config import RobotName
 from leapnav.training.policies.files import SHIPPED, read_description
 
 ROBOTS = ("car", "dynamic_unicycle")
 FREE = collection_name("clutter", horizon="free")
-NAMES = (*FAMILIES, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
+NAMES = (*ALL_FAMILIES, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
 
 
 def ship(name: str, runs: Path) -> None:
@@ -34,7 +34,7 @@ def ship(name: str, runs: Path) -> None:
     training = read_description(run)["training"]
     save_policy(load_policy(run), shipped, policy_environment(run), training=training, half=True)
     policy = load_policy(shipped)
-    for tested in FAMILIES if family == ALL else (family,):
+    for tested in ALL_FAMILIES if family == ALL else (family,):
         score = evaluate(policy, tested, environment=policy_environment(shipped))
         print(f"{name} on {tested}: success {score.success:.3f}, SOC {score.soc:.3f}, median regret {score.regret:.4f}")
 

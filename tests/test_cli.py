@@ -130,7 +130,7 @@ def test_missing_files_and_folders_are_named_before_the_work(scenario_file, tmp_
         ["evaluate", missing],
         ["evaluate", "expert", "--bank", missing],
         ["evaluate", "expert", "expert", "--count", "1", "--family", "open"],
-        ["evaluate", "expert", "--family", "maze"],
+        ["evaluate", "expert", "--family", "moon"],
         ["evaluate", "expert", "--episodes-plot", missing / "out.png"],
         ["report", missing],
         ["report", tmp_path, "--out", missing / "report.html"],
@@ -139,18 +139,18 @@ def test_missing_files_and_folders_are_named_before_the_work(scenario_file, tmp_
         ["rollout", "--out", scenario_file[0] / "demos"],
         ["evaluate"],
         ["evaluate", "expert", "--json", missing / "out.json"],
-        ["rollout", "--out", tmp_path / "out", "--family", "maze"],
+        ["rollout", "--out", tmp_path / "out", "--family", "moon"],
         ["rollout", "--out", tmp_path / "out", "--count", "-3"],
         ["rollout", "--out", tmp_path],
         ["train", "bc", "--demos", missing, "--out", tmp_path / "policy"],
         ["train", "dagger", "--policy", missing, "--out", tmp_path / "policy"],
-        ["train", "ppo", "--family", "maze", "--out", tmp_path / "policy"],
+        ["train", "ppo", "--family", "moon", "--out", tmp_path / "policy"],
         ["train", "ppo", "--warm-start", missing, "--out", tmp_path / "policy"],
         ["train", "ppo", "--resume", "--out", missing],
     ):
         code, line = failing(arguments, capsys)
         assert code == 2, arguments
-        assert "missing" in line or "maze" in line or "-3" in line or str(tmp_path) in line or "policies" in line
+        assert "missing" in line or "moon" in line or "-3" in line or str(tmp_path) in line or "policies" in line
     assert not (tmp_path / "policy").exists()
 
 
@@ -327,7 +327,7 @@ def test_a_shipped_bank_is_shown_by_its_name(tmp_path, capsys, monkeypatch):
         (["show", "slalom-test", "--count", "-1"], "count: expected at least 0, got -1"),
         (["show", "slalom-test", "--plot", "x.txt"], "x.txt: expected a name that ends in .png, .pdf, .svg"),
         (["show", "slalom-test", "--count", "0", "--verify", "--workers", "0"], "workers: expected at least 1, got 0"),
-        (["build", "--family", "maze", "--out", "x.bank"], "family: expected one of open, clutter, polygons"),
+        (["build", "--family", "moon", "--out", "x.bank"], "family: expected one of open, clutter, polygons"),
         (["build", "--count", "0", "--out", "x.bank"], "count: expected at least 1, got 0"),
         (["build", "--out", "no/folder/x.bank"], "no/folder: no such directory"),
         (["build", "--out", "{text}"], "not a scenario bank, or damaged"),

@@ -58,7 +58,7 @@ def test_closing_the_window_ends_the_watching(capsys, monkeypatch):
         (["--video", "film.mp4", "--index", "199"], "index: the bank has scenarios 0 to 199, got 199 to 201"),
         (["--video", "film.mp4", "--index", "3", "--split", "fresh"], "index: fresh scenarios have no index"),
         (["--video", "film.mp4", "--episodes", "0"], "episodes: expected at least 1, got 0"),
-        (["--video", "film.mp4", "--family", "maze"], "family: expected one of open, .*got 'maze'"),
+        (["--video", "film.mp4", "--family", "moon"], "family: expected one of open, .*got 'moon'"),
         (["--video", "film.mp4", "--policy", "nowhere"], "nowhere: no such policy"),
         (["--video", "film.mp4", "--disturbance", "-1"], "disturbance: expected a number >= 0, got -1.0"),
     ],

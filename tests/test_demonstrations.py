@@ -159,7 +159,7 @@ def test_nothing_is_overwritten(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"family": "maze"}, "family: .*'maze'"),
+        ({"family": "moon"}, "family: .*'moon'"),
         ({"count": 0}, "count: .*0"),
         ({"recoveries": -1}, "recoveries: .*-1"),
         ({"workers": 0}, "workers: .*0"),

@@ -296,7 +296,7 @@ def test_the_scenario_option_takes_every_form_and_is_reported():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: gym.make(ID, family="maze"), "family: expected one of .*'maze'"),
+        (lambda: gym.make(ID, family="moon"), "family: expected one of .*'moon'"),
         (lambda: gym.make(ID, control_period=0.0), "control_period: .*0.0"),
         (lambda: gym.make(ID, miss_penalty=-1), "miss_penalty: .*-1"),
         (lambda: gym.make(ID, lidar_beams=-1), "lidar_beams: .*-1"),

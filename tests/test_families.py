@@ -28,7 +28,8 @@ def test_scenarios_are_neither_trivial_nor_rushed(family):
     for seed in range(50):
         scenario = sample_scenario(family, seed)
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
-        assert distance >= 4.0
+        x_min, y_min, x_max, y_max = scenario.arena
+        assert distance >= 0.4 * min(x_max - x_min, y_max - y_min)
         assert distance / scenario.horizon <= 0.81  # 0.8 m/s, and the horizon is rounded to 0.1 s
         for pose in (scenario.start, scenario.goal):
             assert clearance(pose[0], pose[1], scenario.field)[0] >= 0.24  # 0.25 m before rounding
@@ -41,7 +42,7 @@ def test_clutter_is_6_to_12_discs_and_open_is_empty():
 
 
 def test_an_unknown_family_is_named():
-    known = "open, clutter, polygons, rooms, slalom, all, module:function or a file .*"
+    known = "open, clutter, polygons, rooms, slalom, maze, corridors, all, module:function or a file .*"
     with pytest.raises(ValueError, match=f"family: expected one of {known}, got 'moon'"):
         sample_scenario("moon", 0)
 

@@ -9,8 +9,9 @@ import torch as th
 from helpers import QUICK, SMALL, fresh, scenario_fields
 
 from leapnav.cli import main
-from leapnav.envs import FAMILIES, NavigateEnv, NavigateGoalEnv, Scenario, ScenarioBank, ScenarioError, sample_scenario
+from leapnav.envs import NavigateEnv, NavigateGoalEnv, Scenario, ScenarioBank, ScenarioError, sample_scenario
 from leapnav.envs.episodes import act_with, play_episode
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.simulation.entries import observation_entries
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, has_time_left
 from leapnav.experts import ExpertPolicy, build_bank, find_optimum, find_reached_optimum
@@ -144,7 +145,7 @@ def test_fresh_scenarios_have_the_same_layout_with_both_kinds_of_horizon():
         assert 2 * duration < free.time_limit < 4 * duration
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", ALL_FAMILIES)
 def test_included_banks_hold_certified_optima(family):
     for split, count in (("train", 400), ("test", 200)):
         bank = ScenarioBank.shipped(family, split, horizon="free")

@@ -62,7 +62,7 @@ LARGE = [
     *((rooms, *sizes) for sizes in ((64, 15), (128, 7), (128, 31), (256, 7), (256, 15), (256, 31))),
     *((rooms, *sizes) for sizes in ((512, 7), (512, 15), (512, 31))),
     *((maze, *sizes) for sizes in ((64, 1), (64, 3), (128, 1), (128, 7), (256, 3), (256, 7))),
-    *((maze, *sizes) for sizes in ((512, 3), (512, 7), (512, 15))),
+    *((maze, *sizes) for sizes in ((512, 7), (512, 15), (512, 31))),
     *((random_cells, *sizes) for sizes in ((64, 38), (128, 20), (128, 38), (128, 42), (256, 10), (256, 30))),
     *((random_cells, *sizes) for sizes in ((256, 42), (512, 10))),
 ]

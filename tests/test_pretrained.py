@@ -2,7 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from leapnav.envs import FAMILIES
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.training import evaluate, load_policy, policy_environment, shipped_policies
 from leapnav.training.policies.files import SHIPPED, read_description
 from leapnav.training.scoring.policy_specs import load_policy_spec
@@ -20,9 +20,9 @@ def test_a_policy_that_ships_is_loaded_by_its_name_and_drives(name):
     observation, _ = env.reset(seed=0)
     assert env.action_space.contains(policy.predict(observation, deterministic=True)[0])
     family = name.rpartition("-")[2]  # after the robot, if it is not the unicycle
-    families = FAMILIES if family == "all" else (family,)
+    families = ALL_FAMILIES if family == "all" else (family,)
     found = [evaluate(policy, family, count=60, environment=sensors, progress=False) for family in families]
-    min_success = 0.95 if name in (*FAMILIES, "all") else 0.85
+    min_success = 0.95 if name in (*ALL_FAMILIES, "all") else 0.85
     assert np.mean([evaluation.success for evaluation in found]) >= min_success
     assert read_description(name)["training"]["family"] == family
 

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from leapnav.cli import main
-from leapnav.envs import ScenarioBank, ScenarioError, Unicycle
+from leapnav.envs import Polygon, ScenarioBank, ScenarioError, Unicycle
 from leapnav.envs.scenarios.files import read_scenarios
 from leapnav.envs.worlds.barn import path_lengths, read_barn, read_cylinders
+from leapnav.envs.worlds.dynobench import read_dynobench
 from leapnav.envs.worlds.movingai import read_movingai_problems, read_scen
 from leapnav.envs.worlds.ros_map import read_ros_map
-from leapnav.experts import find_optimum
+from leapnav.envs.worlds.tpcap import convex_parts, read_tpcap
+from leapnav.experts import find_optimum, minimum_time
 from leapnav.training.scoring.barn import barn_score
 
 GEOMETRY = "<link name='link'><collision name='collision'><geometry>{}</geometry></collision></link>"
@@ -194,7 +196,7 @@ def test_a_map_of_ros_has_scenarios_between_its_walls(tmp_path, capsys, monkeypa
         ({"resolution": None}, "map.yaml: resolution: expected a number, got None"),
         ({"resolution": -1}, "map.yaml: resolution: expected a positive number, got -1"),
         ({"origin": [0, 0, 0.5]}, "map.yaml: origin: expected a map that is not rotated, got the yaw 0.5"),
-        ({"origin": "here"}, "map.yaml: origin: expected x, y and yaw, got 'here'"),
+        ({"origin": "here"}, "map.yaml: origin: expected 2 or 3 numbers, got 'here'"),
         ({"mode": "raw"}, "map.yaml: mode: expected trinary or scale, got 'raw'"),
         ({"image": "map.yaml"}, "map.yaml: not an image"),
         ({"image": "none.pgm"}, "none.pgm: no such file; it is the image of"),
@@ -206,3 +208,147 @@ def test_an_invalid_map_of_ros_is_named(fields, message, tmp_path):
     path = write_ros_map(tmp_path, rooms_in_gray(), **fields)
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         read_ros_map(path)
+
+
+DYNO_MODEL = """dynamics: {dynamics}
+min_vel: {slowest}
+max_vel: 0.5
+min_angular_vel: -0.5
+max_angular_vel: 0.5
+size: [0.5, 0.25]
+shape: box
+dt: 0.1
+"""
+DYNO_PROBLEM = """name: test
+environment:
+  min: [0.0, 0.0]
+  max: [3.0, 2]
+  obstacles:
+    - type: box
+      center: [1.1, 0.9]
+      size: [0.2, 0.4]
+robots:
+  - type: {model}
+    start: [0.5, 1.2, 0]
+    goal: [1.7, 1.2, 0] # x, y, theta
+"""
+
+
+@pytest.fixture
+def dynobench(tmp_path):
+    """A directory with the structure of dynobench: a problem, and two of robots that leapnav does not have."""
+    folder = tmp_path / "dynobench"
+    (folder / "models").mkdir(parents=True)
+    for model, dynamics, slowest in (
+        ("unicycle1_v0", "unicycle1", -0.5),
+        ("unicycle1_v1", "unicycle1", 0.25),
+        ("unicycle2_v0", "unicycle2", -0.5),
+    ):
+        (folder / "models" / f"{model}.yaml").write_text(DYNO_MODEL.format(dynamics=dynamics, slowest=slowest))
+        solutions = folder / "envs" / model / "wall_0"
+        solutions.mkdir(parents=True)
+        solutions.with_suffix(".yaml").write_text(DYNO_PROBLEM.format(model=model))
+        for planner, feasible, states in (("idbastar_v0", 1, 41), ("rrt_to_v0", 0, 10)):
+            rows = "\n".join("  - [0, 0, 0]" for _ in range(states))
+            (solutions / f"{planner}_solution_v0.yaml").write_text(f"feasible: {feasible}\nstates:\n{rows}\n")
+    (folder / "envs" / "unicycle1_v0" / "constraints.yaml").write_text("constraints: []\n")
+    return folder
+
+
+def test_problems_of_dynobench_are_scenarios_with_the_durations_of_other_planners(dynobench):
+    problems = read_dynobench(dynobench)
+    assert list(problems) == ["unicycle1_v0-wall_0", "unicycle1_v1-wall_0", "unicycle2_v0-wall_0"]
+    assert all(problem.durations == {"idbastar_v0": 4.0} for problem in problems.values())  # the other is not feasible
+    assert "min_vel 0.25" in problems["unicycle1_v1-wall_0"].reason
+    assert "unicycle2" in problems["unicycle2_v0-wall_0"].reason
+    scenario = problems["unicycle1_v0-wall_0"].scenario
+    assert scenario.arena == (0, 0, 3, 2) and scenario.robot.max_speed == 0.5
+    # The discs cover the box of the robot.
+    box = np.array([(x, y) for x in np.linspace(-0.25, 0.25, 41) for y in (-0.125, 0.125)])
+    distances = np.hypot(box[:, :1] - scenario.discs[:, 0], box[:, 1:]) - scenario.discs[:, 1]
+    assert distances.min(axis=1).max() < 1e-9
+    found = minimum_time(scenario, 0.2)
+    assert found.extremal.success
+    assert 1.2 / 0.5 < found.horizon < 4.0  # the distance at the largest speed
+
+
+def test_the_table_of_dynobench(dynobench, tmp_path, capsys):
+    out = tmp_path / "table.json"
+    assert main(["benchmark", "dynobench", str(dynobench), "--tol", "0.2", "--json", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "unicycle2_v0-wall_0: left out: dynamics 'unicycle2'" in printed and "idbastar_v0" in printed
+    (row,) = json.loads(out.read_text()).values()
+    assert row["idbastar_v0"] == 4.0 and 2.4 < row["leapnav"] < 4.0 and row["clearance"] > 0
+    assert main(["import", "dynobench", str(dynobench), "--out", str(tmp_path / "scenarios")]) == 0
+    assert [scenario.name for scenario in read_scenarios(tmp_path / "scenarios")] == ["unicycle1_v0-wall_0"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("size: [0.2, 0.4]", "size: 1", r"wall_0.yaml: environment: obstacles\[0\]: size: expected 2 numbers, got 1"),
+        ("type: box", "type: ball", r"obstacles\[0\]: type: expected box, got 'ball'"),
+        ("    goal: [1.7, 1.2, 0]", "    end: [0, 0, 0]", r"robots\[0\]: goal: missing"),
+    ],
+)
+def test_an_invalid_problem_of_dynobench_is_named(old, new, message, dynobench):
+    path = dynobench / "envs" / "unicycle1_v0" / "wall_0.yaml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        read_dynobench(dynobench)
+
+
+def test_a_directory_without_problems_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected the directories envs and models of dynobench"):
+        read_dynobench(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"expected files CaseN\.csv"):
+        read_tpcap(tmp_path)
+
+
+def write_case(folder, number, start, goal, polygons):
+    sizes = [len(polygon) for polygon in polygons]
+    words = [*start, *goal, len(polygons), *sizes, *np.concatenate(polygons).ravel().tolist()]
+    (folder / f"Case{number}.csv").write_text(",".join(map(str, words)) + "\n")
+
+
+def parked(x_min, y_min, x_max, y_max):
+    return [(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]
+
+
+def test_a_case_of_tpcap_is_a_car_that_parks(tmp_path):
+    walls = [parked(-12, -5, -2, 0), parked(2, -5, 10, 0)]
+    write_case(tmp_path, 10, (-6, 4, 0), (0, -2.5, math.pi / 2), walls)
+    write_case(tmp_path, 2, (0, 0, 2 * math.pi), (5, 0, 0), [[(2, 3), (4, 3), (4, 5), (3, 3.5), (2, 5)]])
+    second, first = read_tpcap(tmp_path)
+    assert [second.name, first.name] == ["tpcap-2", "tpcap-10"]
+    assert first.robot.model == "car" and first.horizon is None and first.start_state[2] == 0.0
+    assert first.arena == pytest.approx((-14.0, -10.5, 8.0, 12.0))
+    assert first.discs[:, 0].max() + first.discs[0, 1] == pytest.approx(3.76)  # the front of the car
+    assert len(second.obstacles) == 3  # triangles, since the polygon is not convex
+    optimum = find_optimum(first)
+    assert optimum.success and optimum.driving_modes[-1] == "backward"
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "0,0,0,5,0,0,1,4,1,1,2,2,3,3\n", "a,b\n"])
+def test_an_invalid_case_of_tpcap_is_named(text, tmp_path):
+    (tmp_path / "Case1.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"Case1\.csv: expected"):
+        read_tpcap(tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_convex_parts_cover_a_polygon_and_nothing_else(seed):
+    rng = np.random.default_rng(seed)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 9))
+    star = rng.uniform(0.5, 2.0, (9, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    parts = convex_parts(star[:: rng.choice((-1, 1))])
+    for part in parts:
+        Polygon(vertices=tuple(map(tuple, part.tolist())))  # strictly convex
+    assert sum(map(area, parts)) == pytest.approx(area(star), rel=1e-9)
+
+
+def area(vertices):
+    x, y = np.transpose(vertices)
+    return abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2

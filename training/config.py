@@ -22,7 +22,7 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(
 
 # Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
 # robots of the user are text as well.
-FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "all"] | str
+FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors", "all"] | str
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObservationName = Literal["lidar", "geodesic"]

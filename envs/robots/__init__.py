@@ -4,6 +4,7 @@ from leapnav.envs.robots.base import Disc, Dynamics, RobotModel, Symmetry, regis
 from leapnav.envs.robots.car import Car
 from leapnav.envs.robots.differential_drive import DifferentialDrive
 from leapnav.envs.robots.dynamic_unicycle import DynamicUnicycle
+from leapnav.envs.robots.footprints import box_footprint
 from leapnav.envs.robots.unicycle import Unicycle
 
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "RobotModel",
     "Symmetry",
     "Unicycle",
+    "box_footprint",
     "register",
 ]

@@ -10,7 +10,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numba import types
@@ -216,7 +216,10 @@ class RobotModel(Frozen):
 MODELS: dict[str, type[RobotModel]] = {}
 
 
-def register(model: type[RobotModel]) -> type[RobotModel]:
+Model = TypeVar("Model", bound=RobotModel)
+
+
+def register(model: type[Model]) -> type[Model]:
     """Register a robot model under the default of its field `model`; usable as a class decorator.
 
     Processes that read its scenarios must import the file that defines it.

@@ -10,7 +10,7 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 | `scenario_ends` | (n,) int64 | the end of each text |
 | `tasks` | (n, K) float64 | the packed tasks: start (3), goal (3), horizon, limits (n_u), weights (n_u), further states at the start and the goal (n_q - 3 each), parameters; NaN where the goal is free. If the horizon is free: the time limit instead of the horizon, and the time weight in a last column |
 | `horizons` | (n,) float64 | durations of the optima (s); only if the horizon is free |
-| `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field` |
+| `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field`, without the cells of their grids |
 | `field_ends` | (n,) int64 | the end of each field |
 | `draws` | (n,) int64 | index of the random draw that produced the scenario |
 | `costs` | (n,) float64 | J* |
@@ -22,7 +22,8 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 | `costates` | (sum of N_i, n_q) float32 | lambda, the gradient of the cost-to-go |
 | `lower_bounds` | (n,) float64 | proved lower bounds of the cost, NaN where none is known; only after `leapnav bank prove` |
 
-Attributes of the file: `format` ("leapnav-bank"), `version` (4), `family`, `seed`, `drawn` (number of scenarios drawn,
+Attributes of the file: `format` ("leapnav-bank"), `version` (5 if some field has a grid, which is omitted; otherwise 4,
+where a grid would be part of its field), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
 leapnav that built the bank), `given` (only of a bank of given scenarios; JSON: `scenarios`, their digest, and
 `rejected` and `doubtful`, the reasons by name) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that
@@ -36,6 +37,7 @@ import json
 import math
 import os
 import re
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -46,10 +48,11 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import HORIZON, Scenario
-from leapnav.envs.shapes.field import check_field
+from leapnav.envs.shapes.field import check_field, with_grid
 from leapnav.envs.utils.validation import check_choice, is_integer
 
-FORMAT, VERSION = "leapnav-bank", 4
+FORMAT, VERSION, VERSION_WITHOUT_GRIDS = "leapnav-bank", 4, 5
+MAX_COMPLETE_FIELDS = 1024  # with a computed grid, of each bank
 # Bytes. A larger dataset is verified when it is first read, because that takes 1 s per GB; the others on opening.
 MAX_VERIFIED_ON_OPENING = 32_000_000
 SPLITS = ("train", "test")
@@ -166,10 +169,10 @@ class ScenarioBank(Sequence[Scenario]):
                 attributes: dict[str, Any] = dict(file.attrs)
                 if attributes.get("format") != FORMAT:
                     raise BankError(f"{self.path}: an HDF5 file, but not a scenario bank")
-                if attributes.get("version") != VERSION:
+                if attributes.get("version") not in (VERSION, VERSION_WITHOUT_GRIDS):
                     raise BankError(
                         f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads "
-                        f"{VERSION}; build the bank again with `leapnav bank build`"
+                        f"{VERSION} and {VERSION_WITHOUT_GRIDS}; build the bank again with `leapnav bank build`"
                     )
                 locations = {name: _locate(file[name], name) for name in TYPES if name in file or name not in OPTIONAL}
             self.family, self.software = str(attributes["family"]), str(attributes["software"])
@@ -201,6 +204,7 @@ class ScenarioBank(Sequence[Scenario]):
         unknown = np.full(len(self.costs), math.nan)
         self.lower_bounds = arrays.get(LOWER_BOUNDS, unknown)
         self._scenarios: dict[int, Scenario] = {}
+        self._complete_fields: OrderedDict[int, np.ndarray] = OrderedDict()
         self._check_widths()
 
     @property
@@ -337,9 +341,18 @@ class ScenarioBank(Sequence[Scenario]):
             ValueError: a shape of an obstacle is not registered in this process.
 
         """
-        start, end = self._span("field_ends", self._check_index(index))
-        field = self._array("fields")[start:end]
-        check_field(field)
+        i = self._check_index(index)
+        if i in self._complete_fields:
+            self._complete_fields.move_to_end(i)
+            return self._complete_fields[i]
+        start, end = self._span("field_ends", i)
+        stored = self._array("fields")[start:end]
+        check_field(stored)
+        field = with_grid(stored)
+        if field is not stored:
+            self._complete_fields[i] = field
+            if len(self._complete_fields) > MAX_COMPLETE_FIELDS:
+                self._complete_fields.popitem(last=False)
         return field
 
     def states(self, index: int) -> np.ndarray:

@@ -14,8 +14,19 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import Unicycle
-from leapnav.envs.scenarios.bank import DURATIONS, FORMAT, GIVEN, LOWER_BOUNDS, TYPES, VERSION, attribute_bytes, digest
+from leapnav.envs.scenarios.bank import (
+    DURATIONS,
+    FORMAT,
+    GIVEN,
+    LOWER_BOUNDS,
+    TYPES,
+    VERSION,
+    VERSION_WITHOUT_GRIDS,
+    attribute_bytes,
+    digest,
+)
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.field import without_grid
 from leapnav.envs.utils.files import atomic_path
 
 MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
@@ -81,13 +92,15 @@ def write_bank(
     kinds = sorted({scenario.horizon_kind for scenario in scenarios})
     if len(kinds) > 1:
         raise ValueError(f"entries: expected one kind of horizon for all scenarios, got {', '.join(kinds)}")
+    fields = [without_grid(scenario.field) for scenario in scenarios]
+    is_complete = all(len(field) == len(scenario.field) for field, scenario in zip(fields, scenarios, strict=True))
     n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
     columns: dict[str, Any] = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
         "scenario_ends": np.cumsum([len(text) for text in texts]),
         "tasks": np.array([scenario.task for scenario in scenarios]).reshape(len(scenarios), -1 if scenarios else 11),
-        "fields": np.concatenate([np.empty(0), *(scenario.field for scenario in scenarios)]),
-        "field_ends": np.cumsum([len(scenario.field) for scenario in scenarios]),
+        "fields": np.concatenate([np.empty(0), *fields]),
+        "field_ends": np.cumsum([len(field) for field in fields]),
         "draws": [entry.draw for entry in entries],
         "costs": [entry.cost for entry in entries],
         "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],
@@ -102,7 +115,7 @@ def write_bank(
     arrays = {name: np.asarray(values, dtype=TYPES[name]) for name, values in columns.items()}
     attributes = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION if is_complete else VERSION_WITHOUT_GRIDS,
         "family": family,
         "seed": seed,
         "drawn": drawn,

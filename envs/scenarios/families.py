@@ -46,7 +46,7 @@ Sample = Callable[[np.random.Generator], ScenarioLayout | Scenario]
 FAMILIES: dict[str, Sample] = dict(LAYOUTS)
 REGISTERED: dict[str, Sample] = {}
 ALL = "all"  # the family is sampled, too
-ALL_FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")  # those that "all" stands for
+ALL_FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")  # those that "all" stands for, in arenas of 10 m
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def check_family(family: object) -> None:
 
 
 def is_built_in(family: str) -> bool:
-    """Return whether a family is built in; only for these are there included banks."""
+    """Return whether a family is built in."""
     return family in FAMILIES
 
 

@@ -112,6 +112,78 @@ def _slalom(rng: np.random.Generator) -> ScenarioLayout:
     return ScenarioLayout(walls, start=(0.6, 1.0, 1.2, 9.0), goal=(8.8, 1.0, 9.4, 9.0))
 
 
+def _maze(rng: np.random.Generator) -> ScenarioLayout:
+    """A maze of 6 x 6 to 8 x 8 cells of 2 m: a random spanning tree, and 1/8 of the other openings."""
+    n, size = int(rng.integers(6, 9)), 2.0
+    # closed[axis][i, j]: wall between the cells (i, j) and (i + 1, j), or (i, j) and (i, j + 1)
+    closed = [np.ones((n - 1, n), dtype=bool), np.ones((n, n - 1), dtype=bool)]
+    visited, stack = {(0, 0)}, [(0, 0)]
+    while stack:
+        i, j = stack[int(rng.integers(len(stack)))]  # a random cell of the tree: short dead ends
+        free = [cell for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)) if min(cell) >= 0 and max(cell) < n]
+        free = [cell for cell in free if cell not in visited]
+        if not free:
+            stack.remove((i, j))
+            continue
+        k, m = free[int(rng.integers(len(free)))]
+        closed[0 if k != i else 1][min(i, k), min(j, m)] = False
+        visited.add((k, m))
+        stack.append((k, m))
+    closed = [walls & (rng.random(walls.shape) >= 1 / 8) for walls in closed]
+    found = []
+    for axis, walls in enumerate((closed[0], closed[1].T)):
+        for line, row in enumerate(walls):
+            across = size * (line + 1)
+            for first, last in _runs(row):
+                low, high = max(0.0, size * first - 0.1), min(size * n, size * last + 0.1)
+                corners = (across - 0.1, low, across + 0.1, high)
+                found.append(_rectangle(*corners) if axis == 0 else _rectangle(low, corners[0], high, corners[2]))
+    return ScenarioLayout(found, arena=(0.0, 0.0, size * n, size * n))
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first index and the last index + 1 of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _corridors(rng: np.random.Generator) -> ScenarioLayout:
+    """Blocks between 4 or 5 corridors in each direction (0.9 to 1.5 m wide), of whose sections 1/6 are closed; 16 m."""
+    size = 16.0
+    columns, rows = (_divide(rng, int(rng.integers(4, 6)), size) for _ in range(2))
+    found = [_rectangle(x[0], y[0], x[1], y[1]) for x in columns.blocks for y in rows.blocks]
+    for corridors, blocks, is_vertical in (
+        (columns.corridors, rows.blocks, True),
+        (rows.corridors, columns.blocks, False),
+    ):
+        for low, high in corridors:
+            for first, last in blocks:
+                if rng.random() < 1 / 6:
+                    at = rng.uniform(first, last - 0.2)
+                    corners = (low, at, high, at + 0.2) if is_vertical else (at, low, at + 0.2, high)
+                    found.append(_rectangle(*corners))
+    return ScenarioLayout(found, arena=(0.0, 0.0, size, size))
+
+
+@dataclass(frozen=True)
+class _Cuts:
+    """Intervals of the corridors and of the blocks between them along an axis."""
+
+    corridors: list[tuple[float, float]]
+    blocks: list[tuple[float, float]]
+
+
+def _divide(rng: np.random.Generator, count: int, size: float) -> _Cuts:
+    """Divide a length into `count` corridors, the first and the last along the walls, and the blocks between them."""
+    widths = rng.uniform(0.9, 1.5, count)
+    shares = rng.uniform(0.5, 1.5, count - 1)
+    lengths = np.empty(2 * count - 1)
+    lengths[0::2], lengths[1::2] = widths, (size - widths.sum()) * shares / shares.sum()
+    ends = np.concatenate([[0.0], np.cumsum(lengths)])
+    intervals = list(zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True))
+    return _Cuts(intervals[0::2], intervals[1::2])
+
+
 def rounded(value: float) -> float:
     """Round a sampled number to `DECIMALS`."""
     return round(float(value), DECIMALS)
@@ -135,4 +207,6 @@ LAYOUTS: dict[str, Callable[[np.random.Generator], ScenarioLayout]] = {
     "polygons": _polygons,
     "rooms": _rooms,
     "slalom": _slalom,
+    "maze": _maze,
+    "corridors": _corridors,
 }

@@ -180,6 +180,19 @@ def _assemble(header: Sequence[float], parts: FieldParts, indices: Sequence[floa
     counts = float(len(parts.circles)), float(len(parts.records) + len(parts.polygons))
     grid_index = float(SHAPES + len(obstacles) + len(indices))
     packed = np.array([*header[:CIRCLES], *counts, *header[ARENA:], grid_index, *obstacles, *indices], dtype=np.float64)
+    return with_grid(packed)
+
+
+def without_grid(packed: np.ndarray) -> np.ndarray:
+    """Return a packed field without the cells of its grid, most of its size; `with_grid` computes them again."""
+    at = int(packed[GRID])
+    return packed[:at] if packed[at + 3] > 0 else packed
+
+
+def with_grid(packed: np.ndarray) -> np.ndarray:
+    """Return a packed field with its grid, computed if it is missing."""
+    if len(packed) > packed[GRID]:
+        return packed
     field = np.concatenate([packed, _pack_grid(packed)])
     field.flags.writeable = False
     return field
@@ -265,9 +278,17 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
         lowest = np.minimum(polygon[:, :2] * size, 0.0).sum(axis=1) - polygon[:, 2]
         for cell in cells[(first[cells] @ polygon[:, :2].T + lowest).max(axis=1) < reach].tolist():
             near_polygons[cell].append(k)
-    cells = [_pack_cell(circles[a], [polygons[k] for k in b]) for a, b in zip(near_circles, near_polygons, strict=True)]
-    offsets = 5 + len(first) + np.cumsum([0, *map(len, cells[:-1])])
-    return np.concatenate([low, [size], shape, offsets, *cells])
+    edges = np.array([len(polygon) for polygon in polygons], dtype=int)
+    rows = np.zeros((len(polygons), max(edges, default=0), 3))
+    rows[:, :, 2] = FAR_AWAY  # padding edges: the robot is this deep inside the half-plane
+    for k, polygon in enumerate(polygons):
+        rows[k, : len(polygon)] = polygon[:, :3]
+    packed_cells = [
+        _pack_cell(circles[a], rows[b, : edges[b].max(initial=0)])
+        for a, b in zip(near_circles, near_polygons, strict=True)
+    ]
+    offsets = 5 + len(first) + np.cumsum([0, *map(len, packed_cells[:-1])])
+    return np.concatenate([low, [size], shape, offsets, *packed_cells])
 
 
 def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarray) -> np.ndarray:
@@ -284,15 +305,13 @@ def _offset(polygon: np.ndarray, distance: float) -> np.ndarray:
     return polygon[:, 3:] + distance * (normals + before) / (1.0 + (normals * before).sum(axis=1, keepdims=True))
 
 
-def _pack_cell(circles: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray:
+def _pack_cell(circles: np.ndarray, polygons: np.ndarray) -> np.ndarray:
+    """Return the entries of a cell with circles (n, 3) and the padded rows of polygons (p, m, 3)."""
     n, p = (-(-len(obstacles) // LANES) * LANES for obstacles in (circles, polygons))
-    m = max(map(len, polygons), default=0)
     columns = np.zeros((3, n))
     columns[0] = FAR_AWAY
     columns[:, : len(circles)] = circles.T
-    rows = np.zeros((m, 3, p))
+    rows = np.zeros((polygons.shape[1], 3, p))
     rows[:, 2] = -FAR_AWAY  # padding polygons: every half-plane is at this distance
-    for k, polygon in enumerate(polygons):
-        rows[: len(polygon), :, k] = polygon[:, :3]
-        rows[len(polygon) :, 2, k] = FAR_AWAY  # padding edges: the robot is this deep inside the half-plane
-    return np.concatenate([[n, p, m], columns.ravel(), rows.ravel()])
+    rows[:, :, : len(polygons)] = polygons.transpose(1, 2, 0)
+    return np.concatenate([[n, p, len(rows)], columns.ravel(), rows.ravel()])

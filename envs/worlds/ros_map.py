@@ -5,7 +5,6 @@ The format is described at https://wiki.ros.org/map_server (ROS 1) and in the do
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 from leapnav.envs.utils.validation import check_at_least, check_choice
+from leapnav.envs.worlds.yaml_files import read_yaml
 
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # defaults of the map server
 UNKNOWN = ("occupied", "free")  # what unknown cells count as
@@ -78,23 +78,22 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    fields = _read_yaml(path)
-    resolution = _number(path, fields, "resolution")
+    fields = read_yaml(path)
+    resolution = fields.number("resolution")
     if not resolution > 0:
         raise ValueError(f"{path}: resolution: expected a positive number, got {resolution}")
-    origin = fields.get("origin")
-    if not isinstance(origin, list) or len(origin) not in (2, 3) or not all(_is_number(value) for value in origin):
-        raise ValueError(f"{path}: origin: expected x, y and yaw, got {origin!r}")
+    origin = fields.numbers("origin", 2, 3)
     if len(origin) == 3 and origin[2] != 0:
         raise ValueError(f"{path}: origin: expected a map that is not rotated, got the yaw {origin[2]}")
-    if fields.get("mode", "trinary") not in ("trinary", "scale"):
-        raise ValueError(f"{path}: mode: expected trinary or scale, got {fields['mode']!r}")
-    gray = _read_image(path, fields)
-    occupancy = gray if fields.get("negate", 0) else 1.0 - gray
-    occupied = occupancy > _number(path, fields, "occupied_thresh", OCCUPIED_THRESHOLD)
-    free = occupancy < _number(path, fields, "free_thresh", FREE_THRESHOLD)
+    mode = fields.values.get("mode", "trinary")
+    if mode not in ("trinary", "scale"):
+        raise ValueError(f"{path}: mode: expected trinary or scale, got {mode!r}")
+    gray = _read_image(path, fields.text("image"))
+    occupancy = gray if fields.values.get("negate", 0) else 1.0 - gray
+    occupied = occupancy > fields.number("occupied_thresh", OCCUPIED_THRESHOLD)
+    free = occupancy < fields.number("free_thresh", FREE_THRESHOLD)
     blocked = ~free if unknown == "occupied" else occupied
-    return GridMap(path.stem, blocked, resolution, (float(origin[0]), float(origin[1])))
+    return GridMap(path.stem, blocked, resolution, (origin[0], origin[1]))
 
 
 def sample_on_map(
@@ -117,27 +116,10 @@ def sample_on_map(
     return [sample_scenario(family, seed + i, robot, horizon) for i in range(count)]
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        import yaml
-    except ImportError:
-        raise ModuleNotFoundError('a map of ROS needs PyYAML: pip install "leapnav[worlds]"') from None
-    try:
-        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(fields, dict):
-        raise ValueError(f"{path}: expected the fields image, resolution and origin, got {type(fields).__name__}")
-    return fields
-
-
-def _read_image(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
-    """Return the gray values (height, width), from 0 (black) to 1."""
+def _read_image(path: Path, name: str) -> np.ndarray:
+    """Return the gray values (height, width) of the image of a map, from 0 (black) to 1."""
     from PIL import Image, UnidentifiedImageError
 
-    name = fields.get("image")
-    if not isinstance(name, str):
-        raise ValueError(f"{path}: image: expected the name of a file, got {name!r}")
     file = path.parent / name
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file; it is the image of {path}")
@@ -146,14 +128,3 @@ def _read_image(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
             return np.asarray(image.convert("L"), dtype=float) / 255
     except (UnidentifiedImageError, OSError, ValueError) as error:
         raise ValueError(f"{file}: not an image: {error}") from None
-
-
-def _number(path: Path, fields: Mapping[str, Any], name: str, default: float | None = None) -> float:
-    value = fields.get(name, default)
-    if not _is_number(value):
-        raise ValueError(f"{path}: {name}: expected a number, got {value!r}")
-    return float(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -20,7 +20,7 @@ from leapnav.envs.episodes import play_episode
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import collection_name
-from leapnav.envs.scenarios.families import ALL, FAMILIES, MAX_HORIZON
+from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES, MAX_HORIZON
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.acting.feedback import Feedback
@@ -45,7 +45,7 @@ MAX_STEPS = {
     "fixed": math.ceil(MAX_HORIZON / CONTROL_PERIOD) + 1,
     "free": math.ceil(TIME_LIMIT_FACTOR * MAX_HORIZON / CONTROL_PERIOD) + 1,
 }
-CUSTOM_STEPS_FACTOR = 10  # for families whose horizons are not known
+STEPS_FACTOR = 10  # for families with larger arenas, and those whose horizons are not known
 N_SCORED = 100  # scenarios from which the score of random actions is computed
 
 
@@ -236,7 +236,7 @@ def write_dataset(
     if robot != Unicycle():
         fields = robot.model_dump(mode="json", exclude_none=True)
         arguments |= {"robot": robot.model if robot == type(robot)() else fields, "split": "fresh"}
-    limit = MAX_STEPS[horizon] * (1 if family in (*FAMILIES, ALL) else CUSTOM_STEPS_FACTOR)
+    limit = MAX_STEPS[horizon] * (1 if family in (*ALL_FAMILIES, ALL) else STEPS_FACTOR)
     env = gym.make(ENVIRONMENT, family=family, max_episode_steps=limit, **arguments)
     scenarios: list[Scenario] = []
     returns: list[float] = []

@@ -29,7 +29,8 @@ from leapnav.experts.transcription import arcs, arcs_descent, descent, midpoint
 INTERVALS_PER_STEP = 2.0  # intervals per step of a lattice path (0.2 to 0.45 m)
 MIN_INTERVALS, MAX_INTERVALS = 32, 32_768
 MAX_ITERATIONS = 40
-INTERVALS_PER_LIMIT = 256  # a path with n times as many intervals may take n times as many iterations
+# A path with n times as many intervals as this may take n times as many iterations, up to a limit.
+INTERVALS_PER_LIMIT, MAX_LIMITS = 256, 16
 MIN_GRAM = 1e-9  # keeps B'B regular where the fields are linearly dependent
 HAMILTONIAN_POINTS = 9  # of a path, along which the Hamiltonian is almost constant
 MIN_TIME_FACTOR = 0.8  # smallest factor by which a free horizon changes at once
@@ -132,7 +133,7 @@ def optimise(
             2 INTERVALS_PER_LIMIT intervals.
 
     """
-    max_iterations *= max(1, len(guess.controls) // INTERVALS_PER_LIMIT)
+    max_iterations *= min(max(1, len(guess.controls) // INTERVALS_PER_LIMIT), MAX_LIMITS)
     arrays = problem.arrays
     speed_weight = speed_weight or problem.control_weight[0]
     scale = max(math.dist(problem.start[:2], arrays.goal[:2]) / 5.0, 0.1)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from leapnav.training.config import FamilyName, HorizonName, RobotName
 
 # Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
-Family = Literal["open", "clutter", "polygons", "rooms", "slalom"] | str
+Family = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"] | str
 FamilyOrAll = FamilyName
 Robot = RobotName
 Horizon = HorizonName

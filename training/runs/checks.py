@@ -8,7 +8,8 @@ from dataclasses import fields, is_dataclass
 from functools import partial
 from typing import Any, get_args
 
-from leapnav.envs.scenarios.families import ALL, check_family, is_built_in
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import check_family
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -65,7 +66,8 @@ def _check_levels(config: PPOConfig) -> None:
         if config.level_bank is not None:
             raise ValueError(f"level_bank: expected none with levels='fresh', got {str(config.level_bank)!r}")
         return
-    if config.level_bank is None and (config.family == ALL or not is_built_in(config.family)):
+    included = ScenarioBank.shipped_families(config.robot, config.horizon)
+    if config.level_bank is None and config.family not in included:
         raise ValueError(f"level_bank: expected a bank for levels={config.levels!r} of {config.family!r}, got none")
     if config.jump_start > 0:
         raise ValueError(f"jump_start: expected 0 with levels={config.levels!r}, got {config.jump_start!r}")

@@ -21,7 +21,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import families_of, is_built_in
+from leapnav.envs.scenarios.families import families_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
@@ -155,9 +155,9 @@ class Run:
         return evaluations
 
     def _bank(self, family: str) -> ScenarioBank:
-        """Return the included test bank of a family; that of a family of one's own is built in the run directory."""
+        """Return the included test bank of a family, or one that is built in the run directory if there is none."""
         robot, horizon = self.config.robot, self.config.horizon
-        if is_built_in(family):
+        if family in ScenarioBank.shipped_families(robot, horizon):
             return ScenarioBank.shipped(family, "test", robot, horizon)
         task: dict[str, Any] = {"robot": robot, "horizon": horizon, "seed": TEST_SEED}
         return build_bank(family, TEST_COUNT, self.folder / TEST_BANK, **task, progress=False)

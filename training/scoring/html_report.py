@@ -23,7 +23,7 @@ from matplotlib.ticker import EngFormatter
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of, is_built_in
+from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of
 from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
@@ -110,9 +110,9 @@ def write_report(
 
 
 def _banks(specs: Sequence[PolicySpec], families: Sequence[str], records: Sequence[_RunRecord]) -> list[ScenarioBank]:
-    """Return the test banks of families: the included ones, or those of the runs for families of one's own."""
+    """Return the test banks of families: the included ones, or those in the directories of the runs."""
     own = {record.config.family: Path(record.spec.name) / TEST_BANK for record in records}
-    found = {name: own[name] for name in families if not is_built_in(name) and name in own}
+    found = {name: own[name] for name in families if name in own and own[name].exists()}
     included = included_banks(specs, [name for name in families if name not in found])
     return [*included, *map(ScenarioBank, found.values())]
 

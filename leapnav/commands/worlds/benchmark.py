@@ -1,11 +1,12 @@
-"""`leapnav benchmark`: policies in the worlds of other benchmarks."""
+"""`leapnav benchmark`: policies and the expert in the worlds of other benchmarks."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
 import tyro
 
@@ -14,15 +15,13 @@ from leapnav.outputs import check_outputs, write_json
 
 
 @dataclass(frozen=True)
-class Benchmark:
-    """Score policies in the worlds of another benchmark, with its own score beside ours.
+class BenchmarkBarn:
+    """Score policies in the worlds of the BARN challenge, with its own score beside ours.
 
     The worlds are solved first, and the optima are stored in a bank. The BARN challenge runs in another simulator
     (Gazebo), with another robot, and counts the time only: its published scores cannot be compared with these.
     """
 
-    name: tyro.conf.Positional[Literal["barn"]]
-    """Name of the benchmark."""
     folder: tyro.conf.Positional[Path]
     """Directory of the files world_N.world, or a clone of the challenge's repository."""
     policy: tuple[str, ...] = ("expert",)
@@ -71,3 +70,79 @@ class Benchmark:
         print_barn_scores(scores)
         write_json({**scores_to_dict(comparison), "barn": [asdict(row) for row in scores]}, self.json)
         return 0
+
+
+@dataclass(frozen=True)
+class BenchmarkDynobench:
+    """Compare the minimum time of the problems of dynobench with the durations of its stored solutions.
+
+    The robot's box is covered by discs, and the paths keep a few centimetres from the obstacles, so that the times are
+    upper bounds of the minimum time of the benchmark. Problems whose robot differs from those of leapnav are left out.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Clone of the repository https://github.com/quimortiz/dynobench."""
+    tol: float = 0.02
+    """Tolerance of the minimum time, see `leapnav.experts.minimum_time`."""
+    json: Path | None = None
+    """JSON file of the table; "-" for standard output."""
+
+    def run(self) -> int:
+        """Compute the minimum times and print the table."""
+        check_outputs(self.json)
+        from leapnav.envs.worlds.dynobench import read_dynobench
+        from leapnav.experts import SolveError, minimum_time
+
+        problems = read_dynobench(self.folder)
+        planners = sorted({planner for problem in problems.values() for planner in problem.durations})
+        rows: dict[str, dict[str, float | None]] = {}
+        for name, problem in problems.items():
+            if problem.scenario is None:
+                print(f"{name}: left out: {problem.reason}")
+                continue
+            row: dict[str, float | None] = dict.fromkeys(("leapnav", "tolerance", "clearance", *planners))
+            try:
+                found = minimum_time(problem.scenario, self.tol)
+            except SolveError as error:
+                print(f"{error}")
+            else:
+                certificate = found.extremal.certificate
+                clearance = certificate.clearance if certificate is not None else None
+                row |= {"leapnav": found.horizon, "tolerance": found.tolerance, "clearance": clearance}
+            rows[name] = {**row, **problem.durations}
+        _print_durations(rows)
+        write_json(rows, self.json)
+        return 0
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Run a benchmark of the field on your own download."""
+
+    name: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[BenchmarkBarn, tyro.conf.subcommand("barn")]
+        | Annotated[BenchmarkDynobench, tyro.conf.subcommand("dynobench")]
+    ]
+
+    @property
+    def resumption(self) -> str | None:
+        """What to do after an interruption."""
+        return getattr(self.name, "resumption", None)
+
+    def run(self) -> int:
+        """Run the benchmark."""
+        return self.name.run()
+
+
+def _print_durations(rows: Mapping[str, Mapping[str, float | None]]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="durations (s)", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("problem", overflow="fold")
+    for title in next(iter(rows.values()), {}):
+        table.add_column(title, justify="right")
+    for name, row in rows.items():
+        table.add_row(name, *("-" if value is None else f"{value:.3g}" for value in row.values()))
+    Console().print(table)

@@ -90,13 +90,54 @@ class ImportRosMap:
 
 
 @dataclass(frozen=True)
+class ImportDynobench:
+    """Read the problems of dynobench (https://github.com/quimortiz/dynobench, MIT licence) for robots that leapnav has.
+
+    The horizon is free with the time weight 1, and the proximity cost is small.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Clone of the repository."""
+    out: Path
+    """Output directory of the scenario files."""
+
+    def run(self) -> int:
+        """Write the scenario files."""
+        from leapnav.envs.worlds.dynobench import read_dynobench
+
+        problems = read_dynobench(self.folder)
+        for name, problem in problems.items():
+            if problem.scenario is None:
+                print(f"{name}: left out: {problem.reason}")
+        return _write([one.scenario for one in problems.values() if one.scenario is not None], self.out)
+
+
+@dataclass(frozen=True)
+class ImportTpcap:
+    """Read the cases of the Trajectory Planning Competition of Automated Parking (https://www.tpcap.net)."""
+
+    folder: tyro.conf.Positional[Path]
+    """Directory of the files CaseN.csv."""
+    out: Path
+    """Output directory of the scenario files."""
+
+    def run(self) -> int:
+        """Write the scenario files."""
+        from leapnav.envs.worlds.tpcap import read_tpcap
+
+        return _write(read_tpcap(self.folder), self.out)
+
+
+@dataclass(frozen=True)
 class Import:
     """Read the worlds of another benchmark from your own download, and write them as scenario files."""
 
     source: tyro.conf.OmitSubcommandPrefixes[
         Annotated[ImportBarn, tyro.conf.subcommand("barn")]
+        | Annotated[ImportDynobench, tyro.conf.subcommand("dynobench")]
         | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
         | Annotated[ImportRosMap, tyro.conf.subcommand("ros-map")]
+        | Annotated[ImportTpcap, tyro.conf.subcommand("tpcap")]
     ]
 
     def run(self) -> int:

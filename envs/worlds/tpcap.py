@@ -1,0 +1,128 @@
+"""The cases of the Trajectory Planning Competition of Automated Parking (TPCAP): a car among polygons.
+
+B. Li et al., "Trajectory planning competition of automated parking", IEEE ITSC (2022), https://www.tpcap.net. A file
+`CaseN.csv` contains, in one line, the poses (x, y, heading) at the start and at the goal, the number of obstacles, the
+number of vertices of each, and the vertices.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from leapnav.envs.robots import Car, box_footprint
+from leapnav.envs.scenarios.cost import Cost
+from leapnav.envs.scenarios.obstacle import Obstacle
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes import Polygon
+
+# The car of the competition: dimensions (m) from the middle of the rear axle, and limits (m/s, rad, rad/s).
+WHEELBASE, FRONT_OVERHANG, REAR_OVERHANG, WIDTH = 2.8, 0.96, 0.929, 1.942
+MAX_SPEED, MAX_STEERING, MAX_STEERING_RATE = 2.5, 0.75, 0.5
+DISCS = 6  # of the footprint, whose corners are rounded
+MARGIN = 8.0  # m around start and goal, which is the area of the competition
+PROXIMITY_WEIGHT, PROXIMITY_SCALE = 1.0, 0.05
+CASE = "Case"
+
+
+def read_tpcap(folder: str | os.PathLike[str]) -> list[Scenario]:
+    """Read the cases of the competition as scenarios with a free horizon, in the order of their numbers.
+
+    The car has no limit of the acceleration, and its corners are rounded. Obstacles that are not convex are divided
+    into triangles.
+
+    Args:
+        folder: directory of the files `CaseN.csv`.
+
+    Raises:
+        FileNotFoundError: there are no such files.
+        ScenarioError: the car touches an obstacle at the start or at the goal.
+        ValueError: a file is not a case; the message names the file.
+
+    """
+    paths = [path for path in Path(folder).glob(f"{CASE}*.csv") if path.stem.removeprefix(CASE).isdecimal()]
+    if not paths:
+        raise FileNotFoundError(f"{folder}: expected files {CASE}N.csv, as in the cases of the competition")
+    return [_scenario(path) for path in sorted(paths, key=lambda path: int(path.stem.removeprefix(CASE)))]
+
+
+def _scenario(path: Path) -> Scenario:
+    text = path.read_text(encoding="utf-8")
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+        count = int(values[6])
+        sizes = [int(value) for value in values[7 : 7 + count]]
+        points = np.reshape(values[7 + count :], (-1, 2))
+    except (ValueError, IndexError):
+        raise ValueError(f"{path}: expected two poses, numbers of vertices, and vertices, got {text[:80]!r}") from None
+    if len(sizes) != count or sum(sizes) != len(points):
+        raise ValueError(f"{path}: expected {sum(sizes)} vertices of {count} obstacles, got {len(points)}")
+    ends = np.cumsum([0, *sizes])
+    parts = [part for a, b in pairwise(ends.tolist()) for part in convex_parts(points[a:b])]
+    start, goal = values[:3], values[3:6]
+    low, high = np.minimum(start[:2], goal[:2]) - MARGIN, np.maximum(start[:2], goal[:2]) + MARGIN
+    car = Car(
+        footprint=box_footprint(WHEELBASE + FRONT_OVERHANG, REAR_OVERHANG, WIDTH, DISCS, rounded=True),
+        wheelbase=WHEELBASE,
+        max_steering=MAX_STEERING,
+        max_speed=MAX_SPEED,
+        # The steering angle changes at most tan(max_steering) times as fast as the steering state.
+        max_steering_rate=MAX_STEERING_RATE / math.tan(MAX_STEERING),
+        steering_weight=1.0,
+    )
+    return Scenario(
+        name=f"tpcap-{path.stem.removeprefix(CASE)}",
+        arena=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
+        robot=car,
+        start=(start[0], start[1], math.remainder(start[2], 2 * math.pi)),
+        goal=(goal[0], goal[1], math.remainder(goal[2], 2 * math.pi)),
+        horizon=None,
+        obstacles=tuple(Obstacle(polygon=Polygon(vertices=tuple(map(tuple, part.tolist())))) for part in parts),
+        cost=Cost(
+            time_weight=1.0,
+            speed_weight=1.0 / MAX_SPEED**2,
+            proximity_weight=PROXIMITY_WEIGHT,
+            proximity_scale=PROXIMITY_SCALE,
+        ),
+    )
+
+
+def convex_parts(vertices: np.ndarray) -> list[np.ndarray]:
+    """Return a simple polygon (n, 2) if it is convex, or else triangles (3, 2) that cover it, by cutting off ears.
+
+    Repeated vertices, and those on a straight line between their neighbours, are left out.
+    """
+    points = [tuple(point) for point in vertices.tolist()]
+    points = [point for k, point in enumerate(points) if point != points[k - 1]]
+    points = [point for k, point in enumerate(points) if _turn(points[k - 1], point, points[(k + 1) % len(points)])]
+    area = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(points, points[1:] + points[:1], strict=True))
+    if area < 0:
+        points.reverse()
+    if all(_turn(points[k - 1], point, points[(k + 1) % len(points)]) > 0 for k, point in enumerate(points)):
+        return [np.array(points)]
+    found = []
+    while len(points) > 3:
+        k = next((k for k in range(len(points)) if _is_ear(points, k)), 0)
+        corner = (points[k - 1], points[k], points[(k + 1) % len(points)])
+        if _turn(*corner) > 0:
+            found.append(np.array(corner))
+        del points[k]
+    return [*found, np.array(points)]
+
+
+def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
+    """Return twice the signed area of a triangle, positive if it turns left."""
+    return (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])
+
+
+def _is_ear(points: list[tuple[float, ...]], k: int) -> bool:
+    """Return whether the triangle at a vertex lies inside a counter-clockwise polygon."""
+    a, b, c = points[k - 1], points[k], points[(k + 1) % len(points)]
+    if _turn(a, b, c) <= 0:
+        return False
+    others = (point for point in points if point not in (a, b, c))
+    return not any(min(_turn(a, b, p), _turn(b, c, p), _turn(c, a, p)) >= 0 for p in others)
