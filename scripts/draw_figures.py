@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from leapnav.envs import (
-    FAMILIES,
     Car,
     DifferentialDrive,
     DynamicUnicycle,
@@ -18,6 +17,7 @@ from leapnav.envs import (
     Unicycle,
     sample_scenario,
 )
+from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.utils.colors import OPTIMUM
 from leapnav.experts import ExpertPolicy, find_optimum, lower_bound, plot_extremal, plot_tube, solve
 from leapnav.experts.plotting import draw_robot, draw_scenario
@@ -34,8 +34,8 @@ FRAMES = (("clutter", 7, 124), ("polygons", 0, 110), ("slalom", 0, 364))
 def draw_families() -> None:
     """Draw three test scenarios of each family with their optima."""
     figure = Figure(figsize=(10.4, 6.5), layout="constrained")
-    axes = figure.subplots(FAMILY_ROWS, len(FAMILIES))
-    for column, family in enumerate(FAMILIES):
+    axes = figure.subplots(FAMILY_ROWS, len(ALL_FAMILIES))
+    for column, family in enumerate(ALL_FAMILIES):
         bank = ScenarioBank.shipped(family, "test")
         axes[0, column].set_title(family)
         for row, index in enumerate(FAMILY_INDICES):

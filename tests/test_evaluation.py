@@ -141,8 +141,8 @@ def test_bad_arguments_are_named():
         evaluate(policy, "open", count=1, progress=False)
     found = evaluate(policy, "open", count=1, environment={"lidar_beams": 16}, progress=False)
     assert len(found) == 1
-    with pytest.raises(ValueError, match=r"family: expected .* got 'maze'"):
-        evaluate(policy, "maze")
+    with pytest.raises(ValueError, match=r"family: expected .* got 'moon'"):
+        evaluate(policy, "moon")
     with pytest.raises(ValueError, match="count: expected at least one scenario, got 0"):
         evaluate(policy, "open", count=0)
 

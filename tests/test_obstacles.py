@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import best_known, scenario_fields
 
-from leapnav.envs import Scenario
+from leapnav.envs import Obstacle, Polygon, Scenario, Unicycle
 from leapnav.envs.shapes.clearance import clearance, clearances
 from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
 from leapnav.envs.shapes.proximity_grid import MAX_EXPONENT, MIN_EXPONENT, exponential
@@ -213,3 +213,18 @@ def test_points_far_away_or_not_numbers_are_survived():
     for x, y in ((1e300, 0.0), (-1e300, 1e300), (math.inf, 0.0)):
         assert proximity(x, y, scenario.field)[0] == math.inf  # far behind a wall
     assert not proximity(math.nan, 1.0, scenario.field)[0] < 0
+
+
+def test_lists_are_accepted_where_tuples_are_expected():
+    square = [[4.0, 4.0], [5.0, 4.0], [5.0, 5.0], [4.0, 5.0]]
+    lists = Scenario(
+        arena=[0.0, 0.0, 10.0, 10.0],
+        start=[1.0, 1.0, 0.0],
+        goal=[9.0, 9.0, None],
+        horizon=12.0,
+        obstacles=[Obstacle(polygon=Polygon(vertices=square))],
+        robot=Unicycle(footprint=[{"offset": 0.0, "radius": 0.2}]),
+    )
+    tuples = Scenario.from_json(lists.to_json())
+    assert lists == tuples and hash(lists) == hash(tuples)
+    assert isinstance(lists.obstacles, tuple) and isinstance(lists.obstacles[0].polygon.vertices[0], tuple)

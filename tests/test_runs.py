@@ -300,7 +300,7 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         ({"evaluate_every": 0}, r"evaluate_every: expected an integer >= 1, got 0"),
         ({"std": 0.0}, r"std: expected a positive number, got 0.0"),
         ({"seed": -1}, r"seed: expected an integer from 0"),
-        ({"family": "maze"}, r"family: expected one of .*got 'maze'"),
+        ({"family": "moon"}, r"family: expected one of .*got 'moon'"),
         ({"hidden": (0,)}, r"hidden: expected widths of at least 1"),
         ({"jump_start": 3.0}, r"jump_start: expected a number in \[0, 1\], got 3.0"),
         ({"critic_first": 1.0}, r"critic_first: expected a number in \[0, 1\), got 1.0"),

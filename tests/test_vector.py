@@ -229,7 +229,7 @@ def test_gymnasium_s_vector_wrappers_accept_the_environment(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: make(2, family="maze"), "family: expected one of .*'maze'"),
+        (lambda: make(2, family="moon"), "family: expected one of .*'moon'"),
         (lambda: NavigateVectorEnv(0), "num_envs: expected an integer >= 1, got 0"),
         (lambda: make(2, autoreset_mode="later"), "autoreset_mode: expected one of .*'later'"),
         (lambda: make(2, render_mode="human"), "render_mode: expected None or one of rgb_array, got 'human'"),

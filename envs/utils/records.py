@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 # Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
 MAX_MAGNITUDE = 1e6
@@ -15,9 +15,16 @@ Point = tuple[Finite, Finite]
 
 
 class Frozen(BaseModel):
-    """An immutable record that accepts no unknown fields and converts no types."""
+    """An immutable record that accepts no unknown fields and converts no types, except lists to tuples."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _accept_lists(cls, fields: Any) -> Any:
+        if isinstance(fields, dict) and any(isinstance(value, list) for value in fields.values()):
+            return {name: as_tuples(value) if isinstance(value, list) else value for name, value in fields.items()}
+        return fields
 
 
 def as_tuples(value: Any) -> Any:
