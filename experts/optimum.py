@@ -243,7 +243,7 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
     scenario = search.scenario
     if math.dist(scenario.start[:2], scenario.goal[:2]) > LONG_DISTANCE:
         return _search_plane(search, grids, thorough)
-    shortest_time = np.inf
+    shortest_time, cropped = np.inf, False
     for refinement, margin in LATTICES[: None if thorough else 1]:
         lattice = grids.lattice(refinement, margin).without(search.closed_places)
         search.reset_failure_budget()
@@ -270,11 +270,14 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
             if search.closed_places != closed:  # other candidates would use the same passage
                 closed = search.closed_places.copy()
                 lattice, found = lattice.without(search.closed_places), None
-        if lattice.cropped and shortest_time == np.inf:
-            return _search_plane(search, grids, thorough)
+        cropped = lattice.cropped
+        if cropped and shortest_time == np.inf:
+            break
         # Lattice paths may lead through passages that are slightly too narrow, so this is checked separately.
         if thorough and not search.certified and not grids.connected():
             return Status.NO_PATH
+    if cropped and not search.certified:  # the path may leave the surroundings of start and goal
+        return _search_plane(search, grids, thorough)
     return _reason(search, shortest_time)
 
 

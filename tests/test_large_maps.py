@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from leapnav.envs import Obstacle, Polygon, Scenario
+from leapnav.envs import Circle, Obstacle, Polygon, Scenario, Unicycle
 from leapnav.envs.scenarios.maps import read_movingai
 from leapnav.experts import find_optimum
 from leapnav.experts.problem.extremal import Status
@@ -143,6 +143,36 @@ def test_a_narrow_passage_of_a_large_arena_is_found(gap, is_open):
         assert optimum.states[:, 1].max() == pytest.approx(63.7, abs=0.5)
     else:
         assert optimum.status is Status.NO_PATH
+
+
+def test_a_detour_far_away_is_found_although_a_passage_nearby_is_too_narrow():
+    """The lattice of the surroundings has candidates, all through the narrow passage."""
+    narrow = (
+        wall(1.2)[0],
+        *(
+            Obstacle(polygon=Polygon(vertices=((-1.0, low), (1.0, low), (1.0, high), (-1.0, high))))
+            for low, high in ((64.3, 75.0), (75.44, 100.0))
+        ),
+    )
+    scenario = Scenario(
+        arena=(-100, -100, 100, 100), start=(-4, 100 - 1.5, 0), goal=(4, 98.5, None), horizon=120.0, obstacles=narrow
+    )
+    optimum = find_optimum(scenario)
+    assert optimum.success
+    assert optimum.states[:, 1].min() == pytest.approx(63.7, abs=1.0)
+
+
+def test_a_footprint_beside_its_position_is_not_said_to_have_no_path():
+    """The position (x, y) of the robot may lie in the thin obstacle, of which its only disc is clear."""
+    scenario = Scenario(
+        arena=(0, 0, 6, 4),
+        robot=Unicycle(footprint=[{"offset": 0.5, "radius": 0.2}]),
+        start=(3.0, 2.0, 0.0),
+        goal=(4.5, 2.0, 0.0),
+        horizon=4.0,
+        obstacles=[Obstacle(circle=Circle(center=(2.9, 2.0), radius=0.2))],
+    )
+    assert is_connected(scenario)
 
 
 def test_a_path_of_hundreds_of_metres_does_not_depend_on_the_search():

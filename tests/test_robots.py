@@ -23,7 +23,7 @@ from leapnav.envs import (
     Unicycle,
     sample_scenario,
 )
-from leapnav.envs.robots import register
+from leapnav.envs.robots import box_footprint, register
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.shapes.clearance import footprint_clearance
@@ -387,3 +387,23 @@ def test_the_system_of_a_model_is_that_of_its_problem():
         assert problem.system is system_of(model)
         assert len(problem.start) == len(model.state_names)
     assert leapnav.envs.RobotModel is not None
+
+
+def test_a_box_footprint_covers_the_box_or_leaves_out_its_corners():
+    box = np.array([(x, y) for x in np.linspace(-0.2, 0.6, 81) for y in np.linspace(-0.15, 0.15, 31)])
+    for count in (1, 3, 5):
+        discs = box_footprint(0.6, 0.2, 0.3, count)
+        depths = [disc.radius - np.hypot(box[:, 0] - disc.offset, box[:, 1]) for disc in discs]
+        assert len(discs) == count and np.max(depths, axis=0).min() > -1e-12
+    rounded = box_footprint(0.6, 0.2, 0.3, 4, rounded=True)
+    ends = [disc.offset + side * disc.radius for disc in rounded for side in (-1, 1)]
+    assert (min(ends), max(ends)) == pytest.approx((-0.2, 0.6))
+    box = {"front": 0.6, "rear": 0.2, "width": 0.3}
+    for change, message in (
+        ({"front": 0.0}, "front: expected a positive"),
+        ({"count": 0}, "count: expected at least 1, got 0"),
+        ({"width": 0.9, "rounded": True}, "width: expected less than the length 0.8"),
+        ({"count": 2, "rounded": True}, "count: expected at least 3 discs that overlap, got 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            box_footprint(**(box | change))

@@ -28,8 +28,20 @@ HorizonName = Literal["fixed", "free"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
 MemoryName = Literal["none", "stack", "lstm"]
-TEST_BANK = "test.bank"  # file in the directory of a run of a family that is not built in: scenarios of the evaluations
+TEST_BANK = "test.bank"  # file in the directory of a run of a family without an included bank
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
+
+
+def own_bank(folder: Path, trained: str, family: str) -> Path:
+    """Return the file of the test bank that a run builds for a family of which no bank is included.
+
+    Args:
+        folder: directory of the run.
+        trained: family of the run, which may be "all".
+        family: the family of the bank.
+
+    """
+    return folder / (TEST_BANK if family == trained else f"test-{family}.bank")
 
 
 @dataclass(frozen=True)

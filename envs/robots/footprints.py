@@ -15,7 +15,7 @@ def box_footprint(
 
     Discs that cover the corners protrude: with `count` discs, by half the difference of their diameter and the width at
     the sides, and by more at the ends. Rounded discs have the width of the rectangle and end where it ends, so that its
-    corners are rounded.
+    corners are left out, and between the discs a narrow part of its sides.
 
     Args:
         front, rear: distances (m) from (x, y) to the front and to the rear end.
@@ -24,7 +24,8 @@ def box_footprint(
         rounded: whether to leave out the corners instead of covering them.
 
     Raises:
-        ValueError: an argument is not positive, or with `rounded` the rectangle is not longer than wide.
+        ValueError: an argument is not positive; with `rounded`, the rectangle is not longer than wide, or the discs do
+            not overlap.
 
     """
     for name, value in (("front", front), ("rear", rear), ("width", width)):
@@ -35,7 +36,10 @@ def box_footprint(
         part = length / count
         radius = math.hypot(part / 2, width / 2)
         return tuple(Disc(offset=-rear + part * (k + 0.5), radius=radius) for k in range(count))
-    if length < width:
-        raise ValueError(f"width: expected at most the length {length:g} of a rounded footprint, got {width:g}")
-    step = (length - width) / max(count - 1, 1)
+    if length <= width:
+        raise ValueError(f"width: expected less than the length {length:g} of a rounded footprint, got {width:g}")
+    needed = math.ceil((length - width) / width - 1e-9) + 1
+    if count < needed:
+        raise ValueError(f"count: expected at least {needed} discs that overlap, got {count}")
+    step = (length - width) / (count - 1)
     return tuple(Disc(offset=-rear + width / 2 + step * k, radius=width / 2) for k in range(count))

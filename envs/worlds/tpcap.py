@@ -32,8 +32,8 @@ CASE = "Case"
 def read_tpcap(folder: str | os.PathLike[str]) -> list[Scenario]:
     """Read the cases of the competition as scenarios with a free horizon, in the order of their numbers.
 
-    The car has no limit of the acceleration, and its corners are rounded. Obstacles that are not convex are divided
-    into triangles.
+    The car has no limit of the acceleration, its corners are rounded, and its sides are indented by up to 4 cm.
+    Obstacles that are not convex are divided into triangles.
 
     Args:
         folder: directory of the files `CaseN.csv`.

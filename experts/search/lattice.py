@@ -213,7 +213,9 @@ def is_connected(scenario: Scenario) -> bool:
     less than MIN_SPACING are closed.
     """
     discs = scenario.discs
-    radius = max(float((discs[:, 1] - np.abs(discs[:, 0])).max()), 1e-3)
+    radius = float((discs[:, 1] - np.abs(discs[:, 0])).max())
+    if radius <= 0:  # no disc contains (x, y), which may lie in an obstacle
+        return True
     low, high = _occupied(scenario)
     side = float((high - low).max())
     spacing = max(MIN_SPACING, side / FIRST_POINTS)

@@ -25,7 +25,7 @@ from leapnav.envs.scenarios.families import families_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
-from leapnav.training.config import TEST_BANK, RunConfig
+from leapnav.training.config import RunConfig, own_bank
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
@@ -160,7 +160,7 @@ class Run:
         if family in ScenarioBank.shipped_families(robot, horizon):
             return ScenarioBank.shipped(family, "test", robot, horizon)
         task: dict[str, Any] = {"robot": robot, "horizon": horizon, "seed": TEST_SEED}
-        return build_bank(family, TEST_COUNT, self.folder / TEST_BANK, **task, progress=False)
+        return build_bank(family, TEST_COUNT, own_bank(self.folder, self.config.family, family), **task, progress=False)
 
     def _write_evaluations(self) -> None:
         write_text(self.folder / "evaluations.jsonl", "".join(encode(line) + "\n" for line in self.evaluations))

@@ -27,7 +27,7 @@ from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of
 from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
-from leapnav.training.config import TEST_BANK, RunConfig, read_config
+from leapnav.training.config import RunConfig, own_bank, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
 from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
@@ -111,8 +111,12 @@ def write_report(
 
 def _banks(specs: Sequence[PolicySpec], families: Sequence[str], records: Sequence[_RunRecord]) -> list[ScenarioBank]:
     """Return the test banks of families: the included ones, or those in the directories of the runs."""
-    own = {record.config.family: Path(record.spec.name) / TEST_BANK for record in records}
-    found = {name: own[name] for name in families if name in own and own[name].exists()}
+    found: dict[str, Path] = {}
+    for name in families:
+        for record in records:
+            config, bank = record.config, own_bank(Path(record.spec.name), record.config.family, name)
+            if name not in ScenarioBank.shipped_families(config.robot, config.horizon) and bank.exists():
+                found[name] = bank
     included = included_banks(specs, [name for name in families if name not in found])
     return [*included, *map(ScenarioBank, found.values())]
 
