@@ -90,8 +90,8 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
         raise SolveError(followed[0].extremal, task.name if isinstance(task, Scenario) else "")
     has_state_cost = problem.field is not None or problem.state_cost != 0
     tolerances = [0.5 * len(bounds) * weight for weight in weights]
-    if has_state_cost:  # the durations alone do not rank the paths; a lower bound of the limit of the costs does
-        best = min(ends, key=lambda end: end.extremal.cost / (1.0 + tolerances[end.solved - 1]))
+    if has_state_cost:  # the durations alone do not rank the paths, and the control costs have different weights
+        best = min(ends, key=lambda end: _cost_without_controls(end.extremal))
     else:
         best = min(ends, key=lambda end: end.extremal.horizon)
     tolerance = tolerances[best.solved - 1]
@@ -105,6 +105,13 @@ class _End(NamedTuple):
 
     extremal: Extremal
     solved: int
+
+
+def _cost_without_controls(extremal: Extremal) -> float:
+    """Return the time plus the integral of the state cost and the proximity cost."""
+    times = np.linspace(0.0, extremal.horizon, POINTS)
+    rates = 0.5 * extremal.evaluate(times)[1] ** 2 @ np.array(extremal.problem.control_weight)
+    return extremal.cost - float(np.trapezoid(rates, times))
 
 
 def _weights(tol: float, m: int) -> Iterator[float]:
