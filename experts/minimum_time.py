@@ -89,12 +89,11 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
     if not ends:
         raise SolveError(followed[0].extremal, task.name if isinstance(task, Scenario) else "")
     has_state_cost = problem.field is not None or problem.state_cost != 0
-    tolerances = [0.5 * len(bounds) * weight for weight in weights]
     if has_state_cost:  # the durations alone do not rank the paths, and the control costs have different weights
         best = min(ends, key=lambda end: _cost_without_controls(end.extremal))
     else:
         best = min(ends, key=lambda end: end.extremal.horizon)
-    tolerance = tolerances[best.solved - 1]
+    tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
     lower_bound = np.nan if has_state_cost else best.extremal.cost / (1.0 + tolerance)
     structure = switching_structure(best.extremal, bounds)
     return MinimumTime(best.extremal, best.extremal.horizon, tolerance, lower_bound, *structure)

@@ -14,7 +14,7 @@ import pytest
 
 import leapnav
 from leapnav.envs import FAMILIES, BankError, ScenarioBank, sample_scenario
-from leapnav.envs.scenarios.bank import SPLITS, VERSION
+from leapnav.envs.scenarios.bank import SPLITS, VERSION, VERSION_WITHOUT_GRIDS
 from leapnav.envs.scenarios.bank_writing import BankEntry, write_bank
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.shapes.clearance import clearances
@@ -340,6 +340,21 @@ def test_the_included_banks_are_certified_and_complete(family):
             assert reference.states[0] == pytest.approx(scenario.start, abs=1e-6)
             assert reference.states[-1, :2] == pytest.approx(scenario.goal[:2], abs=1e-6)
     assert {s.start for s in ScenarioBank.shipped(family, "train")}.isdisjoint(s.start for s in shipped)
+
+
+def test_the_grid_of_a_field_is_left_out_and_computed_again():
+    for family, version in (("clutter", VERSION), ("maze", VERSION_WITHOUT_GRIDS)):
+        shipped = ScenarioBank.shipped(family, "test")
+        index = max(range(20), key=lambda i: len(shipped[i].obstacles))
+        with h5py.File(shipped.path) as file:
+            assert file.attrs["version"] == version
+            stored = int(np.diff(file["field_ends"][:20], prepend=0)[index])
+        field = shipped.field(index)
+        assert np.array_equal(field, shipped[index].field)
+        assert (stored < len(field)) == (family == "maze")
+        if family == "maze":
+            assert len(shipped[index].obstacles) > 16
+            assert shipped.field(index) is field  # it is computed once
 
 
 @pytest.mark.parametrize("family", FAMILIES)

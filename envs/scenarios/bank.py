@@ -10,7 +10,7 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 | `scenario_ends` | (n,) int64 | the end of each text |
 | `tasks` | (n, K) float64 | the packed tasks: start (3), goal (3), horizon, limits (n_u), weights (n_u), further states at the start and the goal (n_q - 3 each), parameters; NaN where the goal is free. If the horizon is free: the time limit instead of the horizon, and the time weight in a last column |
 | `horizons` | (n,) float64 | durations of the optima (s); only if the horizon is free |
-| `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field`, without the cells of their grids |
+| `fields` | (sum of the lengths,) float64 | the packed obstacle fields, see `leapnav.envs.shapes.field`; a grid of several cells is left out |
 | `field_ends` | (n,) int64 | the end of each field |
 | `draws` | (n,) int64 | index of the random draw that produced the scenario |
 | `costs` | (n,) float64 | J* |
@@ -22,8 +22,8 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 | `costates` | (sum of N_i, n_q) float32 | lambda, the gradient of the cost-to-go |
 | `lower_bounds` | (n,) float64 | proved lower bounds of the cost, NaN where none is known; only after `leapnav bank prove` |
 
-Attributes of the file: `format` ("leapnav-bank"), `version` (5 if some field has a grid, which is omitted; otherwise 4,
-where a grid would be part of its field), `family`, `seed`, `drawn` (number of scenarios drawn,
+Attributes of the file: `format` ("leapnav-bank"), `version` (5 if the grid of some field is left out, otherwise 4;
+files of earlier versions of leapnav with version 4 contain the grids), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
 leapnav that built the bank), `given` (only of a bank of given scenarios; JSON: `scenarios`, their digest, and
 `rejected` and `doubtful`, the reasons by name) and `checksums` (JSON: the BLAKE2b digest of each dataset, and under `attributes` that

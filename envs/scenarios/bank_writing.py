@@ -26,7 +26,7 @@ from leapnav.envs.scenarios.bank import (
     digest,
 )
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import GRID, without_grid
+from leapnav.envs.shapes.field import without_grid
 from leapnav.envs.utils.files import atomic_path
 
 MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
@@ -53,12 +53,6 @@ class BankEntry:
     controls: np.ndarray
     costates: np.ndarray
     horizon: float | None = None
-
-
-def grid_cells(field: np.ndarray) -> int:
-    """Return the number of cells of the grid of a packed field."""
-    at = int(field[GRID])
-    return int(field[at + 3] * field[at + 4])
 
 
 def point_times(horizon: float) -> np.ndarray:
@@ -98,9 +92,7 @@ def write_bank(
     kinds = sorted({scenario.horizon_kind for scenario in scenarios})
     if len(kinds) > 1:
         raise ValueError(f"entries: expected one kind of horizon for all scenarios, got {', '.join(kinds)}")
-    fields = [
-        without_grid(scenario.field) if grid_cells(scenario.field) > 1 else scenario.field for scenario in scenarios
-    ]
+    fields = [without_grid(scenario.field) for scenario in scenarios]
     is_complete = all(len(field) == len(scenario.field) for field, scenario in zip(fields, scenarios, strict=True))
     n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
     columns: dict[str, Any] = {

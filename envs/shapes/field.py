@@ -44,8 +44,8 @@ CIRCLES, RECORDS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # indices into the packe
 # Indices into the record of a shape other than circle and polygon.
 KIND, LENGTH, CENTRE, RIM, REACH, ROUNDING, N_VERTICES, VERTICES = 0, 1, 2, 4, 5, 6, 7, 8
 MAX_OBSTACLES_WITHOUT_GRID = 16  # fewer obstacles are evaluated faster one by one
-# Number of cells per axis: MIN_GRID_CELLS, or more in a large arena, whose cells are at most REACHES_PER_CELL times as
-# large as the reach of an obstacle.
+# Smallest and largest number of cells per axis. Between them, a cell is as large as this multiple of the reach of an
+# obstacle.
 MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
 LANES = 8  # doubles in a vector register of 512 bits
 FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
@@ -184,9 +184,9 @@ def _assemble(header: Sequence[float], parts: FieldParts, indices: Sequence[floa
 
 
 def without_grid(packed: np.ndarray) -> np.ndarray:
-    """Return a packed field without the cells of its grid, most of its size; `with_grid` computes them again."""
+    """Return a packed field without its grid, most of its size, if that has several cells; see `with_grid`."""
     at = int(packed[GRID])
-    return packed[:at] if packed[at + 3] > 0 else packed
+    return packed[:at] if packed[at + 3] * packed[at + 4] > 1 else packed
 
 
 def with_grid(packed: np.ndarray) -> np.ndarray:
@@ -264,15 +264,14 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
     near_circles: list[list[int]] = [[] for _ in first]
     near_polygons: list[list[int]] = [[] for _ in first]
-    everywhere = np.arange(len(first))
     for k, (x, y, radius) in enumerate(circles.tolist()):
         box = np.array([[x, y]]) + (radius + reach) * np.array([[-1.0], [1.0]])
-        cells = everywhere if count == MIN_GRID_CELLS else _cells_in(box, low, size, shape)
+        cells = _cells_in(box, low, size, shape)
         nearest = np.clip((x, y), first[cells], first[cells] + size)
         for cell in cells[np.linalg.norm(nearest - (x, y), axis=1) - radius < reach].tolist():
             near_circles[cell].append(k)
     for k, polygon in enumerate(polygons):
-        cells = everywhere if count == MIN_GRID_CELLS else _cells_in(_offset(polygon, reach), low, size, shape)
+        cells = _cells_in(_offset(polygon, reach), low, size, shape)
         # The minimum over the cell of the distance to each half-plane; the maximum of these is a lower bound for the
         # distance to the polygon.
         lowest = np.minimum(polygon[:, :2] * size, 0.0).sum(axis=1) - polygon[:, 2]

@@ -20,7 +20,6 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 from leapnav.envs.worlds.yaml_files import YamlFields, read_yaml
 
-ORIGIN, LICENCE = "dynobench, https://github.com/quimortiz/dynobench", "mit"
 MODEL = "unicycle1"  # the dynamics that leapnav has: speed and turn rate with symmetric limits
 DISCS = 5  # of the footprint that covers the robot's box
 # The proximity cost is small except within a few centimetres of the obstacles, so that its optimum is close to that of

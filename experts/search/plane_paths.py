@@ -1,8 +1,8 @@
 """Candidate paths across a large arena: shortest paths in the plane.
 
 Across a large arena, the cells of the lattice over position and heading would be larger than the passages. The robot's
-heading matters little there: a shortest path in the plane, driven forwards or backwards along its tangent, is an
-initial guess of almost every passage, and a grid of positions may have many more cells.
+heading matters little there: a shortest path in the plane, driven forwards or backwards along its tangent, is a good
+initial guess, and a grid of positions may have many more cells.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from leapnav.experts.search.candidates import Candidate, CandidateSearch, Tree, 
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import meeting_nodes, plane_parents
 
-# Cells per side, for one layer of speeds and for one of each heading, whose number of points is 16 times as large.
+# Cells per side. For a footprint of several discs, the speeds of 16 headings are stored.
 MAX_CELLS, MAX_CELLS_OF_HEADINGS = 1024, 384
 DISTINCT_DISTANCE = 2.0  # m, by which the paths differ somewhere
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from leapnav.commands.options import Horizon, Robot
-from leapnav.outputs import check_outputs, write_json
+from leapnav.outputs import FAILED, check_outputs, write_json
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class BenchmarkDynobench:
     """JSON file of the table; "-" for standard output."""
 
     def run(self) -> int:
-        """Compute the minimum times and print the table."""
+        """Compute the minimum times and print the table; it fails if one is missing."""
         check_outputs(self.json)
         from leapnav.envs.worlds.dynobench import read_dynobench
         from leapnav.experts import SolveError, minimum_time
@@ -104,7 +104,7 @@ class BenchmarkDynobench:
             try:
                 found = minimum_time(problem.scenario, self.tol)
             except SolveError as error:
-                print(f"{error}")
+                print(error)
             else:
                 certificate = found.extremal.certificate
                 clearance = certificate.clearance if certificate is not None else None
@@ -112,7 +112,7 @@ class BenchmarkDynobench:
             rows[name] = {**row, **problem.durations}
         _print_durations(rows)
         write_json(rows, self.json)
-        return 0
+        return 0 if all(row["leapnav"] is not None for row in rows.values()) else FAILED
 
 
 @dataclass(frozen=True)
