@@ -41,7 +41,7 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
             "seeds": [make_policy(env.observation_space, env.action_space, seed, SMALL) for seed in (0, 1)],
         },
         "open",
-        count=3,
+        count=1,
         progress=False,
     )
     rows = {row.policy: row for row in found.scores()}
@@ -51,8 +51,8 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
     assert rows["function"].mean_return.value > rows["object"].mean_return.value
     assert repr(found).startswith("<Comparison: open; SOC: function ")
     frame = found.to_dataframe()
-    assert len(frame) == 3 * 8 and set(frame.policy) == set(rows)
-    assert frame[frame.policy == "seeds"].run.tolist() == [0, 0, 0, 1, 1, 1]
+    assert len(frame) == 8 and set(frame.policy) == set(rows)
+    assert frame[frame.policy == "seeds"].run.tolist() == [0, 1]
     print_scores(found)
     plot_scores(found, tmp_path / "scores.png")
     plot_episodes(found.banks, found.runs["function"][0].episodes, tmp_path / "episodes.png")

@@ -16,7 +16,7 @@ def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tm
     policy = fresh(env)
     behaviour_clone(policy, dataset, QUICK, progress=False)
     venv = make_vec_env(n_envs=4, family="open", split="fresh")
-    config = DAggerConfig(rounds=2, max_failures=4, lead=1.0)
+    config = DAggerConfig(rounds=2, max_episodes=6, lead=1.0)
     dagger = DAgger(
         policy,
         ExpertPolicy(venv, quick=True),
@@ -119,18 +119,18 @@ def test_takeovers_by_regret_are_where_the_cost_increases():
         assert samples.rewards.sum() == pytest.approx(samples.returns[0] + find_optimum(rest).cost_to_go(0.5), rel=1e-6)
 
 
-def test_dagger_is_the_same_with_the_same_seed_and_any_number_of_workers(env, monkeypatch):
+def test_dagger_is_the_same_with_any_number_of_workers(env, monkeypatch):
     monkeypatch.setattr("leapnav.training.learning.dagger.LABELLED_PER_TASK", 1)
     monkeypatch.setattr("leapnav.training.learning.dagger.DRIVEN_PER_TASK", 2)
     found = []
-    for workers in (1, 1, 2):
+    for workers in (1, 2):
         policy = fresh(env)
         venv = make_vec_env(n_envs=2, family="open", split="fresh")
-        config = DAggerConfig(rounds=1, max_episodes=3, lead=0.5, seed=4)
+        config = DAggerConfig(rounds=1, max_episodes=2, lead=0.5, seed=4)
         dagger = DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK, workers=workers)
         dagger.run(progress=False)
         found.append((policy.parameters_to_vector().tobytes(), dagger.dataset.observations.tobytes()))
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]
     with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
         DAgger(fresh(env), ExpertPolicy(venv), venv, workers=0)
 

@@ -249,7 +249,7 @@ def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
 
 def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
     def config(out, **changes):
-        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, max_failures=4, lead=0.5)}
+        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, max_episodes=6, lead=0.5)}
         return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
 
     train_dagger(config(tmp_path / "straight"), progress=False)
@@ -416,7 +416,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):
         folders.append(str(tmp_path / f"bc{seed}"))
     train_ppo(ppo(tmp_path / "ppo"), progress=False)
     page = tmp_path / "report.html"
-    found = write_report([*folders, str(tmp_path / "ppo")], page, count=5, progress=False)
+    found = write_report([*folders, str(tmp_path / "ppo")], page, count=2, progress=False)
     assert list(found.runs) == [folders[0], str(tmp_path / "ppo"), "expert", "go-to-goal", "random"]
     assert [len(runs) for runs in found.runs.values()] == [2, 1, 1, 1, 1]
     text = page.read_text()

@@ -254,19 +254,20 @@ def _sample_task(
     """Return random poses, the horizon and the cost; None if the poses are too close or not connected."""
     discs, cost = body.discs(), Cost() if horizon == "fixed" else Cost(time_weight=TIME_WEIGHT)
     areas = layout.regions
+    poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
+    x_min, y_min, x_max, y_max = layout.arena
+    sides = x_max - x_min, y_max - y_min
+    if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE * min(sides):
+        return None
     field = pack_field(
         [obstacle.shape for obstacle in layout.obstacles],
         layout.arena,
         float(discs[:, 1].max()),
         cost.proximity_weight,
         cost.proximity_scale,
+        grid=False,
     )
-    poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
-    x_min, y_min, x_max, y_max = layout.arena
-    sides = x_max - x_min, y_max - y_min
-    if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE * min(sides) or (
-        footprint_clearances(poses, discs, field).min() < MIN_POSE_CLEARANCE
-    ):
+    if footprint_clearances(poses, discs, field).min() < MIN_POSE_CLEARANCE:
         return None
     length = _shortest_path(layout.arena, field, poses[0, :2], poses[1, :2])
     if length is None:

@@ -78,6 +78,8 @@ def pack_field(
     radius: float,
     weight: float,
     scale: float,
+    *,
+    grid: bool = True,
 ) -> np.ndarray:
     """Pack obstacles, walls and proximity cost into the flat array that the kernels read.
 
@@ -86,6 +88,7 @@ def pack_field(
         arena: (x_min, y_min, x_max, y_max) (m).
         radius: largest radius of a disc of the robot's footprint (m).
         weight, scale: proximity weight and proximity scale (m).
+        grid: whether to compute the grid, which takes most of the time; clearances do not need it.
 
     """
     header = [weight, scale, radius, 0.0, 0.0, *arena]
@@ -102,9 +105,9 @@ def pack_field(
         else:
             parts.records.append(_pack_record(shape, header))
             indices[1].append(float(index))
-    return _assemble(
-        header, parts._replace(circles=np.reshape(circles, (-1, 3))), [*indices[0], *indices[1], *indices[2]]
-    )
+    parts = parts._replace(circles=np.reshape(circles, (-1, 3)))
+    packed = _assemble(header, parts, [*indices[0], *indices[1], *indices[2]])
+    return with_grid(packed) if grid else packed
 
 
 def _pack_record(shape: Shape, header: Sequence[float]) -> np.ndarray:
@@ -166,7 +169,7 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
         blended.records.append(between)
     for polygon, other in zip(a.polygons, b.polygons, strict=True):
         blended.polygons.append(edge_rows((1.0 - fraction) * polygon[:, 3:] + fraction * other[:, 3:]))
-    return _assemble(header, blended, first[int(first[GRID]) - _count(a) : int(first[GRID])].tolist())
+    return with_grid(_assemble(header, blended, first[int(first[GRID]) - _count(a) : int(first[GRID])].tolist()))
 
 
 def _count(parts: FieldParts) -> int:
@@ -174,13 +177,12 @@ def _count(parts: FieldParts) -> int:
 
 
 def _assemble(header: Sequence[float], parts: FieldParts, indices: Sequence[float]) -> np.ndarray:
-    """Return the packed field with its grid; its counts and the index of the grid are not in `header`."""
+    """Return the packed field without its grid; its counts and the index of the grid are not in `header`."""
     polygons = [value for rows in parts.polygons for value in (float(len(rows)), *rows.ravel().tolist())]
     obstacles = [*parts.circles.ravel().tolist(), *(x for record in parts.records for x in record.tolist()), *polygons]
     counts = float(len(parts.circles)), float(len(parts.records) + len(parts.polygons))
     grid_index = float(SHAPES + len(obstacles) + len(indices))
-    packed = np.array([*header[:CIRCLES], *counts, *header[ARENA:], grid_index, *obstacles, *indices], dtype=np.float64)
-    return with_grid(packed)
+    return np.array([*header[:CIRCLES], *counts, *header[ARENA:], grid_index, *obstacles, *indices], dtype=np.float64)
 
 
 def without_grid(packed: np.ndarray) -> np.ndarray:
