@@ -42,7 +42,7 @@ def takeovers(family: str, count: int) -> list[Scenario]:
         if episode.success or left < MIN_TIME_LEFT + LEAD:
             continue
         rest = scenario.model_copy(update={"start": tuple(episode.states[step].tolist()), "horizon": left})
-        if find_optimum(rest, thorough=False).success:
+        if find_optimum(rest, thorough=False, alternatives=False).success:
             found.append(rest)
     return found
 
@@ -83,7 +83,9 @@ def main() -> None:
             start = time.perf_counter()
             actions = in_the_environment(env, scenario)
             middle = time.perf_counter()
-            samples = samples_of(observer, SETTINGS, scenario, find_optimum(scenario, thorough=False), LEAD)
+            samples = samples_of(
+                observer, SETTINGS, scenario, find_optimum(scenario, thorough=False, alternatives=False), LEAD
+            )
             end = time.perf_counter()
             assert len(actions) == len(samples)
             assert np.median(np.abs(samples.actions - np.array(actions))) < AGREEMENT

@@ -32,8 +32,11 @@ from leapnav.experts.solve import solve
 from leapnav.experts.solvers.newton import solve_nodes
 from leapnav.experts.transcription import arcs_descent, descent
 
+N_FIRST = 3  # candidates after which, without alternatives, those that are too long are omitted
 N_ELSEWHERE = 4  # additional candidates far from the others: inexpensive, and the most distinct alternatives
-MAX_ROUNDS = 4
+# Rounds of candidates of a lattice, and of the first one while nothing is certified: among dense obstacles, most
+# candidates are in collision.
+MAX_ROUNDS, MAX_FIRST_ROUNDS = 4, 12
 # Refinement and margin (m) of the lattices, tried in this order while nothing is certified or a better path may have
 # been missed. All candidates may lead through a passage that is too narrow, or in which the optimum is close to
 # contact; a margin closes it. A passage or a short path may need smaller cells.
@@ -59,8 +62,9 @@ class Optimum(Extremal):
             missing; more `candidates` find more of them.
         doubts: solutions without a certificate that cost less than this optimum. The status COLLISION marks those that
             cut into an obstacle by at most 0.4 robot radii: a path in contact with that obstacle may then cost less
-            than this optimum. Any other status is the reason for the missing certificate. Extremals that cut deeper
-            are omitted: with a realistic proximity cost, no similar path is both collision-free and inexpensive.
+            than this optimum. Any other status is the reason for the missing certificate. Of the paths in collision,
+            the cheapest ones at up to four places are computed. Extremals that cut deeper are omitted: with a realistic
+            proximity cost, no similar path is both collision-free and inexpensive.
 
     """
 
@@ -128,7 +132,17 @@ class Grids(NamedTuple):
     connected: Callable[[], bool]
 
 
-def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = True) -> Optimum:
+class Effort(NamedTuple):
+    """The effort of a search, see `find_optimum`."""
+
+    candidates: int
+    thorough: bool
+    alternatives: bool
+
+
+def find_optimum(
+    scenario: Scenario, candidates: int = 12, *, thorough: bool = True, alternatives: bool = True
+) -> Optimum:
     """Find the minimum-cost certified extremal of a scenario.
 
     A lattice search over position and heading, in the metric of the problem, proposes distinct candidates: different
@@ -142,6 +156,8 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
             candidate may have been missed. The effort for alternatives grows with this number.
         thorough: False examines the first round only. It usually contains the optimum, and a scenario without a path
             is recognised 50 times faster; but the only path may be missed, and the status of a failure is a guess.
+        alternatives: False omits candidates and local optima that cost more than the best one, which takes half the
+            time; `alternatives` then contains only what was found on the way.
 
     Returns:
         An `Optimum`; if nothing is certified, its status is the reason.
@@ -162,16 +178,17 @@ def find_optimum(scenario: Scenario, candidates: int = 12, *, thorough: bool = T
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
-    search = LocalOptima(scenario, problem, ALTERNATIVES_BUDGET * candidates)
+    search = LocalOptima(scenario, problem, ALTERNATIVES_BUDGET * candidates if alternatives else 0.0)
     grids = Grids(
         cache(partial(Lattice, scenario)),
         cache(partial(plane_lattice, scenario)),
         cache(partial(is_connected, scenario)),
     )
-    failed = _search(search, grids, candidates, thorough)
+    effort = Effort(candidates, thorough, alternatives)
+    failed = _search(search, grids, effort)
     if not search.certified and search.closed_places:  # a closed place may block the only path
         search.reopen_places()
-        failed = _search(search, grids, candidates, thorough)
+        failed = _search(search, grids, effort)
     return _result(search) if failed is None else as_optimum(failure(problem, failed))
 
 
@@ -201,7 +218,7 @@ def find_reached_optimum(
     followed = None if guess is None else solve(reached, "multiple_shooting", guess=guess)
     if followed is not None and followed.success and followed.cost <= cost:
         return followed
-    found = find_optimum(reached)
+    found = find_optimum(reached, alternatives=False)
     if followed is not None and followed.success and not (found.success and found.cost <= followed.cost):
         return followed
     return found
@@ -225,7 +242,8 @@ def shortest_horizon(scenario: Scenario) -> float | None:
         raise ValueError("horizon: expected a number, got None: a free horizon is never too short")
 
     def suffices(horizon: float) -> bool:
-        return find_optimum(scenario.model_copy(update={"horizon": horizon}), N_BISECTED, thorough=False).success
+        changed = scenario.model_copy(update={"horizon": horizon})
+        return find_optimum(changed, N_BISECTED, thorough=False, alternatives=False).success
 
     low, high = 0.0, scenario.horizon
     while not suffices(high):
@@ -238,34 +256,37 @@ def shortest_horizon(scenario: Scenario) -> float | None:
     return min(math.ceil(10 * high) / 10, MAX_MAGNITUDE)
 
 
-def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) -> Status | None:
+def _search(search: LocalOptima, grids: Grids, effort: Effort) -> Status | None:
     """Search the lattices until a better path is unlikely; return the reason of a failure, or None."""
-    scenario = search.scenario
+    scenario, thorough = search.scenario, effort.thorough
     if math.dist(scenario.start[:2], scenario.goal[:2]) > LONG_DISTANCE:
         return _search_plane(search, grids, thorough)
     shortest_time, cropped = np.inf, False
-    for refinement, margin in LATTICES[: None if thorough else 1]:
+    for index, (refinement, margin) in enumerate(LATTICES[: None if thorough else 1]):
         lattice = grids.lattice(refinement, margin).without(search.closed_places)
         search.reset_failure_budget()
         found: CandidateSearch | None = None
         paths: Iterator[Candidate] = iter(())
         taken: list[Candidate] = []
         closed = search.closed_places.copy()
-        for _ in range(MAX_ROUNDS):
+        for number in range(MAX_FIRST_ROUNDS if index == 0 else MAX_ROUNDS):
+            if number >= MAX_ROUNDS and search.certified:
+                break
             if found is None:
                 found = CandidateSearch(lattice)
                 paths, taken = found.candidates(), []
-            batch = list(islice(paths, candidates))
+            batch = list(islice(paths, effort.candidates))
             if not batch:
                 break
             taken += batch
             shortest_time = min(shortest_time, *(_shortest_time(c, scenario) for c in batch))
-            search.add(Trajectory(c.times, c.poses) for c in batch)
+            _add(search, found, batch, effort)
             if not thorough:
                 break
             # A lattice with a margin lacks passages that may be better.
             if search.certified and margin is None and found.suffices(search.best.cost, taken[0].cost, batch[-1].cost):
-                search.add(Trajectory(c.times, c.poses) for c in islice(found.distinct_from(taken), N_ELSEWHERE))
+                if not _omits(lattice, effort):
+                    search.add(Trajectory(c.times, c.poses) for c in islice(found.distinct_from(taken), N_ELSEWHERE))
                 return None
             if search.closed_places != closed:  # other candidates would use the same passage
                 closed = search.closed_places.copy()
@@ -279,6 +300,21 @@ def _search(search: LocalOptima, grids: Grids, candidates: int, thorough: bool) 
     if cropped and not search.certified:  # the path may leave the surroundings of start and goal
         return _search_plane(search, grids, thorough)
     return _reason(search, shortest_time)
+
+
+def _add(search: LocalOptima, found: CandidateSearch, batch: Sequence[Candidate], effort: Effort) -> None:
+    """Add candidates; without alternatives, only those that may lead to the best extremal."""
+    first = N_FIRST if _omits(found.lattice, effort) else len(batch)
+    transcribed = search.transcribe(Trajectory(c.times, c.poses) for c in batch[:first])
+    lowest = search.lowest_cost(transcribed)
+    rest = [c for c in batch[first:] if not found.is_too_long(c.cost, lowest)]
+    transcribed += search.transcribe(Trajectory(c.times, c.poses) for c in rest)
+    search.solve(transcribed)
+
+
+def _omits(lattice: Lattice, effort: Effort) -> bool:
+    """Return whether candidates are omitted; lattice paths of robots that cannot rotate on the spot are inaccurate."""
+    return not effort.alternatives and lattice.moves.rotating
 
 
 def _search_plane(search: LocalOptima, grids: Grids, thorough: bool) -> Status | None:

@@ -5,7 +5,8 @@ import pytest
 from helpers import best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
-from leapnav.envs import FAMILIES, Scenario, Unicycle, sample_scenario
+from leapnav.envs import FAMILIES, Obstacle, Polygon, Scenario, ScenarioBank, Unicycle, sample_scenario
+from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import Status, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice, Place, is_connected
@@ -305,3 +306,44 @@ def test_a_detour_beyond_the_cropped_lattice_is_found():
     optimum = find_optimum(Scenario.from_dict(fields))
     assert optimum.success
     assert optimum.states[:, 1].max() > 32.0
+
+
+@pytest.mark.parametrize(
+    ("family", "robot"), [("clutter", "unicycle"), ("rooms", "unicycle"), ("slalom", "unicycle"), ("clutter", "car")]
+)
+def test_the_search_without_alternatives_finds_the_same_optimum(family, robot):
+    bank = ScenarioBank.shipped(family, "test", robot)
+    omitted = 0
+    for index in range(0, len(bank), 25):
+        best = find_optimum(bank[index], alternatives=False)
+        whole = find_optimum(bank[index])
+        assert best.cost == pytest.approx(whole.cost, rel=1e-9)
+        omitted += len(whole.alternatives) - len(best.alternatives)
+    assert omitted > 0
+
+
+def test_paths_in_collision_are_doubts_at_different_places():
+    """A gate that is slightly too narrow on the straight line, beside one that is wide enough."""
+    gates = [(0.0, 2.34), (2.76, 6.0), (8.0, 10.0)]
+    scenario = Scenario(
+        arena=(0, 0, 10, 10),
+        start=(2, 2.55, 0),
+        goal=(8, 2.55, 0),
+        horizon=14.0,
+        robot={"model": "unicycle", "radius": 0.25},
+        obstacles=[
+            Obstacle(polygon=Polygon(vertices=[(4.9, low), (5.1, low), (5.1, high), (4.9, high)]))
+            for low, high in gates
+        ],
+    )
+    optimum = find_optimum(scenario)
+    assert optimum.success and optimum.certificate.clearance > 0
+    places = []
+    for doubt in optimum.doubts:
+        assert doubt.cost < optimum.cost
+        if doubt.status is Status.COLLISION:
+            at = np.argmin(clearances(doubt.states, scenario.field))
+            places.append(doubt.states[at, :2])
+    assert places
+    for i, place in enumerate(places):
+        assert all(np.hypot(*(place - other)) > 0.1 for other in places[:i])

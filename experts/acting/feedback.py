@@ -230,7 +230,7 @@ class Feedback:
         scenario = self._remaining_scenario(state, time)
         if scenario is None:
             return False
-        optimum = find_optimum(scenario, thorough=not self._quick)
+        optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
         path = Trajectory(optimum.times, optimum.states, optimum.costates)
         if optimum.success and self._adopt(optimum.problem, path, time):
             return True

@@ -253,7 +253,7 @@ class ExpertPolicy:
             reference = situation.bank.reference(situation.index)
             path = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
         if path is None:
-            optimum = find_optimum(scenario, thorough=not self._quick)
+            optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
             if not optimum.success:
                 message = f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}"
                 raise NoOptimumError(message, scenario)

@@ -320,7 +320,7 @@ def _demonstrations(
 ) -> list[Demonstration]:
     """The demonstrations of one scenario, its optimum first; empty without a certified optimum."""
     scenario = sample_scenario(family, seed, robot, horizon)
-    optimum = find_optimum(scenario)
+    optimum = find_optimum(scenario, alternatives=False)
     if not optimum.success:
         return []
     episodes: list[tuple[Scenario, Extremal]] = [(scenario, optimum)]

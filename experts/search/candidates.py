@@ -153,11 +153,18 @@ class CandidateSearch:
             last: cost of the last candidate.
 
         """
+        return first >= self._length(cost) / LATTICE_ERROR or self.is_too_long(last, cost)
+
+    def is_too_long(self, candidate: float, cost: float) -> bool:
+        """Return whether a candidate is too long to lead to an extremal of less than a given cost; see `suffices`."""
+        return candidate >= self._length(cost) * LATTICE_ERROR
+
+    def _length(self, cost: float) -> float:
+        """Return the length in the metric of an extremal of a given J, at most."""
         scenario = self.lattice.scenario
         # J contains the cost of time: c T, with c = E if the horizon is free.
         rest = 0.0 if scenario.horizon is None else (self.energy - scenario.cost.time_weight) * scenario.horizon
-        length = cost + rest
-        return first >= length / LATTICE_ERROR or last >= length * LATTICE_ERROR
+        return cost + rest
 
     def _distinct(self, taken: Iterable[Candidate], cells: int, headings: int) -> Iterator[Candidate]:
         """Yield paths through nodes that are farther than the given distance from all paths before."""

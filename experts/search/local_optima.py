@@ -7,7 +7,7 @@ earlier one, it is refined and solved by multiple shooting.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -53,6 +53,10 @@ MAX_SLIGHT_DEPTH = TOLERATED_DEPTH
 # A path repeats a failure if it reaches this fraction of the failed path's depth, within this distance (robot radii).
 SIMILAR_DEPTH, SAME_PLACE = 0.5, 0.5
 MIN_CLOSED_DEPTH = 0.1  # fraction of a slight depth; a place is closed only if the path is deeper there
+# Depth (robot radii) of a refined path in an obstacle from which its extremal is in collision, too. The clearances of
+# 270 such pairs among dense obstacles increased by 0.023 at most.
+COLLIDING_DEPTH = 0.05
+MAX_COLLIDING = 4  # places at which the extremal of the cheapest of these paths is computed
 MAX_FAILED_EVALUATIONS = 1_000_000  # evaluations of the flow in failed Newton iterations per lattice
 MAX_VIOLATION = 1e-3  # sum of the constraint violations of a direct path
 COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 65)  # of the horizon, at which paths are compared
@@ -83,7 +87,7 @@ class LocalOptima:
 
     def __init__(self, scenario: Scenario, problem: OptimalControlProblem, budget: float = math.inf) -> None:
         self.scenario, self.problem, self._budget = scenario, problem, budget
-        radius = float(scenario.discs[:, 1].min())
+        self._radius = radius = float(scenario.discs[:, 1].min())
         self._slight_depth = MAX_SLIGHT_DEPTH * radius
         self._lift = Lifting(scenario, problem)
         self._limits = np.array(scenario.robot.limits())
@@ -96,6 +100,7 @@ class LocalOptima:
         # Paths from which Newton's method did not converge, and paths deep in an obstacle.
         self._stalled: list[_Failure] = []
         self._deep: list[_Failure] = []
+        self._colliding: list[_Failure] = []  # refined paths in collision, whose extremals are computed at the end
         self._failed_evaluations = 0
         self._closing = True
         self._place_radius = SAME_PLACE * radius
@@ -116,14 +121,30 @@ class LocalOptima:
 
     def add(self, paths: Iterable[Trajectory]) -> None:
         """Compute the local optima of candidate paths, in order of the cost of their direct paths."""
-        solved = []
+        self.solve(self.transcribe(paths))
+
+    def transcribe(self, paths: Iterable[Trajectory]) -> list[tuple[OptimalControlProblem, DirectPath]]:
+        """Return the direct paths of candidate paths, with their problems."""
+        found = []
         for path in paths:
             lifted = self._lift(path)
             if lifted is not None:
                 problem = self.problem.with_winding_of(lifted.states)
-                solved.append((problem, self._optimise(problem, discretise(problem, lifted))))
-        for problem, direct in sorted(solved, key=lambda entry: entry[1].cost):
+                found.append((problem, self._optimise(problem, discretise(problem, lifted))))
+        return found
+
+    def solve(self, transcribed: Sequence[tuple[OptimalControlProblem, DirectPath]]) -> None:
+        """Compute the extremals of direct paths, in order of their costs."""
+        for problem, direct in sorted(transcribed, key=lambda entry: entry[1].cost):
             self.add_direct(problem, direct)
+
+    def lowest_cost(self, transcribed: Sequence[tuple[OptimalControlProblem, DirectPath]]) -> float:
+        """Return the lowest cost of the certified extremals and of direct paths that are likely to lead to one."""
+        costs = [extremal.cost for extremal in self.certified]
+        for _, path in transcribed:
+            if path.converged and path.violation < MAX_VIOLATION and self._clearances(path).min() > 0.0:
+                costs.append(path.cost)
+        return min(costs, default=math.inf)
 
     def _optimise(self, problem: OptimalControlProblem, guess: DirectPath) -> DirectPath:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
@@ -206,6 +227,10 @@ class LocalOptima:
         clearance = self._clearances(refined)
         # At tight limits a direct path may violate its constraints, but Newton's method sometimes converges from it.
         is_feasible = refined.violation < MAX_VIOLATION
+        if refined.converged and is_feasible and clearance.min() < -COLLIDING_DEPTH * self._radius:
+            self._colliding.append(_Failure(refined.cost, problem, refined))
+            self._close_place(refined, clearance)
+            return
         is_expensive = self._is_expensive(refined, REFINED_ERROR)
         extremal, evaluations = None, 0
         if self._failed_evaluations < MAX_FAILED_EVALUATIONS and (is_feasible or not self.certified):
@@ -310,6 +335,8 @@ class LocalOptima:
     @property
     def best_failure(self) -> Extremal:
         """The most informative failure, if nothing is certified: an extremal of minimum cost, or a stalled path."""
+        if self._colliding:
+            self._solve_colliding(min(failure.cost for failure in self._colliding))
         if self.refused:
             return min(self.refused, key=lambda extremal: extremal.cost)
         _, problem, direct = min(self._deep or self._stalled, key=lambda failure: failure.cost)
@@ -318,10 +345,31 @@ class LocalOptima:
 
     def doubts(self, cost: float) -> tuple[Extremal, ...]:
         """Return the solutions that cost less than `cost` and are not certified; see `Optimum`."""
+        self._solve_colliding(cost, self._slight_depth + COLLIDING_DEPTH * self._radius)
         refused = [extremal for extremal in self.refused if extremal.cost < cost and self._is_slight(extremal)]
         cheaper = [failure for failure in self._stalled if failure.cost < cost * (1 - DIRECT_ERROR)]
         stalled = [_stalled(failure.problem, failure.path) for failure in cheaper]
         return (*refused, *filter(self._is_slight, stalled))
+
+    def _solve_colliding(self, cost: float, max_depth: float = math.inf) -> None:
+        """Compute the cheapest extremals in collision, at different places, up to a cost and a depth (m)."""
+        solved: list[np.ndarray] = []
+        for _, problem, path in sorted(self._colliding, key=lambda failure: failure.cost):
+            if len(solved) == MAX_COLLIDING:
+                break
+            clearance = self._clearances(path)
+            place = path.states[int(clearance.argmin()), :2]
+            if path.cost > (1 + REFINED_ERROR) * cost or clearance.min() < -max_depth:
+                continue
+            if any(math.dist(place, other) <= self._place_radius for other in solved):
+                continue
+            solved.append(place)
+            extremal, _ = self._extremal(problem, path, is_clear=False)
+            if extremal is None:
+                self._stalled.append(_Failure(path.cost, problem, path))
+            elif not any(_is_same(extremal, other) for other in (*self.certified, *self.refused)):
+                (self.certified if extremal.success else self.refused).append(extremal)
+        self._colliding = []
 
     def _is_slight(self, extremal: Extremal) -> bool:
         """Return whether a collision-free path of similar cost is possible close to an extremal."""

@@ -76,7 +76,7 @@ class Labeller:
         scenario = rest_of(episode, step, self._settings.control_period)
         if scenario is None:
             return None
-        optimum = find_optimum(scenario, thorough=not self._quick)
+        optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
         return Takeover(step, scenario, optimum) if optimum.success else None
 
     def _by_schedule(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Takeover]:

@@ -195,7 +195,7 @@ def _optimal_cost(scenario: Scenario, state: np.ndarray, time: float) -> float:
     except ScenarioError:  # in collision, or without time left
         return math.nan
     for thorough in (False, True):
-        optimum = find_optimum(rest, thorough=thorough)
+        optimum = find_optimum(rest, thorough=thorough, alternatives=False)
         if optimum.success:
             return float(optimum.cost)
     return math.nan
