@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from leapnav.experts.data.banks import build_bank, build_bank_of
     from leapnav.experts.data.cards import data_card
     from leapnav.experts.data.demonstrations import load_demonstrations
+    from leapnav.experts.data.optima import find_optima
     from leapnav.experts.data.rollouts import check_dataset, rollout
     from leapnav.experts.plotting import plot_extremal
 
@@ -52,6 +53,7 @@ __all__ = [
     "continuation",
     "data_card",
     "differential_drive",
+    "find_optima",
     "find_optimum",
     "find_reached_optimum",
     "load_demonstrations",
@@ -74,6 +76,7 @@ _LAZY = {
     "build_bank_of": "leapnav.experts.data.banks",
     "data_card": "leapnav.experts.data.cards",
     "check_dataset": "leapnav.experts.data.rollouts",
+    "find_optima": "leapnav.experts.data.optima",
     "load_demonstrations": "leapnav.experts.data.demonstrations",
     "plot_extremal": "leapnav.experts.plotting",
     "plot_tube": "leapnav.experts.bounds.plotting",

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from leapnav.envs import FAMILIES, Obstacle, Polygon, Scenario, ScenarioBank, Unicycle, sample_scenario
 from leapnav.envs.shapes.clearance import clearances
-from leapnav.experts import Status, find_optimum
+from leapnav.experts import Status, find_optima, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice, Place, is_connected
 
@@ -347,3 +347,16 @@ def test_paths_in_collision_are_doubts_at_different_places():
     assert places
     for i, place in enumerate(places):
         assert all(np.hypot(*(place - other)) > 0.1 for other in places[:i])
+
+
+def test_the_optima_of_many_scenarios_do_not_depend_on_the_number_of_processes():
+    scenarios = [sample_scenario("clutter", seed) for seed in range(4)]
+    scenarios.append(scenarios[0].model_copy(update={"horizon": 0.1}))
+    one, two = (find_optima(scenarios, workers=workers, progress=False) for workers in (1, 2))
+    assert [optimum.to_dict() for optimum in one] == [optimum.to_dict() for optimum in two]
+    assert [optimum.cost for optimum in one[:4]] == [find_optimum(scenario).cost for scenario in scenarios[:4]]
+    assert one[-1].status is Status.HORIZON_TOO_SHORT
+    with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
+        find_optima(scenarios, workers=0)
+    with pytest.raises(TypeError, match="scenario: expected a Scenario"):
+        find_optima([None], progress=False)

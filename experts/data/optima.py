@@ -1,0 +1,63 @@
+"""Optima of many scenarios on several processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import cast
+
+from joblib import delayed
+
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.progress import progress_bar
+from leapnav.envs.utils.validation import check_at_least
+from leapnav.experts.optimum import Optimum, find_optimum
+from leapnav.experts.pools import process_pool
+
+
+def find_optima(
+    scenarios: Iterable[Scenario],
+    candidates: int = 12,
+    *,
+    thorough: bool = True,
+    alternatives: bool = True,
+    workers: int = 1,
+    dask: str | None = None,
+    progress: bool = True,
+) -> list[Optimum]:
+    """Find the optimum of each scenario, see `find_optimum`.
+
+    The result does not depend on the number of processes. `build_bank_of` writes the optima to a file, and continues
+    after an interruption.
+
+    Args:
+        scenarios: the scenarios.
+        candidates: see `find_optimum`.
+        thorough: see `find_optimum`.
+        alternatives: see `find_optimum`.
+        workers: number of processes.
+        dask: address of a Dask scheduler (`tcp://host:8786`) whose workers are used instead.
+        progress: whether to show a progress bar.
+
+    Returns:
+        The optima in the order of the scenarios; those without `success` have the reason as their status.
+
+    Raises:
+        TypeError: one of the scenarios is not a Scenario.
+        ValueError: candidates < 1 or workers < 1.
+        ModuleNotFoundError: `dask` is given, and the extra `cluster` is not installed.
+        OSError: the scheduler cannot be reached.
+
+    """
+    check_at_least("workers", workers, 1)
+    given = list(scenarios)
+    task = delayed(find_optimum)
+    found: list[Optimum] = []
+    with (
+        progress_bar(total=len(given), label="Finding optima", unit="scenarios", show=progress) as bar,
+        process_pool(workers, dask, return_as="generator") as pool,
+    ):
+        calls = (task(scenario, candidates, thorough=thorough, alternatives=alternatives) for scenario in given)
+        for optimum in cast(Iterator[Optimum], pool(calls)):
+            found.append(optimum)
+            bar.update()
+    return found
