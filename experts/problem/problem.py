@@ -158,6 +158,11 @@ class OptimalControlProblem:
 
     def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:
         """Return the problem with each goal angle shifted by a multiple of 2 pi to where the path (N, n) ends."""
+        goal = self.wound_goal(states)
+        return self if goal == self.goal else replace(self, goal=goal)
+
+    def wound_goal(self, states: np.ndarray) -> tuple[float | None, ...]:
+        """Return the goal of `with_winding_of`."""
         goal = list(self.goal)
         for symbol in self.system.angles:
             i = self.system.state.index(symbol)
@@ -165,12 +170,12 @@ class OptimalControlProblem:
             if value is not None:
                 # Rounded, because the path need not end exactly at the goal.
                 goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
-        return replace(self, goal=tuple(goal))
+        return tuple(goal)
 
     @property
     def starts_at_goal(self) -> bool:
         """Whether the start is the goal, up to multiples of 2 pi of the angles."""
-        goal = self.with_winding_of(np.array([self.start], dtype=float)).goal
+        goal = self.wound_goal(np.array([self.start], dtype=float))
         return all(g is None or math.isclose(s, g, abs_tol=1e-12) for s, g in zip(self.start, goal, strict=True))
 
     def with_horizon(self, horizon: float) -> OptimalControlProblem:

@@ -94,6 +94,7 @@ class LocalOptima:
         self._duplicate_distance = DUPLICATE_DISTANCE * min(
             1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE
         )
+        self._wound: dict[tuple[float | None, ...], OptimalControlProblem] = {}  # by the goal
         self.certified: list[Extremal] = []
         self.refused: list[Extremal] = []
         self._seen: list[np.ndarray] = []
@@ -129,7 +130,10 @@ class LocalOptima:
         for path in paths:
             lifted = self._lift(path)
             if lifted is not None:
-                problem = self.problem.with_winding_of(lifted.states)
+                goal = self.problem.wound_goal(lifted.states)
+                if goal not in self._wound:
+                    self._wound[goal] = self.problem.with_winding_of(lifted.states)
+                problem = self._wound[goal]
                 found.append((problem, self._optimise(problem, discretise(problem, lifted))))
         return found
 
