@@ -227,7 +227,14 @@ def warm(out, demos, **changes):
 
 
 @pytest.mark.parametrize(
-    "name", ["bc", "ppo", "ppo, levels", pytest.param("sac", marks=pytest.mark.slow), "sac, learning"]
+    "name",
+    [
+        "bc",
+        "ppo",
+        pytest.param("ppo, levels", marks=pytest.mark.slow),
+        pytest.param("sac", marks=pytest.mark.slow),
+        "sac, learning",
+    ],
 )
 def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
     """SIGKILL after the first checkpoint; PPO with all parts of a warm start, SAC with demonstrations."""
