@@ -313,7 +313,10 @@ def _add(search: LocalOptima, found: CandidateSearch, batch: Sequence[Candidate]
 
 
 def _omits(lattice: Lattice, effort: Effort) -> bool:
-    """Return whether candidates are omitted; lattice paths of robots that cannot rotate on the spot are inaccurate."""
+    """Return whether the search may omit candidates by their length.
+
+    It may not if the robot cannot rotate on the spot: the lengths of its lattice paths are too inaccurate.
+    """
     return not effort.alternatives and lattice.moves.rotating
 
 
@@ -358,6 +361,7 @@ def _reason(search: LocalOptima, shortest_time: float) -> Status | None:
 
 def _result(search: LocalOptima) -> Optimum:
     """The best extremal with its alternatives, or the most informative failure."""
+    search.solve_colliding()
     if not search.certified:
         return as_optimum(search.best_failure)
     best, *others = sorted(search.certified, key=lambda extremal: extremal.cost)

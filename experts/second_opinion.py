@@ -89,6 +89,7 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
         nonlocal best, source, tried
         tried += count
         search.reset_failure_budget()
+        search.solve_colliding()
         if search.certified and search.best.cost < best:
             best, source = search.best.cost, source_name
 

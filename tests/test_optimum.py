@@ -1,3 +1,4 @@
+import math
 from itertools import islice
 
 import numpy as np
@@ -360,3 +361,12 @@ def test_the_optima_of_many_scenarios_do_not_depend_on_the_number_of_processes()
         find_optima(scenarios, workers=0)
     with pytest.raises(TypeError, match="scenario: expected a Scenario"):
         find_optima([None], progress=False)
+
+
+def test_a_path_that_was_wrongly_taken_for_a_collision_is_not_lost(monkeypatch):
+    """Every refined path counts as one in collision, although all of them are collision-free."""
+    scenario = sample_scenario("clutter", 3)
+    expected = find_optimum(scenario)
+    monkeypatch.setattr("leapnav.experts.search.local_optima.COLLIDING_DEPTH", -math.inf)
+    found = find_optimum(scenario)
+    assert found.success and found.cost == pytest.approx(expected.cost, rel=1e-9)

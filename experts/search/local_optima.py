@@ -339,8 +339,6 @@ class LocalOptima:
     @property
     def best_failure(self) -> Extremal:
         """The most informative failure, if nothing is certified: an extremal of minimum cost, or a stalled path."""
-        if self._colliding:
-            self._solve_colliding(min(failure.cost for failure in self._colliding))
         if self.refused:
             return min(self.refused, key=lambda extremal: extremal.cost)
         _, problem, direct = min(self._deep or self._stalled, key=lambda failure: failure.cost)
@@ -349,14 +347,20 @@ class LocalOptima:
 
     def doubts(self, cost: float) -> tuple[Extremal, ...]:
         """Return the solutions that cost less than `cost` and are not certified; see `Optimum`."""
-        self._solve_colliding(cost, self._slight_depth + COLLIDING_DEPTH * self._radius)
         refused = [extremal for extremal in self.refused if extremal.cost < cost and self._is_slight(extremal)]
         cheaper = [failure for failure in self._stalled if failure.cost < cost * (1 - DIRECT_ERROR)]
         stalled = [_stalled(failure.problem, failure.path) for failure in cheaper]
         return (*refused, *filter(self._is_slight, stalled))
 
-    def _solve_colliding(self, cost: float, max_depth: float = math.inf) -> None:
-        """Compute the cheapest extremals in collision, at different places, up to a cost and a depth (m)."""
+    def solve_colliding(self) -> None:
+        """Compute the extremals of paths in collision that cost less than the best extremal, at different places.
+
+        Without a certified extremal, the one of minimum cost is computed.
+        """
+        if self.certified:
+            cost, max_depth = self.best.cost, self._slight_depth + COLLIDING_DEPTH * self._radius
+        else:
+            cost, max_depth = min((failure.cost for failure in self._colliding), default=math.inf), math.inf
         solved: list[np.ndarray] = []
         for _, problem, path in sorted(self._colliding, key=lambda failure: failure.cost):
             if len(solved) == MAX_COLLIDING:
