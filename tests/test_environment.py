@@ -255,6 +255,17 @@ def test_lidar_ranges_agree_with_dense_sampling_of_the_beams():
             assert ranges[k] == pytest.approx(walked, abs=3e-3)
 
 
+@pytest.mark.parametrize("family", ["clutter", "polygons", "corridors"])
+def test_a_beam_does_not_depend_on_the_number_of_others(family):
+    """Obstacles are tested only against the beams that may meet them."""
+    for seed in range(8):
+        task = sample_scenario(family, seed)
+        everywhere = NavigateEnv(scenario=task, lidar_beams=360).reset()[0][GOAL_ENTRIES:]
+        for count in (1, 2, 3, 4, 5, 8, 40):
+            ranges = NavigateEnv(scenario=task, lidar_beams=count).reset()[0][GOAL_ENTRIES:]
+            assert ranges == pytest.approx(everywhere[:: 360 // count], abs=1e-6)
+
+
 @pytest.mark.parametrize("heading", [0.0, -0.0, math.pi / 2, math.pi, -math.pi / 2, 1e-12])
 def test_beams_along_the_axes_see_what_is_there(heading):
     disc = {"circle": {"center": [4.0, 1.0], "radius": 0.8}}

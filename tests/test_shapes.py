@@ -188,10 +188,10 @@ def test_cost_and_clearance_on_a_grid_of_points_are_those_of_single_points(shape
 def lidar(scenario, x, y, heading, count=64, reach=5.0):
     """Angles in the plane and ranges of the beams."""
     turn = 2 * math.pi * np.arange(count) / count
-    scratch = np.zeros((5, count))
+    scratch = np.zeros((3, 2 * count))
     beams = np.ascontiguousarray(np.stack([np.cos(turn), np.sin(turn)]))
     scan(x, y, math.cos(heading), math.sin(heading), scenario.field, reach, beams, scratch)
-    return heading + turn, scratch[2].copy()
+    return heading + turn, scratch[2, :count].copy()
 
 
 @each_shape

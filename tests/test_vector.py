@@ -1,5 +1,6 @@
 import pickle
 import warnings
+from copy import deepcopy
 
 import gymnasium as gym
 import numpy as np
@@ -129,6 +130,17 @@ def test_an_arena_s_history_does_not_leak_into_its_next_episode():
     for actions in bold_actions(300, 3, seed=4):
         for one, other in zip(used.step(actions)[:3], fresh.step(actions)[:3], strict=True):
             assert same(one, other)
+
+
+def test_robots_with_the_same_scenario_share_its_field():
+    env = make(5, family="clutter")
+    env.reset(seed=1, options={"index": [3, 4, 3, 3, 4]})
+    for copy in (env, pickle.loads(pickle.dumps(env)), deepcopy(env)):
+        fields = copy.unwrapped._simulator.fields
+        assert fields[0] is fields[2] is fields[3]
+        assert fields[1] is fields[4] is not fields[0]
+        assert (fields[1] == env.unwrapped.bank.field(4)).all()
+        assert len(set(fields.places[:, 0].tolist())) == 2
 
 
 @pytest.mark.parametrize("actuation", ["velocity", "motor"])

@@ -25,7 +25,16 @@ from numba.extending import NativeValue, intrinsic, unbox
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import carray
 
-__all__ = ["FunctionPointer", "FunctionTable", "Kernel", "carray", "part_of", "power_of_two", "scratch_buffer"]
+__all__ = [
+    "FunctionPointer",
+    "FunctionTable",
+    "Kernel",
+    "carray",
+    "part_of",
+    "power_of_two",
+    "scratch_buffer",
+    "vector_at",
+]
 
 _CONFIG: Any = import_module("numba.core.config")  # the module behind `numba.config`
 
@@ -263,26 +272,38 @@ def _generate_call(context: Any, builder: Any, table: tuple[str, int], signature
     return builder.load(result)
 
 
+def _vector(context: Any, builder: Any, array: Any, data: Any, length: Any) -> Any:
+    """Return a vector of floats that does not own its memory."""
+    vector = context.make_array(array)(context, builder)
+    step = ir.Constant(ir.IntType(64), 8)
+    populate_array(vector, data=data, shape=[length], strides=[step], itemsize=step, meminfo=None)
+    return vector._getvalue()
+
+
 def _typed_part_of(context: Any, array: Any, start: Any, count: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         whole = context.make_array(array)(context, builder, arguments[0])
-        part = context.make_array(array)(context, builder)
-        step = ir.Constant(ir.IntType(64), 8)
-        populate_array(
-            part,
-            data=builder.gep(whole.data, [arguments[1]]),
-            shape=[arguments[2]],
-            strides=[step],
-            itemsize=step,
-            meminfo=None,
-        )
-        return part._getvalue()
+        return _vector(context, builder, array, builder.gep(whole.data, [arguments[1]]), arguments[2])
 
     return array(array, int64, int64), generate
 
 
 part_of: Any = intrinsic(_typed_part_of)
 """In kernels: the part of a vector of floats from an index, of a given length, without counting a reference."""
+
+
+def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
+    array = types.Array(float64, 1, "C", readonly=True)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
+        return _vector(context, builder, array, data, arguments[1])
+
+    return array(int64, int64), generate
+
+
+vector_at: Any = intrinsic(_typed_vector_at)
+"""In kernels: the vector of floats at an address, of a given length, which the caller keeps alive."""
 
 
 def _typed_power_of_two(context: Any, shifted: Any) -> Any:

@@ -52,7 +52,7 @@ from leapnav.envs.shapes.field import check_field, with_grid
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 FORMAT, VERSION, VERSION_WITHOUT_GRIDS = "leapnav-bank", 4, 5
-MAX_COMPLETE_FIELDS = 1024  # with a computed grid, of each bank
+MAX_FIELDS = 1024  # of each bank in memory, because a grid may have to be computed
 # Bytes. A larger dataset is verified when it is first read, because that takes 1 s per GB; the others on opening.
 MAX_VERIFIED_ON_OPENING = 32_000_000
 SPLITS = ("train", "test")
@@ -204,7 +204,7 @@ class ScenarioBank(Sequence[Scenario]):
         unknown = np.full(len(self.costs), math.nan)
         self.lower_bounds = arrays.get(LOWER_BOUNDS, unknown)
         self._scenarios: dict[int, Scenario] = {}
-        self._complete_fields: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._fields: OrderedDict[int, np.ndarray] = OrderedDict()
         self._check_widths()
 
     @property
@@ -342,18 +342,16 @@ class ScenarioBank(Sequence[Scenario]):
 
         """
         i = self._check_index(index)
-        if i in self._complete_fields:
-            self._complete_fields.move_to_end(i)
-            return self._complete_fields[i]
+        if i in self._fields:
+            self._fields.move_to_end(i)
+            return self._fields[i]
         start, end = self._span("field_ends", i)
         stored = self._array("fields")[start:end]
         check_field(stored)
-        field = with_grid(stored)
-        if field is not stored:
-            self._complete_fields[i] = field
-            if len(self._complete_fields) > MAX_COMPLETE_FIELDS:
-                self._complete_fields.popitem(last=False)
-        return field
+        self._fields[i] = with_grid(stored)
+        if len(self._fields) > MAX_FIELDS:
+            self._fields.popitem(last=False)
+        return self._fields[i]
 
     def states(self, index: int) -> np.ndarray:
         """Return the states (N, n_q) of the optimum of a scenario, see `Reference`.

@@ -29,7 +29,7 @@ from leapnav.envs.settings import (
     EnvironmentSettings,
 )
 from leapnav.envs.simulation.sensing import WALL_ENTRIES, map_surroundings, scan
-from leapnav.envs.simulation.state import PACKED_STATE, SPIN, TIME, VX, VY, SimulationState
+from leapnav.envs.simulation.state import PACKED_STATE, SPIN, TIME, VX, VY, SimulationState, field_of
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 
 # Number of entries of the parts, which are documented in `NavigateEnv`. If the horizon is free, the goal part has no
@@ -106,7 +106,7 @@ class ObservationBuffers(NamedTuple):
     """Constants and working memory of `observe_robots`.
 
     Attributes:
-        beams (2, n), scratch (5, n): see `leapnav.envs.simulation.sensing.scan`.
+        beams (2, n), scratch (3, 2 n): see `leapnav.envs.simulation.sensing.scan`.
         detours (n,): output of `leapnav.envs.geodesics.geodesic_detours`.
         surroundings: output of `leapnav.envs.simulation.sensing.map_surroundings`; empty without a map.
         row (size,): an observation before it is rounded to float32.
@@ -161,7 +161,7 @@ class ObservationLayout:
         map_entries = WALL_ENTRIES + settings.map_obstacles * (2 + 2 * settings.map_vertices)
         self._buffers = ObservationBuffers(
             beams=np.stack([np.cos(angles), np.sin(angles)]),
-            scratch=np.zeros((5, settings.lidar_beams)),
+            scratch=np.zeros((3, 2 * settings.lidar_beams)),
             detours=np.zeros(settings.lidar_beams),
             surroundings=np.zeros(map_entries if settings.observation == "map" else 0),
             row=np.zeros(self.size),
@@ -205,7 +205,7 @@ class ObservationLayout:
         buffers = self._buffers
         cos, sin = math.cos(heading), math.sin(heading)
         scan(x, y, cos, sin, field, self._settings.lidar_range, buffers.beams, buffers.scratch)
-        return buffers.scratch[2].copy()
+        return buffers.scratch[2, : self._settings.lidar_beams].copy()
 
     def fill(self, robots: np.ndarray, sim: tuple[np.ndarray, ...], out: np.ndarray) -> None:
         """Write the flat observations of robots, given by index, to their rows of `out`."""
@@ -238,7 +238,7 @@ def observe_robots(robots, packed, packed_buffers, out):
         x, y, heading = bodies[i, 0], bodies[i, 1], bodies[i, 2]
         cos, sin = math.cos(heading), math.sin(heading)
         if has_lidar and count > 0:  # from the true pose, not from the sensed one
-            scan(x, y, cos, sin, sim.fields[i], settings[LIDAR_RANGE], beams, scratch)
+            scan(x, y, cos, sin, field_of(sim.fields, i), settings[LIDAR_RANGE], beams, scratch)
         # Achieved goals are observed without noise, because they determine the reward.
         if deviation != 0.0 and not goal_conditioned:
             drawn = sim.noise_rows[i]
@@ -292,13 +292,13 @@ def observe_robots(robots, packed, packed_buffers, out):
                     row[at + k] += deviation * noise[i, sim.noise_rows[i], sensing + 3 + k]
             at += count
         if has_geodesics:
-            geodesic_detours(x, y, heading, sim.maps[i], sim.fields[i, 2], beams, scratch[2], buffers.detours)
+            geodesic_detours(x, y, heading, sim.maps[i], field_of(sim.fields, i)[2], beams, scratch[2], buffers.detours)
             for k in range(count):
                 row[at + k] = buffers.detours[k]
             row[at + count] = geodesic_distance(x, y, sim.maps[i])
         elif has_map:
             obstacles, vertices = int(settings[OBSTACLES]), int(settings[VERTICES])
-            map_surroundings(x, y, cos, sin, sim.fields[i], obstacles, vertices, surroundings)
+            map_surroundings(x, y, cos, sin, field_of(sim.fields, i), obstacles, vertices, surroundings)
             for k in range(len(surroundings)):
                 row[at + k] = surroundings[k]
         for k in range(len(row)):

@@ -5,87 +5,146 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float64, int64
+from numba import float64, int64, types
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
-from leapnav.envs.shapes.field import ARENA, CIRCLES, LENGTH, N_VERTICES, RECORDS, ROUNDING, SHAPES, VERTICES
-from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
-from leapnav.envs.shapes.records import first_polygon, record_distance, trace_rays
+from leapnav.envs.shapes.field import (
+    ARENA,
+    CENTRE,
+    CIRCLES,
+    LENGTH,
+    N_VERTICES,
+    RECORDS,
+    RIM,
+    ROUNDING,
+    SHAPES,
+    VERTICES,
+)
+from leapnav.envs.shapes.polygon import polygon_distance
+from leapnav.envs.shapes.records import record_distance, trace_rays
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
 
 
-@kernel(
-    NOTHING(float64, float64, float64, float64, CONSTANT, float64, MATRIX, MATRIX),
-)
+@kernel(types.UniTuple(int64, 2)(float64, float64, float64, int64))
+def _beams_towards(ahead, left, radius, count):
+    """Return the first beam that may meet a circle, and the number after the last one.
+
+    Beam k of `count` has the angle 2 pi k / count. The numbers are less than 2 count; beam count + k is beam k.
+
+    Args:
+        ahead, left: centre of the circle (m) in the lidar's frame.
+        radius: of the circle (m).
+        count: number of beams.
+
+    """
+    distance = math.sqrt(ahead * ahead + left * left)
+    if distance <= radius:
+        return 0, count
+    ratio = radius / distance
+    half = ratio * (1.0 + ratio * ratio * (math.pi / 2 - 1.0))  # at least asin(ratio)
+    bearing, density = math.atan2(left, ahead), count / (2 * math.pi)
+    first, last = math.floor((bearing - half) * density), math.ceil((bearing + half) * density)
+    if last - first >= count:
+        return 0, count
+    return (count + first, count + last + 1) if first < 0 else (first, last + 1)
+
+
+@kernel(types.UniTuple(float64, 3)(CONSTANT, int64, int64))
+def _circle_around(field, rows, edges):
+    """Return centre and radius (m) of a circle that contains a polygon of the field."""
+    cx = cy = square = 0.0
+    for row in range(rows, rows + 5 * edges, 5):
+        cx += field[row + 3]
+        cy += field[row + 4]
+    cx, cy = cx / edges, cy / edges
+    for row in range(rows, rows + 5 * edges, 5):
+        dx, dy = field[row + 3] - cx, field[row + 4] - cy
+        square = max(square, dx * dx + dy * dy)
+    return cx, cy, math.sqrt(square)
+
+
+@kernel(float64(float64, float64, float64, float64, float64, CONSTANT, int64, int64))
+def _range_to_polygon(x, y, dx, dy, reach, field, rows, edges):
+    """Return the distance (m) from (x, y) in the direction (dx, dy) to a polygon, or `reach` if the ray misses it."""
+    # A point of a ray is inside the polygon if it is inside the half-planes of all edges.
+    enter, leave = -np.inf, np.inf
+    for row in range(rows, rows + 5 * edges, 5):
+        height = field[row] * x + field[row + 1] * y - field[row + 2]
+        rate = field[row] * dx + field[row + 1] * dy
+        if rate < 0.0:
+            enter = max(enter, -height / rate)
+        elif rate > 0.0:
+            leave = min(leave, -height / rate)
+        elif height > 0.0:  # a ray parallel to an edge is entirely inside or outside its half-plane
+            return reach
+    return enter if enter <= leave and leave > 0.0 else reach
+
+
+@kernel(NOTHING(float64, float64, float64, float64, CONSTANT, float64, MATRIX, MATRIX))
 def scan(x, y, cos, sin, field, reach, beams, scratch):
     """Compute lidar ranges (m).
 
-    Each obstacle is intersected with all beams in a loop without branches, which compilers vectorize.
+    Each obstacle is intersected only with the beams that may meet a circle around it.
 
     Args:
         x, y: position of the lidar (m).
         cos, sin: of its heading.
         field: the packed field of the scenario.
         reach: maximum range (m).
-        beams (2, n): cosines and sines of the angles of the beams in the lidar's frame.
-        scratch (5, n): working memory; row 2 contains the ranges afterwards.
+        beams (2, n): cosines and sines of the angles 2 pi k / n of the beams in the lidar's frame.
+        scratch (3, 2 n): working memory; the first n entries of row 2 are the ranges afterwards.
 
     """
     count = beams.shape[1]
-    dxs, dys, nearest, enter, leave = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    dxs, dys, nearest = scratch[0], scratch[1], scratch[2]
     to_right, to_top = field[ARENA + 2] - x, field[ARENA + 3] - y
     to_left, to_bottom = field[ARENA] - x, field[ARENA + 1] - y
     for k in range(count):
         dx = cos * beams[0, k] - sin * beams[1, k]
         dy = sin * beams[0, k] + cos * beams[1, k]
-        dxs[k], dys[k] = dx, dy
         across = (to_right if dx > 0.0 else to_left) / dx if dx != 0.0 else np.inf
         along = (to_top if dy > 0.0 else to_bottom) / dy if dy != 0.0 else np.inf
         first = across if across < along else along
-        nearest[k] = first if first < reach else reach
+        dxs[k] = dxs[count + k] = dx
+        dys[k] = dys[count + k] = dy
+        nearest[k] = nearest[count + k] = first if first < reach else reach
     at = SHAPES
     for _ in range(int(field[CIRCLES])):
         cx, cy, r = field[at] - x, field[at + 1] - y, field[at + 2]
         at += 3
         if cx * cx + cy * cy >= (r + reach) ** 2:
             continue
-        for k in range(count):
+        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
+        for k in range(first, last):
             along = cx * dxs[k] + cy * dys[k]
             beside = cx * dys[k] - cy * dxs[k]
             square = r * r - beside * beside
             half = math.sqrt(square if square > 0.0 else 0.0)
             hit = along - half if square > 0.0 and along + half > 0.0 else reach
             nearest[k] = hit if hit < nearest[k] else nearest[k]
-    others = first_polygon(field)[1] if field[RECORDS] > 0.0 and field[at] < 0.0 else 0
-    for _ in range(others):
-        trace_rays(x, y, dxs, dys, nearest, reach, field, at)
-        at += 2 + int(field[at + LENGTH])
-    for _ in range(int(field[RECORDS]) - others):
-        edges = int(field[at])
-        rows = at + 1
-        at = rows + 5 * edges
-        if half_plane_distance(x, y, field, rows, edges) >= reach:
+    for _ in range(int(field[RECORDS])):
+        if field[at] < 0.0:
+            cx, cy, r = field[at + CENTRE] - x, field[at + CENTRE + 1] - y, field[at + RIM]
+            if cx * cx + cy * cy < (r + reach) ** 2:
+                first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
+                trace_rays(x, y, dxs[first:last], dys[first:last], nearest[first:last], reach, field, at)
+            at += 2 + int(field[at + LENGTH])
             continue
-        # A point of a ray is inside the polygon if it is inside the half-planes of all edges.
-        for k in range(count):
-            enter[k], leave[k] = -np.inf, np.inf
-        for j in range(edges):
-            row = rows + 5 * j
-            nx, ny = field[row], field[row + 1]
-            height = nx * x + ny * y - field[row + 2]
-            for k in range(count):
-                rate = nx * dxs[k] + ny * dys[k]
-                # A ray parallel to an edge is entirely inside or outside its half-plane.
-                crossing = -height / rate if rate != 0.0 else (-np.inf if height > 0.0 else np.inf)
-                enter[k] = crossing if rate < 0.0 and crossing > enter[k] else enter[k]
-                leave[k] = crossing if rate >= 0.0 and crossing < leave[k] else leave[k]
-        for k in range(count):
-            hit = enter[k] if enter[k] <= leave[k] and leave[k] > 0.0 else reach
-            nearest[k] = hit if hit < nearest[k] else nearest[k]
+        edges, rows = int(field[at]), at + 1
+        at = rows + 5 * edges
+        cx, cy, r = _circle_around(field, rows, edges)
+        cx -= x
+        cy -= y
+        if cx * cx + cy * cy >= (r + reach) ** 2:
+            continue
+        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
+        for k in range(first, last):
+            nearest[k] = min(nearest[k], _range_to_polygon(x, y, dxs[k], dys[k], reach, field, rows, edges))
     for k in range(count):
-        nearest[k] = nearest[k] if nearest[k] > 0.0 else 0.0
+        hit = min(nearest[k], nearest[count + k])
+        nearest[k] = hit if hit > 0.0 else 0.0
 
 
 @kernel(int64(CONSTANT))

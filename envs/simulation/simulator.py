@@ -36,6 +36,7 @@ from leapnav.envs.simulation.state import (
     STEPS,
     TURN_RATE,
     VX,
+    SharedFields,
     SimulationState,
     guide_points,
 )
@@ -60,7 +61,7 @@ class BatchSimulator:
         motion (count, n - 3): further states of the robots.
         state (count, COLUMNS): see `leapnav.envs.simulation.state`.
         tasks (count, K): see `leapnav.envs.scenarios.scenario`.
-        fields (count, L): packed obstacle fields; the end of a row is unused.
+        fields: the packed obstacle fields.
 
     """
 
@@ -77,7 +78,7 @@ class BatchSimulator:
         self._known_bank: tuple[ScenarioBank, np.ndarray] | None = None
         self._drive, self._drives_paths = settings.model.drive, settings.model.drive == GENERAL
         self._pointers: tuple[FunctionPointer, FunctionPointer] | None = None
-        self.fields = np.zeros((count, 0))
+        self.fields = SharedFields(count)
         self._packed = settings.packed()
         self._record: tuple[np.ndarray, ...] | None = None
         self._free_horizon = settings.free_horizon
@@ -85,7 +86,6 @@ class BatchSimulator:
         self._maps, self._geodesic = settings.observation == "map", settings.observation == "geodesic"
         self._geodesic_maps = np.zeros((count, 0), np.float32)
         self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
-        self._lengths = np.zeros(count, dtype=int)
         self._guides = np.zeros((count, N_GUIDE_POINTS, 3))
         motor = settings.motor
         self._free = FreeBodies(count, motor.mass, motor.moment, forces=settings.motors)
@@ -119,7 +119,7 @@ class BatchSimulator:
                     robots=self._robots,
                     state=self.state,
                     tasks=self.tasks,
-                    fields=self.fields,
+                    fields=self.fields.places,
                     guides=self._guides,
                     noise=self._noise,
                     noise_rows=self._noise_rows,
@@ -156,16 +156,8 @@ class BatchSimulator:
         footprints = [choice.discs if isinstance(choice, Scenario) else self._bank_discs(bank) for choice in choices]
         distinct = {id(discs): discs for discs in footprints}  # one for all scenarios of a bank
         self._make_room(max(map(len, tasks)), max(map(_required_discs, distinct.values())))
-        longest = max(map(len, fields))
-        if longest > self.fields.shape[1]:
-            # Rows at multiples of a large power of two would map to the same cache sets, so a row has an odd number of
-            # cache lines.
-            wider = np.zeros((len(self.fields), 16 * math.ceil(longest / 16) + 8))
-            wider[:, : self.fields.shape[1]] = self.fields
-            self.fields, self._record = wider, None
         for i, field in zip(indices.tolist(), fields, strict=True):
-            self.fields[i, : len(field)] = field
-            self._lengths[i] = len(field)
+            self.fields[i] = field
         m, first = self._n_controls, self._first_disc
         for i, choice, task, discs in zip(indices.tolist(), choices, tasks, footprints, strict=True):
             self.tasks[i, : len(task)] = task
@@ -291,7 +283,7 @@ class BatchSimulator:
         if self._motors:
             bodies, substeps = self._free.rows, self._substeps
             for substep in range(substeps):
-                stepping.drive_motors(bodies, state, self.tasks, self.fields, self._packed, substep, substeps)
+                stepping.drive_motors(bodies, state, self.tasks, self.fields.places, self._packed, substep, substeps)
                 self._free.advance()
             stepping.read_velocities(bodies, state, substeps)
         else:
@@ -322,7 +314,7 @@ class BatchSimulator:
         """Simulate the rest of a period after a contact."""
         row, body = self.state[i], self._free.rows[i]
         duration = float(row[REMAINING])
-        field, discs = self.field(i), self._robots[i, self._first_disc :].reshape(-1, 2)
+        field, discs = self.fields[i], self._robots[i, self._first_disc :].reshape(-1, 2)
         discs = discs[discs[:, 1] > 0.0]
         motor = self.settings.motor
         if i not in self._contacts:
@@ -392,10 +384,6 @@ class BatchSimulator:
 
         return follow
 
-    def field(self, i: int) -> np.ndarray:
-        """Return the packed obstacle field of a robot's scenario."""
-        return self.fields[i, : self._lengths[i]]
-
     def observe(self, out: np.ndarray, robots: np.ndarray | None = None) -> None:
         """Write flat observations to `out` (count, size), float32: of all robots, or of those given by index."""
         if self._disturbed:
@@ -412,7 +400,7 @@ class BatchSimulator:
 
     def ranges(self, i: int) -> np.ndarray:
         """Return the lidar ranges of a robot without noise (m); empty without a lidar."""
-        return self.layout.scan(self._free.rows[i], self.field(i))
+        return self.layout.scan(self._free.rows[i], self.fields[i])
 
     def __getstate__(self) -> dict[str, Any]:
         # Contact worlds have no memory between periods, so they can be created again.

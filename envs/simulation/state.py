@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import float32, types
+from numba import float32, int64, types
 
-from leapnav.envs.kernels import record_type
-from leapnav.envs.kernels.types import CUBE, INTEGERS, MATRIX, VECTOR
+from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.numba_internals import vector_at
+from leapnav.envs.kernels.types import CONSTANT, CUBE, INTEGERS, MATRIX, VECTOR
+from leapnav.envs.shapes.field import pack_field
 
 # Columns of the state.
 (
@@ -68,6 +70,47 @@ def parts(free_horizon: bool) -> dict[str, int]:
     return _TIMED_PARTS if free_horizon else PARTS
 
 
+class SharedFields:
+    """The packed obstacle field of each robot; robots with the same scenario share one array.
+
+    Attributes:
+        places (count, 2): address and length of each field, int64, see `field_of`.
+
+    """
+
+    def __init__(self, count: int) -> None:
+        self._set([pack_field((), (0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 1.0)] * count)
+
+    def _set(self, fields: list[np.ndarray]) -> None:
+        self._fields = fields
+        self.places = np.zeros((len(fields), 2), np.int64)
+        for i, field in enumerate(fields):
+            self[i] = field
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        return self._fields[i]
+
+    def __setitem__(self, i: int, field: np.ndarray) -> None:
+        assert field.dtype == np.float64 and field.flags.c_contiguous  # as kernels read it
+        self._fields[i] = field  # keeps the memory at the address
+        self.places[i] = field.ctypes.data, len(field)
+
+    def __getstate__(self) -> list[np.ndarray]:
+        return self._fields
+
+    def __setstate__(self, fields: list[np.ndarray]) -> None:
+        self._set(fields)
+
+
+PLACES = int64[:, ::1]
+
+
+@kernel(CONSTANT(PLACES, int64))
+def field_of(places, i):
+    """Return the packed obstacle field of robot i, see `SharedFields`."""
+    return vector_at(places[i, 0], places[i, 1])
+
+
 class SimulationState(NamedTuple):
     """The episodes of `count` robots.
 
@@ -78,7 +121,7 @@ class SimulationState(NamedTuple):
             with its offset along the heading and its radius (m), which is not positive if the disc is unused.
         state (count, COLUMNS): see the constants of this module.
         tasks (count, K): see `leapnav.envs.scenarios.scenario`.
-        fields (count, L): packed obstacle fields; the end of a row is unused.
+        fields (count, 2): the places of the packed obstacle fields, see `field_of`.
         guides (count, N_GUIDE_POINTS, 3): points (m) of the reference path, and the path length (m) from
             each to the goal.
         noise (count, rows, columns): standard normal numbers.
@@ -106,7 +149,7 @@ SIMULATION_STATE = record_type(
     robots=MATRIX,
     state=MATRIX,
     tasks=MATRIX,
-    fields=MATRIX,
+    fields=PLACES,
     guides=CUBE,
     noise=CUBE,
     noise_rows=INTEGERS,

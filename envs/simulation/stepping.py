@@ -61,6 +61,7 @@ from leapnav.envs.simulation.state import (
     LAST_STEP,
     MISS,
     PACKED_STATE,
+    PLACES,
     POSE_CLEARANCE,
     POTENTIAL,
     PROXIMITY,
@@ -81,6 +82,7 @@ from leapnav.envs.simulation.state import (
     VX,
     VY,
     SimulationState,
+    field_of,
 )
 
 GRAVITY = 9.81  # m/s^2
@@ -144,7 +146,11 @@ def start_episodes(robots, packed):
         # A remainder of less than 1e-6 periods is a rounding error of the horizon, not another period.
         state[i, LAST_STEP] = max(1.0, math.ceil(tasks[i, HORIZON] / settings[PERIOD] - 1e-6))
         state[i, POSE_CLEARANCE] = footprint_clearance(
-            bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.robots[i, first_disc:].reshape((-1, 2)), sim.fields[i]
+            bodies[i, 0],
+            bodies[i, 1],
+            bodies[i, 2],
+            sim.robots[i, first_disc:].reshape((-1, 2)),
+            field_of(sim.fields, i),
         )[0]
         state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
         if settings[FREE_HORIZON] != 0.0:
@@ -229,7 +235,7 @@ def drive_paths(packed, motion):
     for i in range(len(state)):
         if general:
             bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        robot, field, duration = sim.robots[i], sim.fields[i], state[i, DURATION]
+        robot, field, duration = sim.robots[i], field_of(sim.fields, i), state[i, DURATION]
         discs = robot[n + m :].reshape((-1, 2))
         if duration == 0.0 or (not general and is_one_disc(discs)):
             continue
@@ -284,7 +290,7 @@ def drive_arcs(actions, active, packed):
         bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
         if state[i, DURATION] == 0.0 or not (all_discs or is_one_disc(sim.robots[i, 5:].reshape((-1, 2)))):
             continue
-        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], sim.fields[i]
+        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], field_of(sim.fields, i)
         distance, turn = state[i, SPEED] * state[i, DURATION], state[i, TURN_RATE] * state[i, DURATION]
         lowest, fraction, after = follow_arc(x, y, heading, distance, turn, state[i, POSE_CLEARANCE], field)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
@@ -337,7 +343,7 @@ def read_velocities(bodies, state, substeps):
             state[i, VX], state[i, VY], state[i, SPIN] = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
 
 
-@kernel(NOTHING(MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, int64, int64))
+@kernel(NOTHING(MATRIX, MATRIX, MATRIX, PLACES, VECTOR, int64, int64))
 def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
     """Set velocity and force of each body for one substep, up to the first contact, and add the running cost.
 
@@ -352,7 +358,7 @@ def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
         if step == 0.0 or state[i, IN_CONTACT] != 0.0:
             continue
         dx, dy, turn = state[i, VX] * step, state[i, VY] * step, state[i, SPIN] * step
-        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], fields[i]
+        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], field_of(fields, i)
         distance, course = math.sqrt(dx * dx + dy * dy), math.atan2(dy, dx)
         lowest, fraction, after = follow_arc(x, y, course, distance, 0.0, state[i, POSE_CLEARANCE], field)
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = min(state[i, CLEARANCE], lowest), after
