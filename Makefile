@@ -49,6 +49,7 @@ bench: .venv/installed
 	$(BIN)/python benchmarks/expert.py
 	$(BIN)/python benchmarks/solvers.py
 	$(BIN)/python benchmarks/optima.py
+	$(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/stages.py
 	$(BIN)/python benchmarks/lower_bounds.py
 	$(BIN)/python benchmarks/labels.py

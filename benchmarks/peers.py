@@ -1,13 +1,15 @@
-"""The peers of the benchmark: SciPy's solve_bvp, and CasADi with IPOPT, on the same problem.
+"""The peers of the benchmark: SciPy's solve_bvp, and CasADi with IPOPT or fatrop, on the same problem.
 
-Both are used as their documentation recommends. solve_bvp gets a vectorised right-hand side in NumPy or, in a second
+They are used as their documentation recommends. solve_bvp gets a vectorised right-hand side in NumPy or, in a second
 variant, leapnav's compiled flow with its analytic Jacobian. IPOPT solves the trapezoidal transcription with exact
 derivatives, built by CasADi's Opti stack for each scenario or, in a second variant, prebuilt with the numbers of the
-scenario as parameters, which is not timed.
+scenario as parameters, which is not timed. Fatrop, an interior-point method for optimal control problems, solves a
+multiple-shooting transcription, prebuilt as well.
 """
 
 import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi
@@ -21,7 +23,7 @@ from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.solvers.nodes import default_segments, start_nodes
 
 MAX_NODES = 5000
-IPOPT_TOLERANCE = 1e-6
+TOLERANCE = 1e-6
 POINTS = 4000  # of the dense path that is checked for collisions
 
 
@@ -151,65 +153,136 @@ def _running_cost(problem: OptimalControlProblem, z: np.ndarray) -> np.ndarray:
     return np.array([arrays.flow.function(row, arrays.data, arrays.field, none, dz, none) for row in z])
 
 
+def _model(numbers: casadi.SX, obstacles: int) -> Callable[[casadi.SX, casadi.SX], tuple[casadi.SX, casadi.SX]]:
+    """The function from states (3, N) and controls (2, N) to rates (3, N) and running costs (1, N) in a scenario."""
+    sigma, weight, radius, speed_weight, turn_weight = casadi.vertsplit(numbers[1:6])
+    arena, discs = numbers[6:10], casadi.reshape(numbers[16:], 3, obstacles)
+
+    def evaluate(q: casadi.SX, u: casadi.SX) -> tuple[casadi.SX, casadi.SX]:
+        v, w = u[0, :], u[1, :]
+        proximity = 0
+        for d in (q[0, :] - arena[0], arena[2] - q[0, :], q[1, :] - arena[1], arena[3] - q[1, :]):
+            proximity += casadi.exp(-(d - radius) / sigma)
+        for i in range(obstacles):
+            d = casadi.sqrt((q[0, :] - discs[0, i]) ** 2 + (q[1, :] - discs[1, i]) ** 2 + 1e-6) - discs[2, i] - radius
+            proximity += casadi.exp(-d / sigma)
+        rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
+        return rates, (speed_weight * v**2 + turn_weight * w**2) / 2 + weight * proximity
+
+    return evaluate
+
+
+def _numbers(scenario: Scenario, goal: np.ndarray) -> list[float]:
+    """The numbers of a scenario with discs, in the order of `_model`; the heading of the goal has its winding."""
+    robot, cost = scenario.robot, scenario.cost
+    weights = [cost.proximity_scale, cost.proximity_weight, robot.radius, cost.speed_weight, cost.turn_weight]
+    discs = [value for o in scenario.obstacles for value in (*o.circle.center, o.circle.radius)]
+    return [scenario.horizon, *weights, *scenario.arena, *scenario.start, *goal, *discs]
+
+
 @functools.cache
 def transcription(obstacles: int, intervals: int) -> tuple[casadi.Function, int]:
     """An IPOPT solver for scenarios with this number of discs, whose parameters are inputs; number of constraints."""
     q, u = casadi.SX.sym("q", 3, intervals + 1), casadi.SX.sym("u", 2, intervals + 1)
     numbers = casadi.SX.sym("numbers", 16 + 3 * obstacles)
-    horizon, sigma, weight, radius, speed_weight, turn_weight = casadi.vertsplit(numbers[:6])
-    arena, start, goal = numbers[6:10], numbers[10:13], numbers[13:16]
-    discs = casadi.reshape(numbers[16:], 3, obstacles)
-    v, w = u[0, :], u[1, :]
-    h = horizon / intervals
-    rates = casadi.vertcat(v * casadi.cos(q[2, :]), v * casadi.sin(q[2, :]), w)
-    proximity = 0
-    for d in (q[0, :] - arena[0], arena[2] - q[0, :], q[1, :] - arena[1], arena[3] - q[1, :]):
-        proximity += casadi.exp(-(d - radius) / sigma)
-    for i in range(obstacles):
-        d = casadi.sqrt((q[0, :] - discs[0, i]) ** 2 + (q[1, :] - discs[1, i]) ** 2 + 1e-6) - discs[2, i] - radius
-        proximity += casadi.exp(-d / sigma)
-    running = (speed_weight * v**2 + turn_weight * w**2) / 2 + weight * proximity
+    rates, running = _model(numbers, obstacles)(q, u)
+    h = numbers[0] / intervals
     steps = q[:, 1:] - q[:, :-1] - h / 2 * (rates[:, 1:] + rates[:, :-1])
-    constraints = casadi.vertcat(casadi.vec(steps), q[:, 0] - start, q[:, -1] - goal)
+    constraints = casadi.vertcat(casadi.vec(steps), q[:, 0] - numbers[10:13], q[:, -1] - numbers[13:16])
     program = {
         "x": casadi.vertcat(casadi.vec(q), casadi.vec(u)),
         "p": numbers,
         "f": h * (casadi.sum2(running) - (running[0] + running[-1]) / 2),
         "g": constraints,
     }
-    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": IPOPT_TOLERANCE}}
+    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": TOLERANCE}}
     return casadi.nlpsol("solver", "ipopt", program, options), constraints.shape[0]
+
+
+@functools.cache
+def staged_transcription(obstacles: int, intervals: int) -> tuple[casadi.Function, int]:
+    """A fatrop solver, see `transcription`.
+
+    Fatrop requires explicit dynamics, and variables and constraints in the order of time, so the controls are constant
+    on each interval, over which states and cost are integrated by one Runge-Kutta step of order 4.
+    """
+    numbers = casadi.SX.sym("numbers", 16 + 3 * obstacles)
+    model, h, cost = _model(numbers, obstacles), numbers[0] / intervals, 0
+    q = casadi.SX.sym("q0", 3)
+    variables, constraints = [q], []
+    for k in range(intervals):
+        u, following = casadi.SX.sym(f"u{k}", 2), casadi.SX.sym(f"q{k + 1}", 3)
+        k1, l1 = model(q, u)
+        k2, l2 = model(q + h / 2 * k1, u)
+        k3, l3 = model(q + h / 2 * k2, u)
+        k4, l4 = model(q + h * k3, u)
+        cost += h / 6 * (l1 + 2 * l2 + 2 * l3 + l4)
+        constraints.append(following - q - h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+        if k == 0:
+            constraints.append(q - numbers[10:13])
+        variables += [u, following]
+        q = following
+    constraints.append(q - numbers[13:16])
+    equations = casadi.vertcat(*constraints)
+    program = {"x": casadi.vertcat(*variables), "p": numbers, "f": cost, "g": equations}
+    options = {
+        "print_time": False,
+        "structure_detection": "auto",
+        "equality": [True] * equations.shape[0],
+        "fatrop": {"print_level": 0, "tol": TOLERANCE},
+    }
+    return casadi.nlpsol("solver", "fatrop", program, options), equations.shape[0]
 
 
 def ipopt(scenario: Scenario, path: Trajectory, intervals: int, prebuilt: bool = False) -> Result:
     """Solve by IPOPT on the trapezoidal transcription, from the states of a path and the speeds along it."""
-    times = np.linspace(0.0, scenario.horizon, intervals + 1)
-    states = path.resample(times).states
-    rates = np.gradient(states, times, axis=0)
-    speed = rates[:, 0] * np.cos(states[:, 2]) + rates[:, 1] * np.sin(states[:, 2])
-    speeds = np.stack([speed, rates[:, 2]], axis=1)
-    values, cost, success, seconds = (_prebuilt if prebuilt else _opti)(scenario, times, states, speeds)
-    dense = Trajectory(times, values).resample(np.linspace(0.0, scenario.horizon, POINTS)).states
-    clear = clearances(np.ascontiguousarray(dense), scenario.field).min() > 0
-    return Result(success and bool(clear), cost, seconds)
+    return _direct(_prebuilt if prebuilt else _opti, scenario, path, intervals)
+
+
+def fatrop(scenario: Scenario, path: Trajectory, intervals: int) -> Result:
+    """Solve by fatrop from the states of a path and the speeds along it."""
+    return _direct(_staged, scenario, path, intervals)
 
 
 Solution = tuple[np.ndarray, float, bool, float]
 
 
+def _direct(solve: Callable[..., Solution], scenario: Scenario, path: Trajectory, intervals: int) -> Result:
+    times = np.linspace(0.0, scenario.horizon, intervals + 1)
+    states = path.resample(times).states
+    rates = np.gradient(states, times, axis=0)
+    speed = rates[:, 0] * np.cos(states[:, 2]) + rates[:, 1] * np.sin(states[:, 2])
+    values, cost, success, seconds = solve(scenario, times, states, np.stack([speed, rates[:, 2]], axis=1))
+    dense = Trajectory(times, values).resample(np.linspace(0.0, scenario.horizon, POINTS)).states
+    clear = clearances(np.ascontiguousarray(dense), scenario.field).min() > 0
+    return Result(success and bool(clear), cost, seconds)
+
+
 def _prebuilt(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
-    solver, count = transcription(len(scenario.obstacles), len(times) - 1)
-    robot, cost = scenario.robot, scenario.cost
-    discs = [value for o in scenario.obstacles for value in (*o.circle.center, o.circle.radius)]
-    weights = [cost.proximity_scale, cost.proximity_weight, robot.radius, cost.speed_weight, cost.turn_weight]
-    numbers = [scenario.horizon, *weights, *scenario.arena, *scenario.start, *states[-1], *discs]
-    limits = np.concatenate([np.full(states.size, np.inf), np.tile([robot.max_speed, robot.max_turn_rate], len(times))])
-    guess = np.concatenate([states.ravel(), speeds.ravel()])
+    solver = transcription(len(scenario.obstacles), len(times) - 1)
+    limits = np.concatenate([np.full(states.size, np.inf), np.tile(scenario.robot.limits(), len(times))])
+    values, cost, success, seconds = _solve(solver, scenario, states, np.append(states, speeds), limits)
+    return values[: states.size].reshape(-1, 3), cost, success, seconds
+
+
+def _staged(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
+    solver = staged_transcription(len(scenario.obstacles), len(times) - 1)
+    guess = np.append(np.hstack([states, speeds])[:-1], states[-1])
+    limits = np.append(np.tile([np.inf] * 3 + list(scenario.robot.limits()), len(times) - 1), [np.inf] * 3)
+    values, cost, success, seconds = _solve(solver, scenario, states, guess, limits)
+    return np.append(values, [0.0, 0.0]).reshape(-1, 5)[:, :3], cost, success, seconds
+
+
+def _solve(
+    solver: tuple[casadi.Function, int], scenario: Scenario, states: np.ndarray, guess: np.ndarray, limits: np.ndarray
+) -> Solution:
+    """Call a prebuilt solver, whose time is measured; the values are those of all variables."""
+    function, count = solver
+    numbers, zeros = _numbers(scenario, states[-1]), np.zeros(count)
     start = time.perf_counter()
-    found = solver(x0=guess, p=numbers, lbx=-limits, ubx=limits, lbg=np.zeros(count), ubg=np.zeros(count))
+    found = function(x0=guess, p=numbers, lbx=-limits, ubx=limits, lbg=zeros, ubg=zeros)
     seconds = time.perf_counter() - start
-    values = np.array(found["x"]).ravel()[: states.size].reshape(-1, 3)
-    return values, float(found["f"]), bool(solver.stats()["success"]), seconds
+    return np.array(found["x"]).ravel(), float(found["f"]), bool(function.stats()["success"]), seconds
 
 
 def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
@@ -237,7 +310,7 @@ def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.
     opti.subject_to(opti.bounded(-robot.max_turn_rate, w, robot.max_turn_rate))
     opti.set_initial(q, states.T)
     opti.set_initial(u, speeds.T)
-    options = {"print_level": 0, "sb": "yes", "tol": IPOPT_TOLERANCE}
+    options = {"print_level": 0, "sb": "yes", "tol": TOLERANCE}
     opti.solver("ipopt", {"print_time": False, "expand": True}, options)
     # The time includes the derivatives and the solve, but not the construction of the expressions above.
     start = time.perf_counter()
