@@ -18,6 +18,7 @@ from leapnav.envs.shapes.clearance import clearances
 from leapnav.envs.shapes.sampling import sample_grid
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
+from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
 from leapnav.experts.problem.extremal import Extremal, Status
@@ -116,6 +117,7 @@ class Optimum(Extremal):
 KERNELS = (
     sample_grid,
     clearances,
+    interpolate,
     *LATTICE_KERNELS,
     arcs_descent.descend,
     solve_nodes,

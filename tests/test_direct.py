@@ -20,6 +20,17 @@ def first_candidate(scenario):
     return OptimalControlProblem.from_scenario(scenario).with_winding_of(path.states), path
 
 
+def test_paths_are_interpolated_as_by_numpy():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        times, rows = np.cumsum(rng.uniform(0.01, 1.0, 20)), rng.normal(size=(20, 3))
+        at = np.concatenate([rng.uniform(-1.0, times[-1] + 1.0, 30), times, times[-1:]])
+        expected = np.stack([np.interp(at, times, column) for column in rows.T], axis=1)
+        path = Trajectory(times, rows, np.asfortranarray(-rows)).resample(at)
+        assert (path.states == expected).all()
+        assert (path.costates == -expected).all()
+
+
 @pytest.mark.parametrize("scenario", [s for s, _ in BEST_KNOWN[::6]], ids=lambda s: s.name)
 def test_it_converges_to_the_extremal_with_order_two(scenario):
     optimum = find_optimum(scenario)

@@ -89,13 +89,15 @@ def _dips(times: np.ndarray, determinants: np.ndarray, check_parabola: bool) -> 
     With `check_parabola` the parabola through each minimum and its neighbours must come close to zero as well.
     """
     size = np.abs(determinants)
-    before = np.maximum.accumulate(size)[1:-1]
-    is_minimum = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < MAX_DIP * before)
-    is_minimum &= before > MIN_DETERMINANT
+    largest = np.maximum.accumulate(size)[1:-1]
+    is_minimum = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < MAX_DIP * largest)
+    is_minimum &= largest > MIN_DETERMINANT
     found = []
     for i in np.flatnonzero(is_minimum) + 1:
-        a, b, c = np.polyfit(times[i - 1 : i + 2] - times[i], size[i - 1 : i + 2], 2)
-        if not check_parabola or a <= 0.0 or c - b * b / (4.0 * a) < MAX_PARABOLA_MINIMUM * size[i]:
+        before, after = np.diff(size[i - 1 : i + 2]) / np.diff(times[i - 1 : i + 2])
+        a = (after - before) / (times[i + 1] - times[i - 1])
+        b = before + a * (times[i] - times[i - 1])
+        if not check_parabola or a <= 0.0 or size[i] - b * b / (4.0 * a) < MAX_PARABOLA_MINIMUM * size[i]:
             found.append(int(i))
     return found
 

@@ -13,6 +13,7 @@ import numpy as np
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
+from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
 from leapnav.experts.problem.system import (
     ControlAffineSystem,
@@ -48,9 +49,9 @@ class Trajectory:
 
     def resample(self, times: np.ndarray) -> Trajectory:
         """Return the path at other times (K,), by linear interpolation."""
-        columns = [self.states] if self.costates is None else [self.states, self.costates]
-        values = [np.stack([np.interp(times, self.times, c) for c in array.T], axis=1) for array in columns]
-        return Trajectory(times, *values)
+        arrays = [self.states] if self.costates is None else [self.states, self.costates]
+        at, own = np.ascontiguousarray(times, float), np.ascontiguousarray(self.times, float)
+        return Trajectory(times, *(interpolate(at, own, np.ascontiguousarray(array, float)) for array in arrays))
 
 
 @dataclass(frozen=True, eq=False)

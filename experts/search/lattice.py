@@ -156,11 +156,13 @@ class Lattice:
     def metric_lengths(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return length in the metric of the weights, and Phi at the midpoint, of each step of a path (N, 3)."""
         speed_weight, turn_weight = self.scenario.robot.metric(self.scenario.cost)
-        step = np.diff(poses, axis=0)
+        step = poses[1:] - poses[:-1]
         lengths = np.sqrt(speed_weight * (step[:, 0] ** 2 + step[:, 1] ** 2) + turn_weight * step[:, 2] ** 2)
         at = np.rint((poses[1:, :2] + poses[:-1, :2] - 2 * np.array(self.origin)) / self.cell).astype(int)
-        layer = np.abs((ANGLES - poses[:-1, 2, None] + np.pi) % (2 * np.pi) - np.pi).argmin(axis=1)
-        phi = self.phi[layer if len(self.phi) > 1 else 0, at[:, 0], at[:, 1]]
+        layer: np.ndarray | int = 0
+        if len(self.phi) > 1:
+            layer = np.abs((ANGLES - poses[:-1, 2, None] + np.pi) % (2 * np.pi) - np.pi).argmin(axis=1)
+        phi = self.phi[layer, at[:, 0], at[:, 1]]
         return lengths, np.where(np.isfinite(phi), phi, 0.0)
 
     def nodes_around(self, x: float, y: float, heading: float | None, speed: np.ndarray) -> Nodes:
@@ -199,7 +201,8 @@ class Lattice:
         poses[1:-1, 1] = self.origin[1] + self.cell * (path // HEADINGS % self.lines)
         poses[1:-1, 2] = ANGLES[path % HEADINGS]
         poses[-1] = (goal[0], goal[1], poses[-2, 2] if goal[2] is None else goal[2])
-        poses[:, 2] = np.unwrap(poses[:, 2])
+        if np.abs(poses[1:, 2] - poses[:-1, 2]).max() >= np.pi:
+            poses[:, 2] = np.unwrap(poses[:, 2])
         return poses
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearances
+from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -185,15 +186,17 @@ class LocalOptima:
 
     def add_direct(self, problem: OptimalControlProblem, direct: DirectPath) -> None:
         """Compute the extremal of a direct path, unless the path is a duplicate or unlikely to lead to a useful one."""
-        if self._is_seen(direct):
+        shape = _shape(direct.times, direct.states)
+        if self._is_seen(shape):
             self._widen_places(direct)
             return
         if self._is_discarded(problem, direct, direct, DIRECT_ERROR):
             return
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
         refined = self._refine(problem, direct)
-        is_duplicate = self._is_seen(refined)
-        self._seen += [_shape(path.times, path.states) for path in (direct, refined)]
+        refined_shape = _shape(refined.times, refined.states)
+        is_duplicate = self._is_seen(refined_shape)
+        self._seen += [shape, refined_shape]
         if is_duplicate:
             self._widen_places(refined)
             return
@@ -328,9 +331,8 @@ class LocalOptima:
         """Return which points of a path are at a place."""
         return np.hypot(path.states[:, 0] - place.x, path.states[:, 1] - place.y) < self._place_radius
 
-    def _is_seen(self, direct: DirectPath) -> bool:
-        """Return whether a path is a duplicate of an earlier one."""
-        shape = _shape(direct.times, direct.states)
+    def _is_seen(self, shape: np.ndarray) -> bool:
+        """Return whether a path, given by its `_shape`, is a duplicate of an earlier one."""
         return any(self._is_close(shape, other) for other in self._seen)
 
     def _is_close(self, shape: np.ndarray, other: np.ndarray) -> bool:
@@ -434,8 +436,7 @@ def _stalled(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the poses of a path at fixed fractions of the horizon, to compare it with others."""
-    at = COMPARED_FRACTIONS * times[-1]
-    return np.stack([np.interp(at, times, column) for column in states[:, :3].T], axis=1)
+    return interpolate(COMPARED_FRACTIONS * times[-1], times, np.ascontiguousarray(states[:, :3]))
 
 
 def _is_same(extremal: Extremal, other: Extremal) -> bool:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -63,10 +64,7 @@ class DirectPath:
     def refined(self) -> DirectPath:
         """Return the path with every interval halved, as an initial guess of the finer discretisation."""
         times = np.interp(np.arange(2 * len(self.controls) + 1) / 2, np.arange(len(self.times)), self.times)
-        states, costates = (
-            np.stack([np.interp(times, self.times, column) for column in array.T], axis=1)
-            for array in (self.states, self.costates)
-        )
+        states, costates = (interpolate(times, self.times, array) for array in (self.states, self.costates))
         controls = np.repeat(self.controls, 2, axis=0)
         return DirectPath(times, states, controls, costates, self.cost, self.violation, False)
 
@@ -91,7 +89,7 @@ def discretise(problem: OptimalControlProblem, path: Trajectory) -> DirectPath:
         path: states (N, n) at times (N,).
 
     """
-    intervals = int(np.clip(INTERVALS_PER_STEP * (len(path.times) - 1), MIN_INTERVALS, MAX_INTERVALS))
+    intervals = min(max(int(INTERVALS_PER_STEP * (len(path.times) - 1)), MIN_INTERVALS), MAX_INTERVALS)
     times = np.linspace(0.0, path.times[-1], intervals + 1)
     states = path.resample(times).states
     return DirectPath(
@@ -101,10 +99,11 @@ def discretise(problem: OptimalControlProblem, path: Trajectory) -> DirectPath:
 
 def _controls(problem: OptimalControlProblem, times: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the controls (N, m) that follow the states (N + 1, n) best."""
-    step, interval = np.diff(states, axis=0), np.diff(times)[:, None]
+    step, interval = states[1:] - states[:-1], (times[1:] - times[:-1])[:, None]
     if problem.system in (unicycle(), differential_drive()):
-        heading = (states[1:, 2] + states[:-1, 2]) / 2
-        controls = np.column_stack([step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading), step[:, 2]])
+        heading, controls = (states[1:, 2] + states[:-1, 2]) / 2, np.empty((len(step), 2))
+        controls[:, 0] = step[:, 0] * np.cos(heading) + step[:, 1] * np.sin(heading)
+        controls[:, 1] = step[:, 2]
         controls /= interval
         return controls if problem.system == unicycle() else controls @ _wheels(problem).T
     return follow_controls(problem, (states[1:] + states[:-1]) / 2, step / interval)
