@@ -265,6 +265,8 @@ def _search(search: LocalOptima, grids: Grids, effort: Effort) -> Status | None:
         return _search_plane(search, grids, thorough)
     shortest_time, cropped = np.inf, False
     for index, (refinement, margin) in enumerate(LATTICES[: None if thorough else 1]):
+        if index > 0 and margin is not None and not search.is_in_time:
+            continue  # a margin helps only against collisions
         lattice = grids.lattice(refinement, margin).without(search.closed_places)
         search.reset_failure_budget()
         found: CandidateSearch | None = None
@@ -272,7 +274,7 @@ def _search(search: LocalOptima, grids: Grids, effort: Effort) -> Status | None:
         taken: list[Candidate] = []
         closed = search.closed_places.copy()
         for number in range(MAX_FIRST_ROUNDS if index == 0 else MAX_ROUNDS):
-            if number >= MAX_ROUNDS and search.certified:
+            if number >= MAX_ROUNDS and (search.certified or not search.is_in_time):
                 break
             if found is None:
                 found = CandidateSearch(lattice)

@@ -1,5 +1,6 @@
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -32,6 +33,14 @@ def shared_directory(tmp_path_factory, name, make):
             make(partial)
             partial.rename(out)
     return out
+
+
+@pytest.fixture
+def coarse_decisions(monkeypatch):
+    """Reports search the optimum every 2 s of an episode; `test_decisions.py` covers the usual resolution."""
+    from leapnav.training.scoring import decision_reports
+
+    monkeypatch.setattr(decision_reports, "decisions_of", partial(decision_reports.decisions_of, resolution=2.0))
 
 
 @pytest.fixture(scope="session")

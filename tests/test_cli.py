@@ -160,6 +160,7 @@ def test_a_plot_in_an_unknown_format_is_refused(scenario_file, tmp_path, capsys)
     assert "xyz" in line
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_rollout_train_evaluate_and_report_work_together(tmp_path, capsys):
     demos, run, table = tmp_path / "demos", tmp_path / "run", tmp_path / "scores.json"
     assert main(["rollout", "--family", "open", "--count", "6", "--workers", "1", "--out", str(demos)]) == 0

@@ -29,6 +29,7 @@ def towards_the_goal(observation):
     return np.clip([0.5 * needed * math.copysign(1, ahead), math.atan2(left, abs(ahead))], -1, 1)
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_all_kinds_of_policies_are_compared(env, tmp_path):
     found = compare(
         {
@@ -86,6 +87,7 @@ def test_banks_are_given_in_any_form(env):
     assert len(compare({"random": policy}, "all", count=1, progress=False).families) == 5
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_the_commands_take_models_of_stable_baselines3(env, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     PPO("MlpPolicy", env, policy_kwargs=network(SMALL), device="cpu").save("model.zip")

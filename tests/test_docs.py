@@ -70,6 +70,7 @@ def output_of(code, name):
     return printed.getvalue()
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_the_readme_s_examples_run_as_printed(tmp_path, monkeypatch):
     """In one directory, so that the second rollout finds the demonstrations of the first."""
     monkeypatch.chdir(tmp_path)
@@ -84,6 +85,7 @@ def test_every_page_with_code_is_run():
     assert {str(path.relative_to(ROOT / "docs")) for path in pages} == set(PRINTED)
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 @pytest.mark.parametrize("page", PRINTED)
 def test_the_blocks_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

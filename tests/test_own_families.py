@@ -99,6 +99,7 @@ def test_banks_and_demonstrations_are_the_same_with_any_number_of_processes(pill
     assert load_demonstrations(tmp_path / "demos")[0].scenario.arena == (0.0, 0.0, 6.0, 6.0)
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_a_run_trains_and_is_evaluated(module, tmp_path):
     config = PPOConfig(
         out=tmp_path / "run",

@@ -218,6 +218,7 @@ def test_what_a_killed_process_left_of_a_file_is_removed(tmp_path):
         assert 0 not in store
 
 
+@pytest.mark.slow  # test_given_scenarios.py has the same for banks
 def test_a_dask_cluster_that_loses_a_worker_makes_the_same_dataset(whole, tmp_path):
     out = tmp_path / "out"
     with cluster_that_loses_a_worker(out, f"{WORK}/shard-*.npz") as address:

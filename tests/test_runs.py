@@ -229,11 +229,8 @@ def warm(out, demos, **changes):
 @pytest.mark.parametrize(
     "name",
     [
-        "bc",
         "ppo",
-        pytest.param("ppo, levels", marks=pytest.mark.slow),
-        pytest.param("sac", marks=pytest.mark.slow),
-        "sac, learning",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("bc", "ppo, levels", "sac", "sac, learning")),
     ],
 )
 def test_a_killed_run_is_resumed_to_the_same_bits(name, demos, tmp_path):
@@ -416,6 +413,7 @@ def test_tuned_settings_depend_on_the_family_and_the_warm_start():
     assert BCConfig.tuned("clutter", observation="lidar").lidar_beams == 128
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):
     folders = []
     for seed in (0, 1):

@@ -82,6 +82,7 @@ class LocalOptima:
     Attributes:
         certified: certified extremals.
         refused: extremals whose certificate does not hold.
+        is_in_time: whether a direct path has met the limits of the robot, perhaps in collision.
         closed_places: places at which unsuccessful paths were deepest in an obstacle.
 
     """
@@ -98,6 +99,7 @@ class LocalOptima:
         self._wound: dict[tuple[float | None, ...], OptimalControlProblem] = {}  # by the goal
         self.certified: list[Extremal] = []
         self.refused: list[Extremal] = []
+        self.is_in_time = False
         self._seen: list[np.ndarray] = []
         # Paths from which Newton's method did not converge, and paths deep in an obstacle.
         self._stalled: list[_Failure] = []
@@ -164,6 +166,7 @@ class LocalOptima:
                     break
                 guess = guess.scaled(LENGTHENING)
                 path = optimise(problem, guess, weight, iterations)
+        self.is_in_time = self.is_in_time or (path.converged and path.violation < MAX_VIOLATION)
         return path
 
     def _is_limited(self, path: DirectPath) -> bool:
