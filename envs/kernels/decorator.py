@@ -61,7 +61,7 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any
     return declare
 
 
-def record_type(record: type[NamedTuple], **fields: types.Type) -> types.NamedTuple:
+def record_type(record: type[NamedTuple], **fields: types.Type) -> types.NamedTuple | types.NamedUniTuple:
     """The Numba type of a `NamedTuple` that kernels take as one argument.
 
     Args:
@@ -75,7 +75,9 @@ def record_type(record: type[NamedTuple], **fields: types.Type) -> types.NamedTu
     names: tuple[str, ...] = getattr(record, "_fields", ())
     if tuple(fields) != names:
         raise TypeError(f"{record.__name__}: expected the fields {', '.join(names)}, got {', '.join(fields)}")
-    found = types.NamedTuple(tuple(fields.values()), record)
+    members = tuple(fields.values())
+    is_uniform = len(set(members)) == 1  # which Numba distinguishes
+    found = types.NamedUniTuple(members[0], len(members), record) if is_uniform else types.NamedTuple(members, record)
     record.numba_record_type = found  # type: ignore[attr-defined]
     return found
 

@@ -39,6 +39,19 @@ class DiscreteProblem(NamedTuple):
     field: np.ndarray
 
 
+class Evaluation(NamedTuple):
+    """What cost, constraints and expansion of a path have in common.
+
+    Attributes:
+        proximity: (N + 1, 6), proximity cost, its gradient and Hessian (x, y, xx, xy, yy) at the states.
+        chords: (N, 5), of the arcs: cosine and sine of the heading, and chord / arc length with two derivatives.
+
+    """
+
+    proximity: np.ndarray
+    chords: np.ndarray
+
+
 class Expansion(NamedTuple):
     """The second-order expansion about a path.
 
@@ -61,6 +74,7 @@ class Expansion(NamedTuple):
 DISCRETE_PROBLEM = record_type(
     DiscreteProblem, h=VECTOR, end=END_CONDITION, turn_weight=float64, unit=float64, limits=CONSTANT, field=CONSTANT
 )
+EVALUATION = record_type(Evaluation, proximity=MATRIX, chords=MATRIX)
 EXPANSION = record_type(Expansion, dphi=MATRIX, A=MATRIX, B=CUBE, defects=MATRIX, W=CUBE)
 
 
@@ -80,32 +94,44 @@ def arc_chord(h, omega, theta):
     return theta + a, s, 0.5 * h * s1, 0.25 * h * h * s2
 
 
-@kernel(float64(DISCRETE_PROBLEM, MATRIX, MATRIX))
-def discrete_cost(problem, q, u):
-    """Return J of a path q (N + 1, 3), u (N, 2), in units of the speed weight."""
-    h, turn_weight, unit, field = problem.h, problem.turn_weight, problem.unit, problem.field
+@kernel(NOTHING(DISCRETE_PROBLEM, MATRIX, MATRIX, EVALUATION))
+def evaluate(problem, q, u, evaluation):
+    """Fill the evaluation of a path q (N + 1, 3), u (N, 2)."""
+    terms, chords = evaluation.proximity, evaluation.chords
+    for k in range(len(q)):
+        terms[k, 0], terms[k, 1], terms[k, 2], terms[k, 3], terms[k, 4], terms[k, 5] = proximity(
+            q[k, 0], q[k, 1], problem.field
+        )
+    for k in range(len(u)):
+        heading, chords[k, 2], chords[k, 3], chords[k, 4] = arc_chord(problem.h[k], u[k, 1], q[k, 2])
+        chords[k, 0], chords[k, 1] = math.cos(heading), math.sin(heading)
+
+
+@kernel(float64(DISCRETE_PROBLEM, MATRIX, EVALUATION))
+def discrete_cost(problem, u, evaluation):
+    """Return J of an evaluated path with the controls u (N, 2), in units of the speed weight."""
+    h, turn_weight, unit = problem.h, problem.turn_weight, problem.unit
     intervals = len(h)
     cost = 0.0
     for k in range(intervals + 1):
         weight = 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
-        cost += unit * weight * proximity(q[k, 0], q[k, 1], field)[0]
+        cost += unit * weight * evaluation.proximity[k, 0]
     for k in range(intervals):
         cost += 0.5 * h[k] * (u[k, 0] * u[k, 0] + turn_weight * u[k, 1] * u[k, 1])
     return cost
 
 
-@kernel(tuple_of(*[float64] * 3)(DISCRETE_PROBLEM, MATRIX, MATRIX, MATRIX, VECTOR))
-def violations(problem, q, u, multipliers, end_multipliers):
+@kernel(tuple_of(*[float64] * 3)(DISCRETE_PROBLEM, MATRIX, MATRIX, EVALUATION, MATRIX, VECTOR))
+def violations(problem, q, u, evaluation, multipliers, end_multipliers):
     """Return sums over the constraint violations: absolute values, products with the multipliers, and squares."""
-    h, goal, free = problem.h, problem.end.goal, problem.end.free
+    h, goal, free, chords = problem.h, problem.end.goal, problem.end.free, evaluation.chords
     intervals = len(h)
     violation, weighted, squares = 0.0, 0.0, 0.0
     for k in range(intervals):
-        v, omega = u[k, 0], u[k, 1]
-        heading, s, _, _ = arc_chord(h[k], omega, q[k, 2])
-        defect_x = q[k, 0] + h[k] * v * s * math.cos(heading) - q[k + 1, 0]
-        defect_y = q[k, 1] + h[k] * v * s * math.sin(heading) - q[k + 1, 1]
-        defect_theta = q[k, 2] + h[k] * omega - q[k + 1, 2]
+        chord = h[k] * u[k, 0] * chords[k, 2]
+        defect_x = q[k, 0] + chord * chords[k, 0] - q[k + 1, 0]
+        defect_y = q[k, 1] + chord * chords[k, 1] - q[k + 1, 1]
+        defect_theta = q[k, 2] + h[k] * u[k, 1] - q[k + 1, 2]
         violation += abs(defect_x) + abs(defect_y) + abs(defect_theta)
         squares += defect_x * defect_x + defect_y * defect_y + defect_theta * defect_theta
         row = multipliers[k + 1]
@@ -119,21 +145,19 @@ def violations(problem, q, u, multipliers, end_multipliers):
     return violation, weighted, squares
 
 
-@kernel(NOTHING(DISCRETE_PROBLEM, MATRIX, MATRIX, MATRIX, EXPANSION))
-def expand(problem, q, u, costates, expansion):
-    """Fill the second-order expansion about a path."""
-    h, unit, field = problem.h, problem.unit, problem.field
+@kernel(NOTHING(DISCRETE_PROBLEM, MATRIX, MATRIX, EVALUATION, MATRIX, EXPANSION))
+def expand(problem, q, u, evaluation, costates, expansion):
+    """Fill the second-order expansion about an evaluated path."""
+    h, unit, terms, chords = problem.h, problem.unit, evaluation.proximity, evaluation.chords
     dphi, A, B, defects, W = expansion.dphi, expansion.A, expansion.B, expansion.defects, expansion.W
     intervals = len(h)
     for k in range(intervals + 1):
         weight = unit * 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
-        _, gx, gy, hxx, hxy, hyy = proximity(q[k, 0], q[k, 1], field)
-        dphi[k, 0], dphi[k, 1] = weight * gx, weight * gy
-        dphi[k, 2], dphi[k, 3], dphi[k, 4] = weight * hxx, weight * hxy, weight * hyy
+        for j in range(5):
+            dphi[k, j] = weight * terms[k, 1 + j]
     for k in range(intervals):
-        v, omega = u[k, 0], u[k, 1]
-        heading, s, s1, s2 = arc_chord(h[k], omega, q[k, 2])
-        c, d, half = math.cos(heading), math.sin(heading), 0.5 * h[k]
+        c, d, s, s1, s2 = chords[k, 0], chords[k, 1], chords[k, 2], chords[k, 3], chords[k, 4]
+        v, omega, half = u[k, 0], u[k, 1], 0.5 * h[k]
         distance = h[k] * v
         defects[k, 0] = q[k, 0] + distance * s * c - q[k + 1, 0]
         defects[k, 1] = q[k, 1] + distance * s * d - q[k + 1, 1]

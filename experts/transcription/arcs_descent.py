@@ -12,8 +12,10 @@ from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR, tuple_of
 from leapnav.experts.transcription.arcs import (
     DISCRETE_PROBLEM,
     EXPANSION,
+    Evaluation,
     Expansion,
     discrete_cost,
+    evaluate,
     expand,
     violations,
 )
@@ -123,6 +125,8 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
     step = _Step(np.zeros((intervals + 1, 3)), np.empty((intervals, 2)), np.zeros((intervals + 1, 3)), np.zeros(3))
     dq, du, multipliers, nu = step.dq, step.du, step.multipliers, step.nu
     new_q, new_u = np.empty((intervals + 1, 3)), np.empty((intervals, 2))
+    found = Evaluation(np.empty((intervals + 1, 6)), np.empty((intervals, 5)))
+    tried = Evaluation(np.empty((intervals + 1, 6)), np.empty((intervals, 5)))
     held = np.zeros((intervals, 2), dtype=np.int8)
     for k in range(intervals):
         for j in range(2):
@@ -131,10 +135,11 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
     for k in range(intervals + 1):
         for i in range(3):
             is_cold_start = is_cold_start and costates[k, i] == 0.0
-    current = discrete_cost(problem, q, u)
+    evaluate(problem, q, u, found)
+    current = discrete_cost(problem, u, found)
     shift, largest, cost, violation = 0.0, 0.0, np.inf, np.inf
     for _ in range(max_iterations):
-        expand(problem, q, u, costates, expansion)
+        expand(problem, q, u, found, costates, expansion)
         for _ in range(MAX_ACTIVE_SETS):
             while not (
                 backward(
@@ -150,11 +155,11 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
             ):
                 shift = max(4.0 * shift, first_shift)
                 if not shift <= max_shift:
-                    return False, current, violations(problem, q, u, multipliers, nu)[0]
+                    return False, current, violations(problem, q, u, found, multipliers, nu)[0]
             largest = _forward(problem, expansion, model, step)
             if not _update_active_set(problem, u, expansion, step, held):
                 break
-        _, weighted, squares = violations(problem, q, u, multipliers, nu)
+        _, weighted, squares = violations(problem, q, u, found, multipliers, nu)
         before = current + weighted + PENALTY / horizon * squares
         damping, descends = 1.0, False
         cost, violation = np.inf, np.inf
@@ -165,8 +170,9 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
             for k in range(intervals):
                 for j in range(2):
                     new_u[k, j] = min(max(u[k, j] + damping * du[k, j], -limits[j]), limits[j])
-            cost = discrete_cost(problem, new_q, new_u)
-            violation, weighted, squares = violations(problem, new_q, new_u, multipliers, nu)
+            evaluate(problem, new_q, new_u, tried)
+            cost = discrete_cost(problem, new_u, tried)
+            violation, weighted, squares = violations(problem, new_q, new_u, tried, multipliers, nu)
             descends = cost + weighted + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
             if descends:
                 break
@@ -177,6 +183,7 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
                 return False, cost, violation
             continue
         current = cost
+        found, tried = tried, found
         fraction = 1.0 if is_cold_start else damping
         for k in range(intervals + 1):
             for i in range(3):

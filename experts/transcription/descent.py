@@ -14,9 +14,12 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR, tuple_of
 from leapnav.experts.transcription.midpoint import (
     DISCRETE_PROBLEM,
+    EVALUATION,
     EXPANSION,
+    Evaluation,
     Expansion,
     discrete_cost,
+    evaluate,
     expand,
     violations,
 )
@@ -99,6 +102,17 @@ def _update_active_set(problem, u, expansion, step, held):
     return changed
 
 
+@kernel(EVALUATION(int64, int64))
+def _empty_evaluation(intervals, n):
+    return Evaluation(
+        np.empty(intervals + 1),
+        np.empty((intervals + 1, n)),
+        np.empty((intervals + 1, n, n)),
+        np.empty((intervals, n)),
+        np.empty((intervals, n)),
+    )
+
+
 @kernel(tuple_of(boolean, float64, float64)(DISCRETE_PROBLEM, MATRIX, MATRIX, MATRIX, float64, int64))
 def descend(problem, q, u, costates, tolerance, max_iterations):
     """Apply sequential quadratic programming to states (N + 1, n), controls (N, m) and costates (N + 1, n), in place.
@@ -132,6 +146,7 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
     step = _Step(np.zeros((intervals + 1, n)), np.empty((intervals, m)), np.zeros((intervals + 1, n)), np.zeros(n))
     dq, du, multipliers, nu = step.dq, step.du, step.multipliers, step.nu
     new_q, new_u = np.empty((intervals + 1, n)), np.empty((intervals, m))
+    found, tried = _empty_evaluation(intervals, n), _empty_evaluation(intervals, n)
     held = np.zeros((intervals, m), dtype=np.int8)
     for k in range(intervals):
         for j in range(m):
@@ -140,10 +155,11 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
     for k in range(intervals + 1):
         for i in range(n):
             is_cold_start = is_cold_start and costates[k, i] == 0.0
-    current = discrete_cost(problem, q, u)
+    evaluate(problem, q, u, found)
+    current = discrete_cost(problem, u, found)
     shift, largest, cost, violation = 0.0, 0.0, np.inf, np.inf
     for _ in range(max_iterations):
-        expand(problem, q, u, costates, expansion)
+        expand(problem, q, u, found, costates, expansion)
         for _ in range(MAX_ACTIVE_SETS):
             while not (
                 backward(
@@ -159,11 +175,11 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
             ):
                 shift = max(4.0 * shift, first_shift)
                 if not shift <= max_shift:
-                    return False, current, violations(problem, q, u, multipliers, nu)[0]
+                    return False, current, violations(problem, q, found, multipliers, nu)[0]
             largest = _forward(problem, expansion, model, step)
             if not _update_active_set(problem, u, expansion, step, held):
                 break
-        _, weighted, squares = violations(problem, q, u, multipliers, nu)
+        _, weighted, squares = violations(problem, q, found, multipliers, nu)
         before = current + weighted + PENALTY / horizon * squares
         damping, descends = 1.0, False
         cost, violation = np.inf, np.inf
@@ -174,8 +190,9 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
             for k in range(intervals):
                 for j in range(m):
                     new_u[k, j] = min(max(u[k, j] + damping * du[k, j], data[m + j]), data[2 * m + j])
-            cost = discrete_cost(problem, new_q, new_u)
-            violation, weighted, squares = violations(problem, new_q, new_u, multipliers, nu)
+            evaluate(problem, new_q, new_u, tried)
+            cost = discrete_cost(problem, new_u, tried)
+            violation, weighted, squares = violations(problem, new_q, tried, multipliers, nu)
             descends = cost + weighted + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
             if descends:
                 break
@@ -186,6 +203,7 @@ def descend(problem, q, u, costates, tolerance, max_iterations):
                 return False, cost, violation
             continue
         current = cost
+        found, tried = tried, found
         fraction = 1.0 if is_cold_start else damping
         for k in range(intervals + 1):
             for i in range(n):

@@ -41,6 +41,25 @@ class DiscreteProblem(NamedTuple):
     state_cost: FunctionPointer
 
 
+class Evaluation(NamedTuple):
+    """What cost, constraints and expansion of a path have in common.
+
+    Attributes:
+        costs: (N + 1,), state cost.
+        gradients: (N + 1, n), its gradient.
+        hessians: (N + 1, n, n), its Hessian.
+        middles: (N, n), states in the middle of the steps.
+        ends: (N, n), states at the ends of the steps.
+
+    """
+
+    costs: np.ndarray
+    gradients: np.ndarray
+    hessians: np.ndarray
+    middles: np.ndarray
+    ends: np.ndarray
+
+
 class Expansion(NamedTuple):
     """The second-order expansion about a path.
 
@@ -73,48 +92,53 @@ DISCRETE_PROBLEM = record_type(
     derivatives=DERIVATIVES_FUNCTION,
     state_cost=STATE_COST_FUNCTION,
 )
+EVALUATION = record_type(Evaluation, costs=VECTOR, gradients=MATRIX, hessians=CUBE, middles=MATRIX, ends=MATRIX)
 EXPANSION = record_type(Expansion, gradient=MATRIX, hessian=CUBE, A=CUBE, B=CUBE, defects=MATRIX, W=CUBE)
 
 
-@kernel(float64(DISCRETE_PROBLEM, MATRIX, MATRIX))
-def discrete_cost(problem, q, u):
-    """Return J of a path q (N + 1, n), u (N, m), times the unit."""
-    h, data, field, state_cost = problem.h, problem.data, problem.field, problem.state_cost
-    intervals, m = u.shape
+@kernel(NOTHING(DISCRETE_PROBLEM, MATRIX, MATRIX, EVALUATION))
+def evaluate(problem, q, u, evaluation):
+    """Fill the evaluation of a path q (N + 1, n), u (N, m)."""
     n = q.shape[1]
-    gradient, hessian = np.empty(n), np.empty((n, n))
+    f = np.empty(n)
+    for k in range(len(q)):
+        evaluation.costs[k] = problem.state_cost(
+            q[k], problem.data, problem.field, evaluation.gradients[k], evaluation.hessians[k]
+        )
+    for k in range(len(u)):
+        h, middle, end = problem.h[k], evaluation.middles[k], evaluation.ends[k]
+        problem.rates(q[k], u[k], problem.data, f)
+        for i in range(n):
+            middle[i] = q[k, i] + 0.5 * h * f[i]
+        problem.rates(middle, u[k], problem.data, f)
+        for i in range(n):
+            end[i] = q[k, i] + h * f[i]
+
+
+@kernel(float64(DISCRETE_PROBLEM, MATRIX, EVALUATION))
+def discrete_cost(problem, u, evaluation):
+    """Return J of an evaluated path with the controls u (N, m), times the unit."""
+    h, data = problem.h, problem.data
+    intervals, m = u.shape
     cost = 0.0
     for k in range(intervals + 1):
         weight = 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
-        cost += weight * state_cost(q[k], data, field, gradient, hessian)
+        cost += weight * evaluation.costs[k]
     for k in range(intervals):
         for j in range(m):
             cost += 0.5 * h[k] * data[j] * u[k, j] * u[k, j]
     return problem.unit * cost
 
 
-@kernel(NOTHING(DISCRETE_PROBLEM, VECTOR, VECTOR, float64, VECTOR, VECTOR, VECTOR))
-def _step(problem, q, u, h, f, middle, new):
-    """Make a step of the midpoint rule; fill the rates at its middle, the state there, and the new state."""
-    problem.rates(q, u, problem.data, f)
-    for i in range(len(q)):
-        middle[i] = q[i] + 0.5 * h * f[i]
-    problem.rates(middle, u, problem.data, f)
-    for i in range(len(q)):
-        new[i] = q[i] + h * f[i]
-
-
-@kernel(tuple_of(*[float64] * 3)(DISCRETE_PROBLEM, MATRIX, MATRIX, MATRIX, VECTOR))
-def violations(problem, q, u, multipliers, end_multipliers):
+@kernel(tuple_of(*[float64] * 3)(DISCRETE_PROBLEM, MATRIX, EVALUATION, MATRIX, VECTOR))
+def violations(problem, q, evaluation, multipliers, end_multipliers):
     """Return sums over the constraint violations: absolute values, products with the multipliers, and squares."""
     h, goal, free = problem.h, problem.end.goal, problem.end.free
     intervals, n = len(h), q.shape[1]
-    f, middle, new = np.empty(n), np.empty(n), np.empty(n)
     violation, weighted, squares = 0.0, 0.0, 0.0
     for k in range(intervals):
-        _step(problem, q[k], u[k], h[k], f, middle, new)
         for i in range(n):
-            defect = new[i] - q[k + 1, i]
+            defect = evaluation.ends[k, i] - q[k + 1, i]
             violation += abs(defect)
             squares += defect * defect
             weighted += multipliers[k + 1, i] * defect
@@ -127,36 +151,33 @@ def violations(problem, q, u, multipliers, end_multipliers):
     return violation, weighted, squares
 
 
-@kernel(NOTHING(DISCRETE_PROBLEM, MATRIX, MATRIX, MATRIX, EXPANSION))
-def expand(problem, q, u, costates, expansion):
-    """Fill the second-order expansion about a path.
+@kernel(NOTHING(DISCRETE_PROBLEM, MATRIX, MATRIX, EVALUATION, MATRIX, EXPANSION))
+def expand(problem, q, u, evaluation, costates, expansion):
+    """Fill the second-order expansion about an evaluated path.
 
     The step is F(q, u) = q + h f(p, u) with the middle p = q + h / 2 f(q, u) and M = dp / d(q, u). The Hessian of
     lambda'F is h M' (lambda'f)_pp M, the mixed derivatives in (p, u) with M on one side, and the Hessian of mu'f at
     (q, u) with mu = h^2 / 2 f_p' lambda.
     """
-    h, data, field, unit = problem.h, problem.data, problem.field, problem.unit
+    h, data, unit = problem.h, problem.data, problem.unit
     A, B, defects, W = expansion.A, expansion.B, expansion.defects, expansion.W
     intervals, m = u.shape
     n = q.shape[1]
-    f, middle, new, mu = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    mu = np.empty(n)
     fq, fu, hqq, hqu = np.empty((n, n)), np.empty((n, m)), np.empty((n, n)), np.empty((n, m))
     gq, gu, gqq, gqu = np.empty((n, n)), np.empty((n, m)), np.empty((n, n)), np.empty((n, m))
     M, product = np.empty((n, n + m)), np.empty((n, n + m))
     for k in range(intervals + 1):
         weight = unit * 0.5 * ((h[k] if k < intervals else 0.0) + (h[k - 1] if k > 0 else 0.0))
-        problem.state_cost(q[k], data, field, expansion.gradient[k], expansion.hessian[k])
         for i in range(n):
-            expansion.gradient[k, i] *= weight
+            expansion.gradient[k, i] = weight * evaluation.gradients[k, i]
             for j in range(n):
-                expansion.hessian[k, i, j] *= weight
+                expansion.hessian[k, i, j] = weight * evaluation.hessians[k, i, j]
     for k in range(intervals):
-        step = h[k]
-        _step(problem, q[k], u[k], step, f, middle, new)
-        lam = costates[k + 1]
+        step, middle, end, lam = h[k], evaluation.middles[k], evaluation.ends[k], costates[k + 1]
         problem.derivatives(middle, u[k], lam, data, fq, fu, hqq, hqu)
         for i in range(n):
-            defects[k, i] = new[i] - q[k + 1, i]
+            defects[k, i] = end[i] - q[k + 1, i]
             mu[i] = 0.0
             for r in range(n):
                 mu[i] += fq[r, i] * lam[r]
