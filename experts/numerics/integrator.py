@@ -61,6 +61,7 @@ def step(flow, y, new, stages, size, h, tolerance, sensitivity_tolerance):
     K, L = stages.slopes, stages.running
     length = len(y)
     columns = length // size - 1
+    state, sensitivities = new[:size], new[size:].reshape((size, columns))
     for s in range(1, STAGES + 1):
         for e in range(length):
             new[e] = 0.0
@@ -73,10 +74,10 @@ def step(flow, y, new, stages, size, h, tolerance, sensitivity_tolerance):
             new[e] = y[e] + h * new[e]
         slope = K[s]
         L[s] = flow.function(
-            new[:size],
+            state,
             flow.data,
             flow.field,
-            new[size:].reshape((size, columns)),
+            sensitivities,
             slope[:size],
             slope[size:].reshape((size, columns)),
         )
