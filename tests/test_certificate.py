@@ -22,6 +22,7 @@ from leapnav.experts.solve import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
+SLOW_CASE = (13.0, "leapfrog")
 
 
 def grushin_geodesic(a, b):
@@ -170,9 +171,8 @@ def test_a_conjugate_point_of_even_multiplicity_is_seen(method):
 @pytest.mark.parametrize(
     ("horizon", "method"),
     [
-        (horizon, pytest.param(method, marks=pytest.mark.slow) if (horizon, method) == (13.0, "leapfrog") else method)
-        for horizon in (4.0, 7.0, 13.0)
-        for method in METHODS
+        *((horizon, method) for horizon in (4.0, 7.0, 13.0) for method in METHODS if (horizon, method) != SLOW_CASE),
+        pytest.param(*SLOW_CASE, marks=pytest.mark.slow),
     ],
 )
 def test_a_conjugate_point_of_an_extremal_at_rest_is_detected(horizon, method):
