@@ -319,7 +319,7 @@ def _add(search: LocalOptima, found: CandidateSearch, batch: Sequence[Candidate]
 def _omits(lattice: Lattice, effort: Effort) -> bool:
     """Return whether the search may omit candidates by their length.
 
-    It may not if the robot cannot rotate on the spot: the lengths of its lattice paths are too inaccurate.
+    It may not if the robot cannot rotate in place, because the lengths of its lattice paths are not accurate enough.
     """
     return not effort.alternatives and lattice.moves.rotating
 

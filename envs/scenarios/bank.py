@@ -52,7 +52,7 @@ from leapnav.envs.shapes.field import check_field, with_grid
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 FORMAT, VERSION, VERSION_WITHOUT_GRIDS = "leapnav-bank", 4, 5
-MAX_FIELDS = 1024  # of each bank in memory, because a grid may have to be computed
+MAX_FIELDS = 1024  # fields that each bank keeps in memory, because computing a grid takes time
 # Bytes. A larger dataset is verified when it is first read, because that takes 1 s per GB; the others on opening.
 MAX_VERIFIED_ON_OPENING = 32_000_000
 SPLITS = ("train", "test")
