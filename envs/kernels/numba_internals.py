@@ -30,6 +30,7 @@ __all__ = [
     "FunctionTable",
     "Kernel",
     "carray",
+    "matrix_of",
     "part_of",
     "power_of_two",
     "scratch_buffer",
@@ -272,24 +273,42 @@ def _generate_call(context: Any, builder: Any, table: tuple[str, int], signature
     return builder.load(result)
 
 
-def _vector(context: Any, builder: Any, array: Any, data: Any, length: Any) -> Any:
-    """Return a vector of floats that does not own its memory."""
-    vector = context.make_array(array)(context, builder)
-    step = ir.Constant(ir.IntType(64), 8)
-    populate_array(vector, data=data, shape=[length], strides=[step], itemsize=step, meminfo=None)
-    return vector._getvalue()
+def _view(context: Any, builder: Any, array: Any, data: Any, shape: list[Any]) -> Any:
+    """Return an array of floats in C order that does not own its memory."""
+    view = context.make_array(array)(context, builder)
+    itemsize = ir.Constant(ir.IntType(64), 8)
+    strides = [itemsize]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    populate_array(view, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None)
+    return view._getvalue()
+
+
+def _typed_view(array: Any, n_dimensions: int) -> tuple[Any, Any]:
+    """Return signature and code of a view: (array in C order, index of its first element, shape) -> view."""
+    view = types.Array(float64, n_dimensions, "C", readonly=not array.mutable)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = context.make_array(array)(context, builder, arguments[0])
+        return _view(context, builder, view, builder.gep(whole.data, [arguments[1]]), list(arguments[2:]))
+
+    return view(array, *[int64] * (1 + n_dimensions)), generate
 
 
 def _typed_part_of(context: Any, array: Any, start: Any, count: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        whole = context.make_array(array)(context, builder, arguments[0])
-        return _vector(context, builder, array, builder.gep(whole.data, [arguments[1]]), arguments[2])
-
-    return array(array, int64, int64), generate
+    return _typed_view(array, 1)
 
 
+def _typed_matrix_of(context: Any, array: Any, start: Any, rows: Any, columns: Any) -> Any:
+    return _typed_view(array, 2)
+
+
+# A slice counts references, atomically, which takes as long as some of the kernels that receive it.
 part_of: Any = intrinsic(_typed_part_of)
-"""In kernels: the part of a vector of floats from an index, of a given length, without counting a reference."""
+"""In kernels: the vector (count,) of an array's elements in C order from `start`, without counting a reference."""
+
+matrix_of: Any = intrinsic(_typed_matrix_of)
+"""In kernels: the matrix (rows, columns) of an array's elements in C order from `start`, likewise."""
 
 
 def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
@@ -297,7 +316,7 @@ def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
-        return _vector(context, builder, array, data, arguments[1])
+        return _view(context, builder, array, data, [arguments[1]])
 
     return array(int64, int64), generate
 

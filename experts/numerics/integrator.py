@@ -17,6 +17,7 @@ from numba import boolean, float64, int64
 from scipy.integrate import DOP853
 
 from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.numba_internals import matrix_of, part_of
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import FLOW
 
@@ -50,6 +51,21 @@ class Stages(NamedTuple):
 STAGES_TYPE = record_type(Stages, slopes=MATRIX, running=VECTOR)
 
 
+@kernel(NOTHING(FLOW, VECTOR, STAGES_TYPE, int64, int64))
+def evaluate_stage(flow, y, stages, s, size):
+    """Fill slope and running cost of stage s at y = (z, S), flat, of which z are the first `size` entries."""
+    length = len(y)
+    columns = length // size - 1
+    stages.running[s] = flow.function(
+        part_of(y, 0, size),
+        flow.data,
+        flow.field,
+        matrix_of(y, size, size, columns),
+        part_of(stages.slopes, s * length, size),
+        matrix_of(stages.slopes, s * length + size, size, columns),
+    )
+
+
 @kernel(tuple_of(float64, float64)(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64, float64))
 def step(flow, y, new, stages, size, h, tolerance, sensitivity_tolerance):
     """Make one step of length h from y = (z, S) to `new`, both flat; return (cost, error relative to the tolerance).
@@ -60,8 +76,6 @@ def step(flow, y, new, stages, size, h, tolerance, sensitivity_tolerance):
     """
     K, L = stages.slopes, stages.running
     length = len(y)
-    columns = length // size - 1
-    state, sensitivities = new[:size], new[size:].reshape((size, columns))
     for s in range(1, STAGES + 1):
         for e in range(length):
             new[e] = 0.0
@@ -72,15 +86,7 @@ def step(flow, y, new, stages, size, h, tolerance, sensitivity_tolerance):
                     new[e] += a * K[j, e]
         for e in range(length):
             new[e] = y[e] + h * new[e]
-        slope = K[s]
-        L[s] = flow.function(
-            state,
-            flow.data,
-            flow.field,
-            sensitivities,
-            slope[:size],
-            slope[size:].reshape((size, columns)),
-        )
+        evaluate_stage(flow, new, stages, s, size)
     cost = 0.0
     for s in range(STAGES):
         cost += WEIGHTS[s] * L[s]
@@ -124,8 +130,7 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
             y[size + i * columns + c] = S[i, c]
     cost, elapsed, evaluations = 0.0, 0.0, 1
     h = duration if first_step <= 0.0 else first_step
-    slope = K[0]
-    L[0] = flow.function(z, flow.data, flow.field, S, slope[:size], slope[size:].reshape((size, columns)))
+    evaluate_stage(flow, y, stages, 0, size)
     failed = False
     while elapsed < duration:
         proposed = h
@@ -174,7 +179,8 @@ def interpolant(flow, y, new, stages, h, cost, terms):
             for j in range(STAGES + 1 + s):
                 total += EXTRA_A[s, j] * K[j, i]
             z[i] = y[i] + h * total
-        L[STAGES + 1 + s] = flow.function(z, flow.data, flow.field, none, K[STAGES + 1 + s, :size], d_none)
+        slope = part_of(K, (STAGES + 1 + s) * K.shape[1], size)
+        L[STAGES + 1 + s] = flow.function(z, flow.data, flow.field, none, slope, d_none)
     for i in range(size + 1):
         change = new[i] - y[i] if i < size else cost
         first, last = (K[0, i], K[STAGES, i]) if i < size else (L[0], L[STAGES])

@@ -9,6 +9,7 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
+from leapnav.envs.kernels.numba_internals import matrix_of, part_of
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW
@@ -19,6 +20,7 @@ from leapnav.experts.numerics.integrator import (
     STAGES,
     Stages,
     evaluate_interpolant,
+    evaluate_stage,
     interpolant,
     next_step,
     step,
@@ -64,10 +66,9 @@ def trace(flow, control, times, Z, accuracy, record):
     y, new = np.zeros(length), np.empty(length)
     stages = Stages(np.empty((STAGES + 1 + EXTRA_STAGES, length)), np.empty(STAGES + 1 + EXTRA_STAGES))
     K, L = stages.slopes, stages.running
-    S = y[size:].reshape((size, n))
     before_step = np.zeros((size, n))
     for i in range(n):
-        S[n + i, i] = 1.0
+        y[size + (n + i) * n + i] = 1.0
     rows, defect, conjugate, total, sign, determinant = 0, 0.0, -1, 0.0, 0.0, 0.0
     last = len(times) - 2
     h = (times[1] - times[0]) / 4.0
@@ -75,9 +76,7 @@ def trace(flow, control, times, Z, accuracy, record):
         for i in range(size):
             y[i] = Z[k, i]
         elapsed, duration = 0.0, times[k + 1] - times[k]
-        slope = K[0]
-        S = y[size:].reshape((size, n))
-        L[0] = flow.function(y[:size], flow.data, flow.field, S, slope[:size], slope[size:].reshape((size, n)))
+        evaluate_stage(flow, y, stages, 0, size)
         while True:
             finished = elapsed >= duration
             if not finished or k == last:
@@ -86,7 +85,7 @@ def trace(flow, control, times, Z, accuracy, record):
                 out[rows, 0] = times[k] + elapsed
                 out[rows, 1] = total
                 out[rows, 2] = L[0]
-                control(y[:size], flow.data, out[rows, 3 : 3 + m])
+                control(part_of(y, 0, size), flow.data, part_of(out, rows * out.shape[1] + 3, m))
                 for i in range(size):
                     out[rows, 3 + m + i] = y[i]
                     out[rows, 3 + m + size + i] = K[0, i]
@@ -119,12 +118,9 @@ def trace(flow, control, times, Z, accuracy, record):
                     return DIVERGED, np.inf, conjugate
             # Only the span of S matters. Gram-Schmidt keeps it numerically independent over any horizon, and its
             # positive scaling leaves the sign of det dq/dlambda(0) unchanged.
-            S = y[size:].reshape((size, n))
-            determinant = orthonormalise(S)
-            slope = K[0]
+            determinant = orthonormalise(matrix_of(y, size, size, n))
             # Orthonormalisation changed S, so the last stage of the step cannot serve as the first of the next one.
-            flow.function(y[:size], flow.data, flow.field, S, slope[:size], slope[size:].reshape((size, n)))
-            L[0] = L[STAGES]
+            evaluate_stage(flow, y, stages, 0, size)
             if abs(determinant) > MIN_DETERMINANT and conjugate < 0:
                 if sign == 0.0:
                     sign = math.copysign(1.0, determinant)
@@ -137,7 +133,7 @@ def trace(flow, control, times, Z, accuracy, record):
             defect = max(defect, abs(y[i] - Z[k + 1, i]))
     for i in range(size):
         for j in range(n):
-            record.final[i, j] = S[i, j]
+            record.final[i, j] = y[size + i * n + j]
     return rows + 1, defect, conjugate
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import boolean
 
 from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.numba_internals import carray, matrix_of, part_of, scratch_buffer
 from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR
 from leapnav.experts.transcription.arcs import DISCRETE_PROBLEM, EXPANSION
 from leapnav.experts.transcription.quadratic_model import MODEL, REGULARISATION
@@ -41,9 +41,12 @@ def backward(problem, u, held, last_state, regularisation, expansion, model):
             P[intervals, i, i] = penalty
             p[intervals, i] = -penalty * (goal[i] - last_state[i])
             F[intervals, i, i] = 1.0
-    Qux, Fu, PA, PB = np.empty((2, 3)), np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 2))
-    b = np.zeros((3, 2))
-    pc, Qu = np.empty(3), np.empty(2)
+    # On the stack, where the compiler knows that they do not overlap with the arrays of the model.
+    Qux, Fu = carray(scratch_buffer(6), (2, 3)), carray(scratch_buffer(6), (2, 3))
+    PA, PB = carray(scratch_buffer(9), (3, 3)), carray(scratch_buffer(6), (3, 2))
+    pc, Qu = carray(scratch_buffer(3), (3,)), carray(scratch_buffer(2), (2,))
+    b = carray(scratch_buffer(6), (3, 2))
+    b[2, 0] = 0.0
     for k in range(intervals, -1, -1):
         hxx, hxy, hyy = dphi[k, 2], dphi[k, 3], dphi[k, 4]
         if convex:
@@ -55,7 +58,8 @@ def backward(problem, u, held, last_state, regularisation, expansion, model):
                 hxy = largest * 0.5 * hxy / spread
                 hxx, hyy = largest * xx, largest * (1.0 - xx)
         if k < intervals:
-            after, last, before = P[k + 1], p[k + 1], F[k + 1]
+            after, before = matrix_of(P, 9 * (k + 1), 3, 3), matrix_of(F, 9 * (k + 1), 3, 3)
+            last = part_of(p, 3 * (k + 1), 3)
             a0, a1 = A[k, 0], A[k, 1]
             b[0, 0], b[0, 1], b[1, 0], b[1, 1], b[2, 1] = B[k, 0, 0], B[k, 0, 1], B[k, 1, 0], B[k, 1, 1], h[k]
             for i in range(3):
