@@ -120,12 +120,11 @@ def test_a_run_trains_and_is_evaluated(module, tmp_path):
 
 
 def test_the_command_line_finds_modules_in_the_current_directory(module, tmp_path):
-    command = [sys.executable, "-m", "leapnav", "bank", "build", "--family", module, "--count", "3", "--workers", "2"]
-    script = Path(sys.executable).with_name("leapnav")
-    for words in (command, [str(script), *command[3:]]):
-        out = tmp_path / "own.bank"
+    out, script = tmp_path / "own.bank", Path(sys.executable).with_name("leapnav")
+    command = ["bank", "build", "--family", module, "--count", "3", "--out", str(out)]
+    for words in ([sys.executable, "-m", "leapnav", *command], [str(script), *command, "--workers", "2"]):
         out.unlink(missing_ok=True)
-        done = subprocess.run([*words, "--out", str(out)], capture_output=True, text=True, check=False, cwd=tmp_path)
+        done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         assert ScenarioBank(out)[0].name == "warehouse_pillar-0-0"
 

@@ -141,6 +141,14 @@ def test_bad_settings_are_named(settings, message, dataset):
         warm_start(ppo(), dataset, reward_scale=0.0, progress=False)
 
 
+def test_without_values_for_the_critic_the_actor_is_not_changed(dataset):
+    model = ppo()
+    before = model.policy.parameters_to_vector()
+    with pytest.raises(ValueError, match=r"dataset: no sample has a cost-to-go and a costate"):
+        warm_start(model, replace(dataset, returns=np.nan * dataset.returns), cloning=CLONING, progress=False)
+    np.testing.assert_array_equal(model.policy.parameters_to_vector(), before)
+
+
 @pytest.mark.parametrize("quiet", [0.0, 10.0])
 def test_the_divergence_from_the_reference_is_that_of_two_gaussians(quiet):
     env = NavigateEnv("open")

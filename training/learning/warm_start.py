@@ -101,18 +101,19 @@ def warm_start(
     check_positive("reward_scale", reward_scale)
     samples, target = Dataset.of(dataset), policy_of(model)
     check_observations(target, samples)
+    valued = _valued(samples) if config.critic else None
     losses: list[EpochLoss] = []
     if policy is not None:
         copy_actor(policy, target)
     elif config.actor:
         losses = behaviour_clone(model, samples, cloning, progress=progress)
     value_error = slope_error = math.nan
-    if config.critic:
+    if valued is not None:
         gamma = float(getattr(model, "gamma", 1.0))
         robots = model.get_env()
         period = CONTROL_PERIOD if robots is None else float(robots.get_attr("control_period")[0])
         rewards = _Rewards(gamma, period, reward_scale)
-        value_error, slope_error = _fit_critic(target, samples, config, rewards, progress)
+        value_error, slope_error = _fit_critic(target, valued, config, rewards, progress)
     return WarmStart(tuple(losses), value_error, slope_error)
 
 
@@ -132,14 +133,18 @@ class _Rewards:
         return self.scale * (1 - self.gamma**steps) / (steps * (1 - self.gamma))
 
 
-def _fit_critic(
-    policy: BasePolicy, dataset: Dataset, config: WarmStartConfig, rewards: _Rewards, progress: bool
-) -> tuple[float, float]:
-    """Fit the critic, and return the errors of values and slopes in the last epoch, see `WarmStart`."""
+def _valued(dataset: Dataset) -> Dataset:
+    """Return the samples with a cost-to-go and a costate."""
     known = np.isfinite(dataset.returns) & np.isfinite(dataset.costates).all(axis=1)
     if not known.any():
         raise ValueError("dataset: no sample has a cost-to-go and a costate; start.critic needs them")
-    dataset = dataset[known]
+    return dataset[known]
+
+
+def _fit_critic(
+    policy: BasePolicy, dataset: Dataset, config: WarmStartConfig, rewards: _Rewards, progress: bool
+) -> tuple[float, float]:
+    """Fit the critic to samples with values; return the errors of values and slopes in the last epoch."""
     factors = rewards.factors(dataset.time_left)
     samples = _CriticSamples(dataset, factors, rewards.period, policy.device)
     slopes = None
