@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from itertools import islice
@@ -34,6 +34,8 @@ from leapnav.experts.solvers.newton import solve_nodes
 from leapnav.experts.transcription import arcs_descent, descent
 
 N_FIRST = 3  # candidates after which, without alternatives, those that are too long are omitted
+# Distance (m) from start to goal above which many candidates are about as long as the shortest.
+PARTIAL_DISTANCE = 20.0
 N_ELSEWHERE = 4  # additional candidates far from the others: inexpensive, and the most distinct alternatives
 # Rounds of candidates of a lattice, and of the first one while nothing is certified: among dense obstacles, most
 # candidates are in collision.
@@ -270,27 +272,22 @@ def _search(search: LocalOptima, grids: Grids, effort: Effort) -> Status | None:
         lattice = grids.lattice(refinement, margin).without(search.closed_places)
         search.reset_failure_budget()
         found: CandidateSearch | None = None
-        paths: Iterator[Candidate] = iter(())
-        taken: list[Candidate] = []
         closed = search.closed_places.copy()
         for number in range(MAX_FIRST_ROUNDS if index == 0 else MAX_ROUNDS):
             if number >= MAX_ROUNDS and (search.certified or not search.is_in_time):
                 break
             if found is None:
-                found = CandidateSearch(lattice)
-                paths, taken = found.candidates(), []
-            batch = list(islice(paths, effort.candidates))
+                found = CandidateSearch(lattice, partial=_is_partial(lattice, effort))
+            batch, last = _add(search, found, effort)
             if not batch:
                 break
-            taken += batch
             shortest_time = min(shortest_time, *(_shortest_time(c, scenario) for c in batch))
-            _add(search, found, batch, effort)
             if not thorough:
                 break
             # A lattice with a margin lacks passages that may be better.
-            if search.certified and margin is None and found.suffices(search.best.cost, taken[0].cost, batch[-1].cost):
+            if search.certified and margin is None and found.suffices(search.best.cost, last):
                 if not _omits(lattice, effort):
-                    search.add(Trajectory(c.times, c.poses) for c in islice(found.distinct_from(taken), N_ELSEWHERE))
+                    search.add(_trajectories(found.take_elsewhere(N_ELSEWHERE)))
                 return None
             if search.closed_places != closed:  # other candidates would use the same passage
                 closed = search.closed_places.copy()
@@ -306,14 +303,35 @@ def _search(search: LocalOptima, grids: Grids, effort: Effort) -> Status | None:
     return _reason(search, shortest_time)
 
 
-def _add(search: LocalOptima, found: CandidateSearch, batch: Sequence[Candidate], effort: Effort) -> None:
-    """Add candidates; without alternatives, only those that may lead to the best extremal."""
-    first = N_FIRST if _omits(found.lattice, effort) else len(batch)
-    transcribed = search.transcribe(Trajectory(c.times, c.poses) for c in batch[:first])
-    lowest = search.lowest_cost(transcribed)
-    rest = [c for c in batch[first:] if not found.is_too_long(c.cost, lowest)]
-    transcribed += search.transcribe(Trajectory(c.times, c.poses) for c in rest)
-    search.solve(transcribed)
+def _add(search: LocalOptima, found: CandidateSearch, effort: Effort) -> tuple[list[Candidate], float]:
+    """Add the next candidates; without alternatives, only those that may lead to the best extremal.
+
+    Returns:
+        The candidates, and the cost up to which all candidates are taken.
+
+    """
+    count = effort.candidates
+    first = found.take(min(N_FIRST, count), found.limit) if _omits(found.lattice, effort) else []
+    if not first:
+        batch = found.take(count)
+        search.add(_trajectories(batch))
+        return batch, batch[-1].cost if batch else math.inf
+    transcribed = search.transcribe(_trajectories(first))
+    max_cost = found.max_cost(search.lowest_cost(transcribed))
+    others = found.take(count - len(first), max_cost)
+    search.solve([*transcribed, *search.transcribe(_trajectories(others))])
+    batch = [*first, *others]
+    return batch, max_cost if len(batch) < count and max_cost < math.inf else batch[-1].cost
+
+
+def _trajectories(candidates: Iterable[Candidate]) -> Iterator[Trajectory]:
+    return (Trajectory(candidate.times, candidate.poses) for candidate in candidates)
+
+
+def _is_partial(lattice: Lattice, effort: Effort) -> bool:
+    """Return whether a search probably needs only candidates that cost little more than the cheapest."""
+    scenario = lattice.scenario
+    return _omits(lattice, effort) or math.dist(scenario.start[:2], scenario.goal[:2]) > PARTIAL_DISTANCE
 
 
 def _omits(lattice: Lattice, effort: Effort) -> bool:

@@ -1,5 +1,4 @@
 import math
-from itertools import islice
 
 import numpy as np
 import pytest
@@ -250,15 +249,26 @@ def test_lattice_paths_avoid_a_closed_place():
 
 def test_candidates_elsewhere_leave_the_first_ones():
     search = CandidateSearch(Lattice(BEST_KNOWN[0][0]))
-    taken = list(islice(search.candidates(), 6))
-    first = [c.poses for c in taken]
-    others = [c.poses for c in islice(search.distinct_from(taken), 4)]
+    first = [c.poses for c in search.take(6)]
+    others = [c.poses for c in search.take_elsewhere(4)]
     assert others
     known = np.concatenate(first)[:, :2]
     for poses in others:
         distances = np.linalg.norm(poses[:, None, :2] - known, axis=2).min(axis=1)
         assert distances.max() > 0.7
         known = np.concatenate([known, poses[:, :2]])
+
+
+def test_a_partial_search_finds_the_same_candidates():
+    for scenario, _ in BEST_KNOWN[::6]:
+        lattice = Lattice(scenario)
+        whole, partial = CandidateSearch(lattice), CandidateSearch(lattice, partial=True)
+        assert partial.limit < whole.limit
+        within = partial.take(100, partial.limit)
+        assert within and max(c.cost for c in within) <= partial.limit < whole.limit  # nothing was extended
+        for found in (within, partial.take(4)):
+            np.testing.assert_allclose([c.cost for c in found], [c.cost for c in whole.take(len(found))], rtol=1e-9)
+        assert partial.limit == whole.limit and len(partial.taken) == len(whole.taken)
 
 
 @pytest.mark.parametrize(("seed", "cost"), [(700_000, 3.37391), (710_085, 6.06953)])

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -41,9 +42,12 @@ MIN_ENERGY = 1e-4
 MIN_ENERGY_FRACTION = 0.3  # smallest E of a path, relative to its E for a small Phi
 LATTICE_ERROR = 1.07  # relative length error of lattice paths, see `suffices`; at most 1.067 in 200 scenarios
 LIMIT_MARGIN = 1.05  # duration of a step relative to the shortest, at least; the limits leave no freedom at 1
+# Fraction of the excess cost, see REACH, up to which a partial search looks for candidates first. It contains all
+# candidates that may lead to the optimum of most scenarios (see `suffices`), and takes 2/5 of the time.
+PARTIAL = 0.2
 # Nodes within this distance (cells, heading steps) of a candidate belong to it.
 DUPLICATE_CELLS, DUPLICATE_HEADINGS = 2, 3
-# The same for `distinct_from`, which yields paths that differ by more.
+# The same for `take_elsewhere`, whose paths differ by more.
 DISTINCT_CELLS, DISTINCT_HEADINGS = 4, HEADINGS // 2
 
 
@@ -84,15 +88,23 @@ class CandidateSearch:
     Args:
         lattice: the lattice.
         reach: largest cost of a candidate relative to the cheapest, see REACH.
+        partial: whether to search first for candidates that cost little more than the cheapest, and for others only
+            when they are needed. The candidates are the same.
 
     Attributes:
         lattice: the lattice.
         energy: E of the metric; 0 if there is no path.
+        limit: cost up to which candidates are known; a partial search is extended to find others.
+        taken: candidates that `take` has returned.
 
     """
 
-    def __init__(self, lattice: Lattice, reach: float = REACH) -> None:
+    def __init__(self, lattice: Lattice, reach: float = REACH, *, partial: bool = False) -> None:
         self.lattice, self._reach = lattice, reach
+        self._fraction = PARTIAL if partial else 1.0
+        self.limit = math.inf
+        self.taken: list[Candidate] = []
+        self._marked: np.ndarray | None = None
         self._from_start = self._to_goal = Tree(np.empty(0), np.empty(0, dtype=np.int32))
         self._meetings = np.empty(0, dtype=np.int64)
         self.energy = self._first_energy()
@@ -122,14 +134,24 @@ class CandidateSearch:
 
     def candidates(self) -> Iterator[Candidate]:
         """Yield distinct paths in order of cost; none if the goal cannot be reached."""
-        return self._distinct((), DUPLICATE_CELLS, DUPLICATE_HEADINGS)
+        return self._distinct(self._mark_all(()), DUPLICATE_CELLS, DUPLICATE_HEADINGS)
 
-    def distinct_from(self, taken: Iterable[Candidate]) -> Iterator[Candidate]:
-        """Yield paths that are somewhere at least 0.8 m (4 cells of 0.2 m) away from those `taken` and from each other.
+    def take(self, count: int, max_cost: float = math.inf) -> list[Candidate]:
+        """Return the next distinct paths in order of cost: at most `count`, with at most a given cost."""
+        if self._marked is None:
+            self._marked = self._mark_all(())
+        following = self._distinct(self._marked, DUPLICATE_CELLS, DUPLICATE_HEADINGS, max_cost)
+        found = list(islice(following, count))
+        self.taken += found
+        return found
+
+    def take_elsewhere(self, count: int) -> list[Candidate]:
+        """Return paths that are somewhere at least 0.8 m (4 cells of 0.2 m) away from those `taken` and each other.
 
         Most of them pass obstacles on other sides, and cost more.
         """
-        return self._distinct(taken, DISTINCT_CELLS, DISTINCT_HEADINGS)
+        marked = self._mark_all(self.taken, DISTINCT_CELLS, DISTINCT_HEADINGS)
+        return list(islice(self._distinct(marked, DISTINCT_CELLS, DISTINCT_HEADINGS), count))
 
     def random_candidates(self, count: int, rng: np.random.Generator) -> Iterator[Candidate]:
         """Yield shortest paths through random nodes; none if the goal cannot be reached."""
@@ -139,25 +161,24 @@ class CandidateSearch:
         for node in rng.choice(np.flatnonzero(np.isfinite(through)), count):
             yield self._candidate(int(node))
 
-    def suffices(self, cost: float, first: float, last: float) -> bool:
+    def suffices(self, cost: float, last: float) -> bool:
         """Return whether further candidates are unlikely to lead to a cheaper extremal.
 
         For any E, a path of length D in the metric has J >= D - (E - c) T with the time weight c, and equality for an
         extremal of that E. Lattice paths are slightly longer than the extremals close to them, at most by the factor
         LATTICE_ERROR in hundreds of scenarios, and rarely shorter. So no more candidates are needed if the first one is
-        about as short as the best extremal, or if the last one is too long to be close to a cheaper extremal.
+        about as short as the best extremal, or if the others are too long to be close to a cheaper extremal.
 
         Args:
             cost: J of the best extremal.
-            first: cost of the first candidate.
-            last: cost of the last candidate.
+            last: cost up to which all candidates are taken.
 
         """
-        return first >= self._length(cost) / LATTICE_ERROR or self.is_too_long(last, cost)
+        return self.taken[0].cost >= self._length(cost) / LATTICE_ERROR or last >= self.max_cost(cost)
 
-    def is_too_long(self, candidate: float, cost: float) -> bool:
-        """Return whether a candidate is too long to lead to an extremal of less than a given cost; see `suffices`."""
-        return candidate >= self._length(cost) * LATTICE_ERROR
+    def max_cost(self, cost: float) -> float:
+        """Return the cost of a candidate from which it is too long for an extremal of a given J; see `suffices`."""
+        return self._length(cost) * LATTICE_ERROR
 
     def _length(self, cost: float) -> float:
         """Return the length in the metric of an extremal of a given J, at most."""
@@ -166,16 +187,32 @@ class CandidateSearch:
         rest = 0.0 if scenario.horizon is None else (self.energy - scenario.cost.time_weight) * scenario.horizon
         return cost + rest
 
-    def _distinct(self, taken: Iterable[Candidate], cells: int, headings: int) -> Iterator[Candidate]:
-        """Yield paths through nodes that are farther than the given distance from all paths before."""
-        marked = np.zeros(len(self._from_start.cost), dtype=bool)
-        for candidate in taken:
-            self._mark(marked, candidate.nodes, cells, headings)
-        for node in self._meetings:
-            if not marked[node]:
-                candidate = self._candidate(int(node))
+    def _distinct(
+        self, marked: np.ndarray, cells: int, headings: int, max_cost: float = math.inf
+    ) -> Iterator[Candidate]:
+        """Yield paths of at most a given cost through nodes that are not `marked`, and mark those around each."""
+        while True:
+            start = 0
+            while start < len(self._meetings):
+                free = ~marked[self._meetings[start:]]
+                start += int(free.argmax())
+                node = int(self._meetings[start])
+                if marked[node] or self._from_start.cost[node] + self._to_goal.cost[node] > max_cost:
+                    break
+                candidate = self._candidate(node)
                 self._mark(marked, candidate.nodes, cells, headings)
                 yield candidate
+            if self._fraction == 1.0 or self.limit >= max_cost:
+                return
+            self._fraction = 1.0
+            self._grow()
+
+    def _mark_all(self, candidates: Iterable[Candidate], cells: int = 0, headings: int = 0) -> np.ndarray:
+        """Return an array with marks at the nodes within the given distance of candidates."""
+        marked = np.zeros(len(self._from_start.cost), dtype=bool)
+        for candidate in candidates:
+            self._mark(marked, candidate.nodes, cells, headings)
+        return marked
 
     def _first_energy(self) -> float:
         """Estimate E from the shortest path in the plane; 0 if there is none."""
@@ -220,12 +257,13 @@ class CandidateSearch:
         seeds = self.lattice.nodes_around(*scenario.start, metric.plane)
         ends = self.lattice.nodes_around(*scenario.goal, metric.plane)
         bound = cell_costs(metric, seeds)
-        limits = Limits(self._reach, self.slack, math.inf)
+        fraction = self._fraction
+        limits = Limits(1.0 + fraction * (self._reach - 1.0), fraction * self.slack, math.inf)
         grow = tree if self.lattice.moves.rotating and len(metric.speed) == 1 else general_tree
         cost_behind, behind, limit = grow(metric, ends, seeds, bound, False, limits)
         cost_ahead, ahead, _ = grow(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
-        self._meetings = meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit)
+        self._meetings, self.limit = meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit), limit
 
     def _poses(self, nodes: np.ndarray) -> np.ndarray:
         """Return the poses (N + 2, 3) along nodes (N,)."""
@@ -260,7 +298,7 @@ def shortest_durations(poses: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 def best_candidate(lattice: Lattice) -> Candidate | None:
     """Return the cheapest path of a lattice, or None if the goal cannot be reached."""
-    return next(CandidateSearch(lattice).candidates(), None)
+    return next(CandidateSearch(lattice, partial=True).candidates(), None)
 
 
 def cell_costs(metric: Metric, seeds: Nodes) -> np.ndarray:

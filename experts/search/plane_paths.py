@@ -33,7 +33,7 @@ class PlaneSearch(CandidateSearch):
 
     def candidates(self) -> Iterator[Candidate]:
         """Yield distinct paths in order of cost; none if the goal cannot be reached."""
-        return self._distinct((), max(round(DISTINCT_DISTANCE / self.lattice.cell), 1), 0)
+        return self._distinct(self._mark_all(()), max(round(DISTINCT_DISTANCE / self.lattice.cell), 1), 0)
 
     def _grow(self) -> None:
         scenario, metric = self.lattice.scenario, self._metric(self.energy)
