@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 from leapnav.envs import FAMILIES, Obstacle, Polygon, Scenario, ScenarioBank, Unicycle, sample_scenario
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import Status, find_optima, find_optimum
+from leapnav.experts import optimum as optimum_module
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice, Place, is_connected
 
@@ -317,6 +318,22 @@ def test_a_detour_beyond_the_cropped_lattice_is_found():
     optimum = find_optimum(Scenario.from_dict(fields))
     assert optimum.success
     assert optimum.states[:, 1].max() > 32.0
+
+
+def test_a_direct_path_that_has_not_converged_may_lead_to_the_optimum():
+    """Its cost, 5 % higher than that of the best extremal so far, is not reliable."""
+    bank = ScenarioBank.shipped("clutter", "test", "dynamic_unicycle")
+    assert find_optimum(bank[78], alternatives=False).cost == pytest.approx(bank.costs[78], rel=1e-9)
+
+
+def test_lattices_with_margins_are_omitted_if_no_path_is_in_time(monkeypatch):
+    """They help against collisions only; a gap that is closed by a margin is not the reason."""
+    searched = []
+    monkeypatch.setattr(optimum_module, "Lattice", lambda *arguments: searched.append(arguments) or Lattice(*arguments))
+    fields = scenario_fields(obstacles=[], start=[1.0, 5.0, 0.0], goal=[9.0, 5.0, np.pi / 2])
+    found = find_optimum(Scenario.from_dict({**fields, "horizon": 4.2}))
+    assert found.status is not Status.SUCCESS
+    assert [arguments[2] for arguments in searched] == [None, None]
 
 
 @pytest.mark.parametrize(

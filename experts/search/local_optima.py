@@ -42,7 +42,7 @@ SHORT_DISTANCE = 4.0  # m from start to goal; below it, the distance of duplicat
 # Relative error of the cost of a direct path, and of a refined direct path. Among 6,000 refined paths, six exceeded the
 # cost of their extremal by more; these were different extremals from the closest ones.
 DIRECT_ERROR, REFINED_ERROR = 0.01, 0.002
-UNCONVERGED_ERROR = 0.02  # the same for a path whose iteration has not converged
+UNCONVERGED_FACTOR = 10.0  # factor of these errors for a path whose iteration has not converged
 FAILURE_WEIGHT = 4  # evaluations for an expensive path without an extremal count this many times in the budget
 # Free horizon: factor and largest number of lengthenings of a path that the limits make infeasible, largest number of
 # changes of the horizon, and the change after which there is no other.
@@ -220,9 +220,8 @@ class LocalOptima:
 
         """
         clearance = self._clearances(path)
-        if self._is_expensive(path, error) and (clearance.min() <= 0 or self._budget <= 0):
-            return True
-        if not path.converged and self._is_expensive(path, UNCONVERGED_ERROR):
+        is_expensive = self._is_expensive(path, error if path.converged else UNCONVERGED_FACTOR * error)
+        if is_expensive and (clearance.min() <= 0 or self._budget <= 0 or not path.converged):
             return True
         if self._repeats_failure(path, clearance):
             return True
