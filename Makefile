@@ -19,7 +19,8 @@ demo: $(if $(wildcard .venv/installed),.venv/installed,.venv/package)
 compile: .venv/installed
 	$(BIN)/leapnav compile
 
-test: lint types compile .venv/examples
+test: lint .venv/examples
+	$(MAKE) --jobs=2 --output-sync types compile
 	$(PYTEST)
 
 # Long checks, see CONTRIBUTING.md.

@@ -24,8 +24,8 @@ from leapnav.experts.data.banks import build_bank
 ENV_ID, ROUNDS, SECONDS, ROBOTS = "leapnav/Navigate-v0", 7, 1.0, 1024
 RATES = [
     # Name, robots (None: the single environment), arguments, target of the ratio to Pendulum-v1.
-    ("vector, state", ROBOTS, {"observation": "state"}, 25.0),
-    ("vector, 32 lidar beams", ROBOTS, {}, 10.0),
+    ("vector, state", ROBOTS, {"observation": "state"}, 50.0),
+    ("vector, 32 lidar beams", ROBOTS, {}, 45.0),
     ("vector, map", ROBOTS, {"observation": "map"}, None),
     ("vector, state, shaped reward", ROBOTS, {"observation": "state", "reward": "shaped"}, None),
     ("vector, 32 beams, car", ROBOTS, {"robot": "car"}, 10.0),
@@ -35,7 +35,7 @@ RATES = [
     ("vector, state, motors", ROBOTS, {"observation": "state", "actuation": "motor"}, None),
     ("vector, 32 lidar beams, disturbed", ROBOTS, {"disturbance": 0.1}, None),
     ("vector of 16, 32 lidar beams", 16, {}, None),
-    ("single, 32 lidar beams", None, {}, 0.7),
+    ("single, 32 lidar beams", None, {}, 1.0),
     ("single, 32 lidar beams, motors", None, {"actuation": "motor"}, 0.3),
 ]
 
