@@ -263,7 +263,13 @@ class CandidateSearch:
         cost_behind, behind, limit = grow(metric, ends, seeds, bound, False, limits)
         cost_ahead, ahead, _ = grow(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
-        self._meetings, self.limit = meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit), limit
+        self._meetings, self.limit = self._meet(limit), limit
+
+    def _meet(self, limit: float) -> np.ndarray:
+        """Return the nodes at which the trees meet, in order of the cost of the path through them, up to a limit."""
+        to_goal, from_start = self._to_goal, self._from_start
+        nodes, costs = meeting_nodes(from_start.parent, to_goal.parent, from_start.cost, to_goal.cost, limit)
+        return nodes[np.argsort(costs, kind="stable")]  # the same order on every processor
 
     def _poses(self, nodes: np.ndarray) -> np.ndarray:
         """Return the poses (N + 2, 3) along nodes (N,)."""

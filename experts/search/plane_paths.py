@@ -15,7 +15,7 @@ from leapnav.envs.robots.moves import HEADINGS
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.search.candidates import Candidate, CandidateSearch, Tree, cell_costs
 from leapnav.experts.search.lattice import Lattice
-from leapnav.experts.search.shortest_paths import meeting_nodes, plane_parents
+from leapnav.experts.search.shortest_paths import plane_parents
 
 # Cells per side. For a footprint of several discs, the speeds of 16 headings are stored.
 MAX_CELLS, MAX_CELLS_OF_HEADINGS = 1024, 384
@@ -43,7 +43,7 @@ class PlaneSearch(CandidateSearch):
             trees.append(Tree(cost, plane_parents(metric, cost)))
         self._from_start, self._to_goal = trees
         limit = self._reach * float((trees[0].cost + trees[1].cost).min()) + self.slack
-        self._meetings = meeting_nodes(trees[0].parent, trees[1].parent, trees[0].cost, trees[1].cost, limit)
+        self._meetings = self._meet(limit)
 
     def _poses(self, nodes: np.ndarray) -> np.ndarray:
         poses = self.lattice.poses(nodes * HEADINGS)

@@ -282,9 +282,9 @@ def tree(metric, seeds, ends, rest, exact, limits):
     return cost, parent, limit
 
 
-@kernel(INTEGERS(INDICES, INDICES, VECTOR, VECTOR, float64))
+@kernel(tuple_of(INTEGERS, VECTOR)(INDICES, INDICES, VECTOR, VECTOR, float64))
 def meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit):
-    """Return the nodes at which both trees share an edge, in order of the cost of the path through them, up to `limit`.
+    """Return the nodes at which both trees share an edge, and the costs of the paths through them, up to `limit`.
 
     Only there the path through a node is locally shortest; through all other nodes it is a detour. (These nodes are the
     plateaus of alternative routes: I. Abraham et al., Alternative Routes in Road Networks, J. Exp. Algorithmics, 2013.)
@@ -297,8 +297,7 @@ def meeting_nodes(ahead, behind, cost_ahead, cost_behind, limit):
         if total <= limit and (behind[node] < 0 or ahead[behind[node]] == node):
             found[count], through[count] = node, total
             count += 1
-    # Sorted here, because the order in which NumPy puts equal costs depends on the processor.
-    return found[:count][np.argsort(through[:count])]
+    return found[:count], through[:count]
 
 
 @kernel(INTEGERS(int64, INDICES, INDICES))
