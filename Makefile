@@ -27,7 +27,7 @@ test: lint .venv/examples
 test-all: test
 	$(PYTEST) -m "slow"
 	HYPOTHESIS_PROFILE=long $(PYTEST) tests/test_fuzz.py
-	$(BIN)/python scripts/check_banks.py
+	$(BIN)/python scripts/build_banks.py --check
 	$(BIN)/python scripts/check_installations.py
 
 lint: .venv/installed

@@ -28,8 +28,8 @@ from leapnav.experts.transcription.riccati import backward
 
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of the horizon (s)
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
-# With the penalty of `arcs_descent`, full steps are rejected where the dynamics are strongly curved, and 3 % of the paths
-# of a car do not converge; with this one, 0.5 %.
+# With the penalty of `arcs_descent`, full steps are rejected where the dynamics are strongly curved, and 3 % of the
+# paths of a car do not converge; with this one, 0.5 %.
 END_PENALTY, PENALTY = 1e4, 10.0
 MAX_STEP_LENGTHS = 5  # step lengths that the line search tries: 1, 1/2, ...
 MAX_ACTIVE_SETS = 8  # iterations per step that determine the controls at their limits
