@@ -8,6 +8,7 @@ import numpy as np
 from numba import float64, int64, types
 
 from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.numba_internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.shapes.field import (
     ARENA,
@@ -25,6 +26,9 @@ from leapnav.envs.shapes.polygon import polygon_distance
 from leapnav.envs.shapes.records import record_distance, trace_rays
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
+# Up to this number of beams it takes less time to intersect a circle with all of them, in vector instructions, than to
+# find those that may meet it.
+MAX_VECTORISED_BEAMS = 64
 
 
 @kernel(types.UniTuple(int64, 2)(float64, float64, float64, int64))
@@ -82,11 +86,24 @@ def _range_to_polygon(x, y, dx, dy, reach, field, rows, edges):
     return enter if enter <= leave and leave > 0.0 else reach
 
 
+@kernel(NOTHING(float64, float64, float64, float64, VECTOR, VECTOR, VECTOR))
+def _shorten(cx, cy, r, reach, dxs, dys, nearest):
+    """Shorten rays from the origin in the directions (dxs, dys), of lengths `nearest` (m), to the rim of a circle."""
+    for k in range(len(nearest)):
+        along = cx * dxs[k] + cy * dys[k]
+        beside = cx * dys[k] - cy * dxs[k]
+        square = r * r - beside * beside
+        half = math.sqrt(square if square > 0.0 else 0.0)
+        hit = along - half if square > 0.0 and along + half > 0.0 else reach
+        nearest[k] = hit if hit < nearest[k] else nearest[k]
+
+
 @kernel(NOTHING(float64, float64, float64, float64, CONSTANT, float64, MATRIX, MATRIX))
 def scan(x, y, cos, sin, field, reach, beams, scratch):
     """Compute lidar ranges (m).
 
-    Each obstacle is intersected only with the beams that may meet a circle around it.
+    Polygons and other shapes are intersected only with the beams that may meet a circle around them, and so are circles
+    if there are many beams.
 
     Args:
         x, y: position of the lidar (m).
@@ -107,23 +124,23 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         across = (to_right if dx > 0.0 else to_left) / dx if dx != 0.0 else np.inf
         along = (to_top if dy > 0.0 else to_bottom) / dy if dy != 0.0 else np.inf
         first = across if across < along else along
-        dxs[k] = dxs[count + k] = dx
-        dys[k] = dys[count + k] = dy
-        nearest[k] = nearest[count + k] = first if first < reach else reach
-    at = SHAPES
+        dxs[k], dys[k] = dx, dy
+        nearest[k] = first if first < reach else reach
+    # The beams that may meet an obstacle are consecutive, if beam count + k is beam k.
+    selects, at = count > MAX_VECTORISED_BEAMS or field[RECORDS] > 0.0, SHAPES
+    if selects:
+        for k in range(count):
+            dxs[count + k], dys[count + k], nearest[count + k] = dxs[k], dys[k], nearest[k]
     for _ in range(int(field[CIRCLES])):
         cx, cy, r = field[at] - x, field[at + 1] - y, field[at + 2]
         at += 3
         if cx * cx + cy * cy >= (r + reach) ** 2:
             continue
-        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
-        for k in range(first, last):
-            along = cx * dxs[k] + cy * dys[k]
-            beside = cx * dys[k] - cy * dxs[k]
-            square = r * r - beside * beside
-            half = math.sqrt(square if square > 0.0 else 0.0)
-            hit = along - half if square > 0.0 and along + half > 0.0 else reach
-            nearest[k] = hit if hit < nearest[k] else nearest[k]
+        first, last = 0, count
+        if count > MAX_VECTORISED_BEAMS:
+            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
+        size = last - first
+        _shorten(cx, cy, r, reach, part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size))
     for _ in range(int(field[RECORDS])):
         if field[at] < 0.0:
             cx, cy, r = field[at + CENTRE] - x, field[at + CENTRE + 1] - y, field[at + RIM]
@@ -143,7 +160,7 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         for k in range(first, last):
             nearest[k] = min(nearest[k], _range_to_polygon(x, y, dxs[k], dys[k], reach, field, rows, edges))
     for k in range(count):
-        hit = min(nearest[k], nearest[count + k])
+        hit = min(nearest[k], nearest[count + k]) if selects else nearest[k]
         nearest[k] = hit if hit > 0.0 else 0.0
 
 
