@@ -12,7 +12,6 @@ from leapnav.envs.scenarios.files import read_scenarios
 from leapnav.envs.worlds.barn import path_lengths, read_barn, read_cylinders
 from leapnav.envs.worlds.dynobench import read_dynobench
 from leapnav.envs.worlds.movingai import read_movingai_problems, read_scen
-from leapnav.envs.worlds.ros_map import read_ros_map
 from leapnav.envs.worlds.tpcap import convex_parts, read_tpcap
 from leapnav.experts import find_optimum, minimum_time
 from leapnav.training.scoring.barn import barn_score
@@ -117,6 +116,23 @@ def test_problems_on_a_grid_map_are_scenarios(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("2 2 0 0 1 1 1.4", "scen: line 2: expected the size 4 x 4 of free.map, got 2 x 2"),
+        ("8 8 0 0 7 7 9.9", "scen: line 2: expected the size 4 x 4 of free.map, got 8 x 8"),
+        ("4 4 0 0 4 3 4.4", "scen: line 2: goal: expected a cell of the map 4 x 4, got 4 3"),
+        ("4 4 -1 0 3 3 4.4", "scen: line 2: start: expected a cell of the map 4 x 4, got -1 0"),
+    ],
+)
+def test_problems_of_another_map_are_refused(line, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "free.map").write_text("type octile\nheight 4\nwidth 4\nmap\n" + 4 * "....\n")
+    (tmp_path / "scen").write_text(f"version 1\n0 free.map {line}\n")
+    with pytest.raises(ValueError, match=message):
+        read_movingai_problems("free.map", "scen", robot=Unicycle(radius=0.1))
+
+
+@pytest.mark.parametrize(
     ("call", "error", "message"),
     [
         (lambda: read_barn("none"), FileNotFoundError, "none: expected files world_N.world"),
@@ -147,67 +163,6 @@ def test_invalid_files_are_named(call, error, message, tmp_path, monkeypatch):
     (tmp_path / "bad.scen").write_text("version 1\n0 x.map 8 5 0 2 7 2 9.0\n0 x 8 5\n")
     with pytest.raises(error, match=message):
         call()
-
-
-def write_ros_map(folder, gray, **fields):
-    """Write an occupancy grid as the map saver of ROS does."""
-    height, width = gray.shape
-    (folder / "map.pgm").write_bytes(
-        b"P5\n# made for a test\n%d %d\n255\n" % (width, height) + gray.astype("u1").tobytes()
-    )
-    known = {"image": "map.pgm", "resolution": 0.25, "origin": [-2.0, -1.0, 0.0], "negate": 0, **fields}
-    lines = [f"{name}: {value}" for name, value in known.items() if value is not None]
-    (folder / "map.yaml").write_text("\n".join(lines) + "\n")
-    return folder / "map.yaml"
-
-
-def rooms_in_gray():
-    """A map of 40 x 30 cells: two rooms with a door, black walls, and an unknown corner."""
-    gray = np.full((30, 40), 254)
-    gray[[0, -1]] = gray[:, [0, -1]] = 0
-    gray[:, 20] = 0
-    gray[12:18, 20] = 254
-    gray[1:6, 1:6] = 205
-    return gray
-
-
-def test_a_map_of_ros_has_scenarios_between_its_walls(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    path = write_ros_map(tmp_path, rooms_in_gray())
-    grid = read_ros_map(path)
-    assert grid.arena == (-2.0, -1.0, 8.0, 6.5) and grid.blocked[3, 3] and not grid.blocked[14, 20]
-    assert not read_ros_map(path, unknown="free").blocked[3, 3]
-    inverted = write_ros_map(tmp_path, 255 - rooms_in_gray(), negate=1, occupied_thresh=0.65, free_thresh=0.196)
-    assert (read_ros_map(inverted).blocked == grid.blocked).all()
-    assert len(grid.obstacles()) < 12
-    assert main(["import", "ros-map", "map.yaml", "--count", "3", "--out", "lab"]) == 0
-    scenarios = read_scenarios("lab")
-    assert [scenario.name for scenario in scenarios] == ["map-0", "map-1", "map-2"]
-    for scenario in scenarios:
-        optimum = find_optimum(scenario)
-        assert optimum.success and scenario.arena == grid.arena
-        column, line = ((optimum.states[:, :2] - (-2.0, -1.0)) / 0.25).astype(int).T
-        assert not grid.blocked[29 - line, column].any()
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"resolution": None}, "map.yaml: resolution: expected a number, got None"),
-        ({"resolution": -1}, "map.yaml: resolution: expected a positive number, got -1"),
-        ({"origin": [0, 0, 0.5]}, "map.yaml: origin: expected a map that is not rotated, got the yaw 0.5"),
-        ({"origin": "here"}, "map.yaml: origin: expected 2 or 3 numbers, got 'here'"),
-        ({"mode": "raw"}, "map.yaml: mode: expected trinary or scale, got 'raw'"),
-        ({"image": "map.yaml"}, "map.yaml: not an image"),
-        ({"image": "none.pgm"}, "none.pgm: no such file; it is the image of"),
-        ({"free_thresh": "low"}, "map.yaml: free_thresh: expected a number, got 'low'"),
-        ({"image": "[1"}, "map.yaml: not valid YAML"),
-    ],
-)
-def test_an_invalid_map_of_ros_is_named(fields, message, tmp_path):
-    path = write_ros_map(tmp_path, rooms_in_gray(), **fields)
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        read_ros_map(path)
 
 
 DYNO_MODEL = """dynamics: {dynamics}

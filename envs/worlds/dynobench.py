@@ -8,10 +8,8 @@ the repository https://github.com/quimortiz/dynobench (MIT licence), in the dire
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from leapnav.envs.robots import Unicycle, box_footprint
 from leapnav.envs.scenarios.cost import Cost
@@ -133,8 +131,7 @@ def _durations(folder: Path, dt: float) -> dict[str, float]:
     found: dict[str, float] = {}
     for path in sorted(folder.glob(f"*{SOLUTION}*.yaml")):
         fields = read_yaml(path)
-        values: Mapping[str, Any] = fields.values
-        if values.get("feasible"):
+        if fields.flag("feasible", False):
             planner = path.stem.partition(SOLUTION)[0]
             found[planner] = round(dt * (len(fields.list("states")) - 1), 6)
     return found

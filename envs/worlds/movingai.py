@@ -15,6 +15,7 @@ from typing import Any
 
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.families import REFERENCE_SPEED
+from leapnav.envs.scenarios.maps import read_movingai
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.utils.validation import check_at_least, check_positive
 
@@ -62,14 +63,19 @@ def read_movingai_problems(
     Raises:
         OSError: a file cannot be read.
         ScenarioError: the robot does not fit into a start or goal cell.
-        ValueError: a file or an argument is invalid; the message names the file and the line, or the argument.
+        ValueError: a file or an argument is invalid, or the scenario file is for a map of another size; the message
+            names the file and the line, or the argument.
 
     """
     if count is not None:
         check_at_least("count", count, 1)
     check_positive("cell_size", cell_size)
     body = check_robot(robot)
-    problems = [problem for problem in read_scen(scen_file) if problem.start != problem.goal]
+    problems = read_scen(scen_file)
+    height, width = read_movingai(map_file).shape
+    for problem in problems:
+        _check_size(problem, width, height, map_file, scen_file)
+    problems = [problem for problem in problems if problem.start != problem.goal]
     if count is not None and count < len(problems):
         problems = [problems[i * len(problems) // count] for i in range(count)]
     return [_scenario(map_file, problem, cell_size, body) for problem in problems]
@@ -103,6 +109,25 @@ def read_scen(path: str | os.PathLike[str]) -> list[GridProblem]:
                 f"{path}: line {number}: expected bucket, map, width, height, start, goal and length, got {line[:80]!r}"
             ) from None
     return problems
+
+
+def _check_size(
+    problem: GridProblem,
+    width: int,
+    height: int,
+    map_file: str | os.PathLike[str],
+    scen_file: str | os.PathLike[str],
+) -> None:
+    """Raise ValueError if a problem is for a map of another size, or its cells are not on the map."""
+    place = f"{scen_file}: line {problem.line}"
+    if (problem.width, problem.height) != (width, height):
+        raise ValueError(
+            f"{place}: expected the size {width} x {height} of {map_file}, got {problem.width} x {problem.height}; "
+            "scaled maps are not supported"
+        )
+    for name, (column, line) in (("start", problem.start), ("goal", problem.goal)):
+        if not (0 <= column < width and 0 <= line < height):
+            raise ValueError(f"{place}: {name}: expected a cell of the map {width} x {height}, got {column} {line}")
 
 
 def _scenario(map_file: str | os.PathLike[str], problem: GridProblem, cell_size: float, robot: RobotModel) -> Scenario:

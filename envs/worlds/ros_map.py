@@ -1,11 +1,14 @@
 """Occupancy grids of ROS: an image and a YAML file, as the map server of ROS reads them.
 
-The format is described at https://wiki.ros.org/map_server (ROS 1) and in the documentation of Nav2 (ROS 2).
+The format is described at https://wiki.ros.org/map_server (ROS 1) and in the documentation of Nav2 (ROS 2). Where the
+two differ, this module follows Nav2.
 """
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +24,13 @@ from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 from leapnav.envs.utils.validation import check_at_least, check_choice
-from leapnav.envs.worlds.yaml_files import read_yaml
+from leapnav.envs.worlds.yaml_files import YamlFields, read_yaml
 
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # defaults of the map server
 UNKNOWN = ("occupied", "free")  # what unknown cells count as
+UNKNOWN_GRAY = 205  # of 255: the value that map savers write for an unknown cell in the mode trinary
+MAX_SHALLOW, MAX_DEEP = 255, 65535  # white, with 8 and 16 bits per channel
+MAX_YAW = 1e-4  # rad: a rotation that moves a corner by 1 cm at 100 m, less than a cell; yaws are rounded in files
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +66,13 @@ class GridMap:
 def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> GridMap:
     """Read an occupancy grid.
 
-    With the occupancy p = (255 - gray) / 255 of a cell, or gray / 255 if `negate` is set, a cell is occupied if p is
-    above `occupied_thresh`, free if p is below `free_thresh`, and unknown otherwise.
+    The gray value g of a cell is the mean of its red, green and blue, from 0 (black) to 1; in the mode trinary, of its
+    opacity, too, if the image has one. With the occupancy p = 1 - g, or g if `negate` is set, a cell is occupied if p
+    is above `occupied_thresh`, otherwise free if p is below `free_thresh`, and otherwise unknown. In the mode scale,
+    a cell that is not opaque is unknown.
 
     Args:
-        path: the YAML file; its image is beside it.
+        path: the YAML file; its image, with 8 or 16 bits per channel, is beside it.
         unknown: what unknown cells count as, "occupied" or "free".
 
     Raises:
@@ -72,6 +80,10 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
         ValueError: a field is missing or invalid, the map is rotated, its mode is "raw", or the image cannot be read;
             the message names the file and the field.
         ModuleNotFoundError: PyYAML is not installed.
+
+    Warns:
+        UserWarning: the yaw is not a number and is read as 0, or cells with the gray value of unknown cells are below
+            `free_thresh` and are read as free.
 
     """
     check_choice("unknown", unknown, UNKNOWN)
@@ -82,18 +94,28 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
     resolution = fields.number("resolution")
     if not resolution > 0:
         raise ValueError(f"{path}: resolution: expected a positive number, got {resolution}")
-    origin = fields.numbers("origin", 2, 3)
-    if len(origin) == 3 and origin[2] != 0:
-        raise ValueError(f"{path}: origin: expected a map that is not rotated, got the yaw {origin[2]}")
+    origin = _origin(fields)
     mode = fields.values.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
         raise ValueError(f"{path}: mode: expected trinary or scale, got {mode!r}")
-    gray = _read_image(path, fields.text("image"))
-    occupancy = gray if fields.values.get("negate", 0) else 1.0 - gray
-    occupied = occupancy > fields.number("occupied_thresh", OCCUPIED_THRESHOLD)
-    free = occupancy < fields.number("free_thresh", FREE_THRESHOLD)
+    occupied_threshold = _threshold(fields, "occupied_thresh", OCCUPIED_THRESHOLD)
+    free_threshold = _threshold(fields, "free_thresh", FREE_THRESHOLD)
+    negate = fields.flag("negate", False)
+    gray, is_opaque = _read_image(path, fields.text("image"), mode)
+    occupancy = gray if negate else 1.0 - gray
+    occupied = occupancy > occupied_threshold
+    free = (occupancy < free_threshold) & ~occupied
+    if mode == "scale":
+        occupied, free = occupied & is_opaque, free & is_opaque
+    doubtful = int((free & (gray == UNKNOWN_GRAY / 255)).sum())
+    if doubtful and unknown == "occupied" and mode == "trinary" and not negate:
+        warnings.warn(
+            f"{path}: free_thresh: {doubtful} cells with the gray value {UNKNOWN_GRAY}, which map savers write for "
+            f"unknown cells, are read as free; free_thresh: {FREE_THRESHOLD} reads them as unknown",
+            stacklevel=2,
+        )
     blocked = ~free if unknown == "occupied" else occupied
-    return GridMap(path.stem, blocked, resolution, (origin[0], origin[1]))
+    return GridMap(path.stem, blocked, resolution, origin)
 
 
 def sample_on_map(
@@ -116,8 +138,26 @@ def sample_on_map(
     return [sample_scenario(family, seed + i, robot, horizon) for i in range(count)]
 
 
-def _read_image(path: Path, name: str) -> np.ndarray:
-    """Return the gray values (height, width) of the image of a map, from 0 (black) to 1."""
+def _origin(fields: YamlFields) -> tuple[float, float]:
+    """Return the position of the lower left corner (m), if the map is not rotated."""
+    origin = fields.numbers("origin", 2, 3, finite=2)
+    yaw = origin[2] if len(origin) == 3 else 0.0
+    if math.isnan(yaw):
+        warnings.warn(f"{fields.place}: origin: the yaw is not a number and is read as 0", stacklevel=3)
+    elif math.isinf(yaw) or abs(math.remainder(yaw, 2 * math.pi)) > MAX_YAW:
+        raise ValueError(f"{fields.place}: origin: expected a map that is not rotated, got the yaw {yaw}")
+    return origin[0], origin[1]
+
+
+def _threshold(fields: YamlFields, name: str, default: float) -> float:
+    value = fields.number(name, default)
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(f"{fields.place}: {name}: expected a number from 0 to 1, got {value}")
+    return value
+
+
+def _read_image(path: Path, name: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gray values (height, width) of the image of a map, from 0 (black) to 1, and whether it is opaque."""
     from PIL import Image, UnidentifiedImageError
 
     file = path.parent / name
@@ -125,6 +165,19 @@ def _read_image(path: Path, name: str) -> np.ndarray:
         raise FileNotFoundError(f"{file}: no such file; it is the image of {path}")
     try:
         with Image.open(file) as image:
-            return np.asarray(image.convert("L"), dtype=float) / 255
-    except (UnidentifiedImageError, OSError, ValueError) as error:
+            has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            is_deep = image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM"))
+            if image.mode in ("I", "F") and not is_deep:
+                raise ValueError(f"expected 8 or 16 bits per channel, got the mode {image.mode}")
+            if is_deep and has_alpha:
+                raise ValueError("a transparent gray value of 16 bits is not supported")
+            if not is_deep:  # this would clip 16 bits
+                image = image.convert("RGBA" if has_alpha else "L" if image.mode in ("1", "L") else "RGB")
+            values = np.asarray(image).reshape(image.height, image.width, -1)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise ValueError(f"{file}: not an image: {error}") from None
+    colors = values if mode == "trinary" else values[..., :3]
+    maximum = MAX_DEEP if is_deep else MAX_SHALLOW
+    gray = colors.sum(axis=2, dtype=np.int64) / (colors.shape[2] * maximum)
+    is_opaque = values[..., 3] == maximum if has_alpha else np.ones(gray.shape, dtype=bool)
+    return gray, is_opaque

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+# Numbers that YAML 1.2 and ROS read, but PyYAML, which implements YAML 1.1, reads as text: 5e-2, nan, and quoted ones.
+_NUMBER = re.compile(r"[-+]?((\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|\.?(nan|NaN|NAN|inf|Inf|INF))")
+_FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
 @dataclass(frozen=True)
@@ -32,17 +37,29 @@ class YamlFields:
     def number(self, name: str, default: float | None = None) -> float:
         """Return a finite number."""
         value = self.values.get(name, default)
-        if not _is_number(value):
+        number = _as_number(value)
+        if number is None or not math.isfinite(number):
             raise ValueError(f"{self.place}: {name}: expected a number, got {value!r}")
-        return float(value)
+        return number
 
-    def numbers(self, name: str, *counts: int) -> list[float]:
-        """Return a list of finite numbers, whose length is one of `counts`."""
+    def numbers(self, name: str, *counts: int, finite: int | None = None) -> list[float]:
+        """Return a list of numbers, whose length is one of `counts`; the first `finite`, by default all, are finite."""
         value = self._get(name)
-        if not isinstance(value, list) or len(value) not in counts or not all(map(_is_number, value)):
+        found = [_as_number(item) for item in value] if isinstance(value, list) else []
+        numbers = [number for number in found if number is not None]
+        is_valid = len(numbers) == len(found) and len(found) in counts and all(map(math.isfinite, numbers[:finite]))
+        if not is_valid:
             expected = " or ".join(map(str, counts))
             raise ValueError(f"{self.place}: {name}: expected {expected} numbers, got {value!r}")
-        return [float(item) for item in value]
+        return numbers
+
+    def flag(self, name: str, default: bool) -> bool:
+        """Return a truth value: a bool, 0 or 1, or one of these in quotes."""
+        value = self.values.get(name, default)
+        known = _FLAGS.get(value.lower(), _as_number(value)) if isinstance(value, str) else value
+        if known not in (0, 1):
+            raise ValueError(f"{self.place}: {name}: expected 0 or 1, got {value!r}")
+        return bool(known)
 
     def list(self, name: str) -> list[Any]:
         """Return a list."""
@@ -87,5 +104,8 @@ def read_yaml(path: str | os.PathLike[str]) -> YamlFields:
     return YamlFields(str(path), fields)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+def _as_number(value: Any) -> float | None:
+    """Return a number, or a text that is one, as a float; None if it is neither."""
+    if isinstance(value, str) and _NUMBER.fullmatch(value.strip()):
+        return float(value.strip().lower().replace(".nan", "nan").replace(".inf", "inf"))
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None

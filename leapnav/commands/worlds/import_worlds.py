@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,7 +87,11 @@ class ImportRosMap:
         """Write the scenario files."""
         from leapnav.envs.worlds.ros_map import read_ros_map, sample_on_map
 
-        grid = read_ros_map(self.file, unknown=self.unknown)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            grid = read_ros_map(self.file, unknown=self.unknown)
+        for warning in caught:
+            print(f"leapnav: warning: {warning.message}", file=sys.stderr)
         return _write(sample_on_map(grid, self.count, seed=self.seed, robot=self.robot, horizon=self.horizon), self.out)
 
 
