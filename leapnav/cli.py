@@ -83,8 +83,6 @@ def main(arguments: list[str] | None = None) -> int:
 
     """
     command = None
-    if "" not in sys.path:
-        sys.path.append("")  # a console script does not search the current directory for a family module:function
     try:
         words = sys.argv[1:] if arguments is None else arguments
         command = parse_or_explain(parse, words, tuple(COMMANDS))

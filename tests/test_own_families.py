@@ -129,6 +129,21 @@ def test_the_command_line_finds_modules_in_the_current_directory(module, tmp_pat
         assert ScenarioBank(out)[0].name == "warehouse_pillar-0-0"
 
 
+def test_modules_are_searched_in_the_current_directory_only_for_a_family_of_a_module(tmp_path, monkeypatch, capsys):
+    (tmp_path / "depot.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    known = [folder for folder in sys.path if folder not in ("", str(tmp_path))]
+    monkeypatch.setattr(sys, "path", known.copy())
+    assert main(["completion", "bash"]) == 0 and main(["bank", "show", "missing.bank"]) == 2
+    assert main(["evaluate", "go-to-goal", "--family", "nowhere:pillar"]) == 2
+    assert "cannot import the module 'nowhere'" in capsys.readouterr().err
+    assert sys.path == known
+    assert main(["evaluate", "go-to-goal", "--family", "depot:pillar"]) == 2
+    assert "build a bank of another family" in capsys.readouterr().err
+    assert sys.path == [*known, str(tmp_path)]
+    sys.modules.pop("depot")
+
+
 def test_without_a_bank_the_command_says_how_to_make_one(module, capsys):
     assert main(["evaluate", "go-to-goal", "--family", module]) == 2
     message = "got 'warehouse:pillar'; build a bank of another family with leapnav bank build, and pass it as bank"

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -98,7 +100,8 @@ def _stored(file: str) -> Sequence[Scenario]:
 def register_family(name: str, sample: Sample) -> None:
     """Register a family of scenarios under a name, which is accepted wherever a built-in family is.
 
-    A function in a module need not be registered: its family is "module:function".
+    A function in a module need not be registered: its family is "module:function". The module is imported; if Python
+    does not find it, the current directory is appended to `sys.path`.
 
     Args:
         name: letters, digits and underscores.
@@ -156,7 +159,7 @@ def _import(name: str) -> Sample:
     """Return the function that is named as module:function."""
     module, _, function = name.partition(":")
     try:
-        sample = getattr(import_module(module), function)
+        sample = getattr(_import_module(module), function)
     except ImportError as error:
         raise ValueError(f"family: {name!r}: cannot import the module {module!r}: {error}") from None
     except AttributeError:
@@ -164,6 +167,22 @@ def _import(name: str) -> Sample:
     if not callable(sample):
         raise ValueError(f"family: {name!r} is not a function, but a {type(sample).__name__}")
     return cast(Sample, sample)
+
+
+def _import_module(name: str) -> ModuleType:
+    """Import a module; one that Python does not find otherwise is searched in the current directory."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        folder = str(Path.cwd())
+        if folder in sys.path or "" in sys.path:
+            raise
+        sys.path.append(folder)  # stays there for imports in functions of the module, and for worker processes
+        try:
+            return import_module(name)
+        except BaseException:
+            sys.path.remove(folder)
+            raise
 
 
 def check_family(family: object) -> None:
