@@ -42,9 +42,7 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Hold an action for one control period, see `NavigateEnv.step`; the reward is that of `compute_reward`."""
-        playing = bool(self._playing[0])
         observation, _, terminated, truncated, info = super().step(action)
         info["terminated"], info["at_horizon"] = terminated, self._simulator.at_horizon(0)
-        reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
-        reward = float(reward) if playing else 0.0
+        reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info))
         return observation, reward, terminated, truncated, info

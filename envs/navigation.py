@@ -14,7 +14,7 @@ from leapnav.envs.keys import keys_to_action
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
+from leapnav.envs.scenarios.sources import ScenarioSource, WithSpec, get_scenario
 from leapnav.envs.settings import Disturbance, EnvironmentSettings, Motor
 from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 NOISE_STREAM = 1  # of the environment's seed; the stream of the scenarios is the seed itself
 
 
-class NavigateEnv(gym.Env[Any, np.ndarray]):
+class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`spec` is a property)
     r"""A wheeled robot drives to a goal pose among obstacles, in a fixed or a free time and at minimum cost.
 
     ## Description
@@ -180,7 +180,8 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
     ## Errors
     `ValueError` for an invalid argument; the message states its name and value. `ScenarioError`, a `ValueError`, for an
     invalid `scenario`. `FileNotFoundError` if the file of `bank` does not exist. `BankError`, a `ValueError`, if it is
-    not a bank or has another format version.
+    not a bank or has another format version. `ResetNeeded` for a step before the first reset or after the end of an
+    episode.
 
     ## Version history
     * v0: initial version.
@@ -298,15 +299,17 @@ class NavigateEnv(gym.Env[Any, np.ndarray]):
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Hold an action for one control period. After the end of an episode, the robot stays and the reward is 0.
+        """Hold an action for one control period.
 
         Raises:
-            ResetNeeded: before the first reset.
-            ValueError: the action is not two finite numbers; the state is unchanged then.
+            ResetNeeded: before the first reset, or after the end of an episode; the state is unchanged then.
+            ValueError: the action is not m finite numbers; the state is unchanged then.
 
         """
         if self._choice is None:
             raise gym.error.ResetNeeded("reset the environment before the first step")
+        if not self._playing[0]:
+            raise gym.error.ResetNeeded("the episode has ended; reset the environment before the next step")
         values = check_actions(action, self._action_shape)
         self._simulator.step(values.reshape(1, -1), self._playing)
         if self.render_mode is not None:

@@ -22,6 +22,7 @@ from leapnav.envs.scenarios.sources import (
     LevelOutcome,
     LevelSampler,
     ScenarioSource,
+    WithSpec,
     check_sampler,
     draw_level,
     get_scenario,
@@ -46,7 +47,7 @@ else:
             DISABLED = "Disabled"
 
 
-class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
+class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # type: ignore[misc] (`spec` is a property)
     """`NavigateEnv` for many robots. The episodes of each are identical to those of a single environment.
 
     Infos are arrays with masks, as in Gymnasium; `pose` is (num_envs, 3). With a bank, the infos of a reset contain
@@ -55,7 +56,8 @@ class NavigateVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     Args:
         num_envs: number of robots.
         family, scenario, split, bank, robot, horizon: see `NavigateEnv`.
-        sampler: chooses the scenario of the bank for each episode, and is told its outcome; needs a bank.
+        sampler: chooses the scenario of the bank for each episode, and is told its outcome; needs a bank. The `spec` of
+            an environment with a sampler has no form in JSON.
         autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
             next one. "SameStep": the last step starts the next episode, and `infos["final_obs"]` and
             `infos["final_info"]` describe the end. "Disabled": `reset(options={"reset_mask": mask})` starts it.

@@ -54,7 +54,8 @@ def test_an_episode_terminates_at_the_goal_and_its_return_is_the_cost():
     assert last.info["reward_parts"]["time"] == pytest.approx(-0.5 * 0.05)
     optimum = find_reached_optimum(env.scenario, env.state, last.info["cost"])
     assert optimum.cost == pytest.approx(last.info["cost"])
-    assert env.step(AHEAD)[1] == 0.0  # after the end
+    with pytest.raises(gym.error.ResetNeeded):  # after the end
+        env.step(AHEAD)
 
 
 def test_an_episode_is_truncated_at_the_time_limit_without_a_penalty():

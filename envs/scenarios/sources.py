@@ -5,8 +5,9 @@ from __future__ import annotations
 import operator
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,8 +16,11 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS
+from leapnav.envs.settings import HORIZONS, Disturbance, Motor
 from leapnav.envs.utils.validation import check_choice, is_integer
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
 
 SPLITS = ("train", "test", "fresh")
 DEFAULT_FAMILY = "clutter"
@@ -231,3 +235,47 @@ def draw_level(source: ScenarioSource, sampler: LevelSampler | None, rng: np.ran
     if not 0 <= index < count:
         raise IndexError(f"sampler: expected an index of the {count} scenarios of the bank, got {index}")
     return index
+
+
+class WithSpec:
+    """Mixin of the environments, single and vector: a `spec` that `EnvSpec.to_json` can write.
+
+    The objects among the arguments, such as a scenario or a robot, are stored in the form of dicts and names, which the
+    environments accept as well.
+    """
+
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification with which `gymnasium.make` has created the environment, or None."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = None if spec is None else replace(spec, kwargs=to_json_value(spec.kwargs))
+
+
+def to_json_value(value: Any) -> Any:
+    """Return an argument of an environment as a value of JSON that has the same meaning for the environment."""
+    match value:
+        case Scenario():
+            return value.to_dict()
+        case RobotModel():
+            return value.model_dump(mode="json", exclude_none=True)
+        case Disturbance() | Motor():
+            return to_json_value(asdict(value))
+        case ScenarioBank():
+            return str(value.path)
+        case os.PathLike():
+            return os.fspath(value)
+        case Enum():
+            return value.value
+        case np.generic():
+            return value.item()
+        case Mapping():
+            return {key: to_json_value(item) for key, item in value.items()}
+        case list() | tuple():
+            return [to_json_value(item) for item in value]
+        case _:
+            return value
