@@ -13,7 +13,7 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import check_family, families_of
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
-from leapnav.training.scoring.results import Evaluation
+from leapnav.training.scoring.results import Evaluation, bank_identity
 from leapnav.training.scoring.scores import Score, score
 
 if TYPE_CHECKING:
@@ -39,6 +39,20 @@ class Comparison:
     def families(self) -> tuple[str, ...]:
         """The families of the banks."""
         return tuple(dict.fromkeys(bank.family for bank in self.banks))
+
+    @property
+    def bank_names(self) -> tuple[str, ...]:
+        """Names of the banks that differ from each other: the family, with the file if the family has several banks."""
+        forms = [
+            lambda bank: bank.family,
+            lambda bank: f"{bank.family} ({bank.path.name})",
+            lambda bank: f"{bank.family} ({bank.path})",
+        ]
+        rows = [[form(bank) for form in forms] for bank in self.banks]
+        return tuple(
+            next((name for k, name in enumerate(row) if sum(other[k] == name for other in rows) == 1), row[-1])
+            for row in rows
+        )
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a pandas data frame with one row per episode: policy, run, and the columns of `Episode.to_dict`.
@@ -66,13 +80,15 @@ class Comparison:
         """Compute the rows of the table."""
         return [score(name, runs, self.seed) for name, runs in self.runs.items()]
 
-    def of(self, family: str) -> Comparison:
-        """Return the comparison restricted to one family."""
+    def of(self, part: str | ScenarioBank) -> Comparison:
+        """Return the comparison restricted to one family, or to one of the banks."""
+        banks = tuple(bank for bank in self.banks if part in (bank, bank.family))
+        identities = {bank_identity(bank) for bank in banks}
         runs = {
-            name: [replace(run, episodes=tuple(e for e in run if e.family == family)) for run in evaluations]
+            name: [replace(run, episodes=tuple(e for e in run if e.bank in identities)) for run in evaluations]
             for name, evaluations in self.runs.items()
         }
-        return Comparison(tuple(bank for bank in self.banks if bank.family == family), runs, self.seed)
+        return Comparison(banks, runs, self.seed)
 
 
 # A policy to compare: a name, an object or a function (see `evaluate`), one of these with the arguments of its
@@ -206,9 +222,16 @@ def compare_policies(
         progress: show progress bars.
 
     Raises:
-        ValueError: see `group_by_row` and `evaluate`.
+        ValueError: a bank is given twice, or see `group_by_row` and `evaluate`.
 
     """
+    given: dict[str, ScenarioBank] = {}
+    for bank in banks:
+        other = given.setdefault(bank_identity(bank), bank)
+        if other is not bank:
+            raise ValueError(f"banks: expected different ones, got the same content in {other.path} and {bank.path}")
+    if len(given) < len(banks):
+        raise ValueError("banks: expected different ones, got the same bank more than once")
     runs: dict[str, list[Evaluation]] = {}
     for row, members in group_by_row(specs).items():
         runs[row] = []

@@ -20,7 +20,7 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.utils.colors import FAILURE, OPTIMUM
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.decisions import Decisions, decisions_of, level_regrets
-from leapnav.training.scoring.results import Evaluation
+from leapnav.training.scoring.results import Evaluation, bank_identity, bank_of
 
 N_SHOWN = 8  # episodes in a picture
 COLOR_MAP = "viridis_r"
@@ -40,7 +40,7 @@ def costliest_decisions(
 
     Args:
         evaluation: the episodes.
-        banks: their banks, of different families.
+        banks: their banks.
         count: number of episodes.
         workers: number of processes for the searches.
         progress: show a progress bar.
@@ -49,7 +49,7 @@ def costliest_decisions(
     order = np.argsort(-level_regrets(evaluation), kind="stable")[:count]
     found: list[Decisions] = []
     for bank in banks:
-        chosen = tuple(e for e in (evaluation.episodes[i] for i in order) if e.family == bank.family)
+        chosen = tuple(e for e in (evaluation.episodes[i] for i in order) if e.bank == bank_identity(bank))
         part = replace(evaluation, episodes=chosen)
         found += decisions_of(part, bank, workers=workers, progress=progress)
     return sorted(found, key=lambda one: -float(one.regrets.sum()))
@@ -120,7 +120,7 @@ def _before_loss(decisions: Decisions) -> np.ndarray:
 def _draw_decisions(axes: Any, banks: Sequence[ScenarioBank], decisions: Decisions, scale: Normalize) -> None:
     """Draw an episode with its optimum (dashed), the path coloured by the regret, red after the loss."""
     episode = decisions.episode
-    bank = next(bank for bank in banks if bank.family == episode.family)
+    bank = bank_of(episode, banks)
     draw_scenario(axes, bank[episode.index])
     axes.plot(*bank.states(episode.index)[:, :2].T, color=OPTIMUM, linewidth=1.0, linestyle="--")
     ordinary = _before_loss(decisions)

@@ -27,7 +27,7 @@ from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
-from leapnav.training.scoring.results import Episode, Evaluation
+from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.threads import limit_threads
 
 BATCH_SIZE = 256  # episodes simulated in parallel
@@ -224,6 +224,7 @@ def _make_episode(
     scenario, reference = bank[index], bank.reference(index)
     return Episode(
         family=bank.family,
+        bank=bank_identity(bank),
         index=index,
         scenario=scenario.name,
         success=success,

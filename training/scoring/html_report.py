@@ -31,8 +31,16 @@ from leapnav.training.config import RunConfig, own_bank, read_config
 from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
 from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
-from leapnav.training.scoring.reports import COLUMNS, NEGATIVE_REGRET, cell, draw_profiles, plot_episodes, row_name
-from leapnav.training.scoring.results import Episode, Evaluation
+from leapnav.training.scoring.reports import (
+    COLUMNS,
+    NEGATIVE_REGRET,
+    cell,
+    draw_profiles,
+    plot_episodes,
+    row_name,
+    sampled,
+)
+from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 
 BASELINES = ("expert", "go-to-goal", "random")  # in the order of the table
 CLEARANCE_BINS = (0.0, 0.05, 0.1, 0.2, math.inf)  # bin edges of the optimum's clearance (m)
@@ -111,14 +119,17 @@ def write_report(
 
 def _banks(specs: Sequence[PolicySpec], families: Sequence[str], records: Sequence[_RunRecord]) -> list[ScenarioBank]:
     """Return the test banks of families: the included ones, or those in the directories of the runs."""
-    found: dict[str, Path] = {}
+    found: dict[str, ScenarioBank] = {}  # by their identity: runs can have the same bank, or different ones of a family
+    own_families = set()
     for name in families:
         for record in records:
-            config, bank = record.config, own_bank(Path(record.spec.name), record.config.family, name)
-            if name not in ScenarioBank.shipped_families(config.robot, config.horizon) and bank.exists():
-                found[name] = bank
-    included = included_banks(specs, [name for name in families if name not in found])
-    return [*included, *map(ScenarioBank, found.values())]
+            config, path = record.config, own_bank(Path(record.spec.name), record.config.family, name)
+            if name not in ScenarioBank.shipped_families(config.robot, config.horizon) and path.exists():
+                bank = ScenarioBank(path)
+                found.setdefault(bank_identity(bank), bank)
+                own_families.add(name)
+    included = included_banks(specs, [name for name in families if name not in own_families])
+    return [*included, *found.values()]
 
 
 def _report_families(family: str | None, records: Sequence[_RunRecord]) -> list[str]:
@@ -162,7 +173,7 @@ def _write_page(
         date=datetime.now().astimezone().strftime("%Y-%m-%d"),
         episodes=scores[0].episodes,
         families=families,
-        resampled="the runs" if any(row.runs > 1 for row in scores) else "the scenarios",
+        sampled=sampled(scores),
         columns=[title.replace("\n", " ").strip() for title, *_ in COLUMNS] + ["time ms"],
         rows=[
             {
@@ -251,13 +262,19 @@ def _draw_curve(axes: Axes, records: Sequence[_RunRecord], axis: str, measure: s
 
 
 def _success_tables(comparison: Comparison) -> list[dict[str, Any]]:
-    """Tabulate the success rate by family, by the optimum's clearance, and by whether the optimum reverses."""
+    """Tabulate the success rate by family or bank, by the optimum's clearance, and by whether the optimum reverses."""
     bins = [
         (f"{low:g} to {high:g} m" if math.isfinite(high) else f"over {low:g} m", low, high)
         for low, high in pairwise(CLEARANCE_BINS)
     ]
     groupings: list[tuple[str, dict[str, Callable[[Episode], bool]]]] = [
-        ("by family", {family: lambda e, family=family: e.family == family for family in comparison.families}),
+        (
+            "by family" if len(comparison.families) == len(comparison.banks) else "by bank",
+            {
+                name: lambda e, identity=identity: e.bank == identity
+                for name, identity in zip(comparison.bank_names, map(bank_identity, comparison.banks), strict=True)
+            },
+        ),
         (
             "by clearance",
             {name: lambda e, low=low, high=high: low <= e.reference_clearance < high for name, low, high in bins},

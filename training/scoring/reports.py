@@ -24,7 +24,7 @@ from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.barn import BarnScore
 from leapnav.training.scoring.comparison import Comparison
-from leapnav.training.scoring.results import Episode
+from leapnav.training.scoring.results import Episode, bank_identity, bank_of
 from leapnav.training.scoring.scores import Bracket, Interval, Score, profile
 
 RATIOS = np.concatenate([np.linspace(1.0, 1.2, 81), np.linspace(1.2, 2.0, 41)[1:]])  # of the profiles
@@ -46,12 +46,11 @@ N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal;
 
 
 def print_scores(comparison: Comparison, console: Console | None = None) -> None:
-    """Print the table of the policies with 95 % bootstrap intervals, and for several families a table by family."""
+    """Print the table of the policies with 95 % intervals, and for several banks a table by bank."""
     console = console or Console()
     scores = comparison.scores()
-    resampled = "the runs" if any(row.runs > 1 for row in scores) else "the scenarios"
     table = Table(
-        title=f"{scores[0].episodes} scenarios; brackets: 95 % bootstrap interval over {resampled}",
+        title=f"{scores[0].episodes} scenarios; brackets: 95 % interval over {sampled(scores)}",
         box=box.SIMPLE_HEAD,
         padding=0,
         pad_edge=False,
@@ -70,8 +69,13 @@ def print_scores(comparison: Comparison, console: Console | None = None) -> None
         console.print("Cost above the true optimal cost of the scenario, between proved limits (medians):")
         for row in scores:
             console.print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
-    if len(comparison.families) > 1:
-        console.print(_family_table(comparison))
+    if len(comparison.banks) > 1:
+        console.print(_bank_table(comparison))
+
+
+def sampled(scores: Sequence[Score]) -> str:
+    """Return what the intervals of scores refer to."""
+    return "runs and scenarios" if any(row.runs > 1 for row in scores) else "the scenarios"
 
 
 def print_barn_scores(scores: Sequence[BarnScore]) -> None:
@@ -93,13 +97,14 @@ def _bracket_text(bracket: Bracket) -> str:
     return f"{100 * bracket.low:z.2f} to {100 * bracket.high:z.2f} % ({episodes})"
 
 
-def _family_table(comparison: Comparison) -> Table:
-    table = Table(title="success % / SOC by family", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+def _bank_table(comparison: Comparison) -> Table:
+    grouping = "family" if len(comparison.families) == len(comparison.banks) else "bank"
+    table = Table(title=f"success % / SOC by {grouping}", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("policy", min_width=6, overflow="fold")
     rows: dict[str, list[str]] = {name: [] for name in comparison.runs}
-    for family in comparison.families:
-        table.add_column(family, justify="right", no_wrap=True)
-        for row in comparison.of(family).scores():
+    for name, bank in zip(comparison.bank_names, comparison.banks, strict=True):
+        table.add_column(name, justify="right", overflow="fold")
+        for row in comparison.of(bank).scores():
             rows[row.policy].append(f"{100 * row.success.value:.1f} / {row.soc.value:.3f}")
     for name, cells in rows.items():
         table.add_row(name, *cells)
@@ -130,7 +135,15 @@ def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
     content = {
         "environment": ENVIRONMENT,
         "leapnav": leapnav.__version__,
-        "banks": [{"family": bank.family, "file": bank.path.name} for bank in comparison.banks],
+        "banks": [
+            {
+                "family": bank.family,
+                "file": bank.path.name,
+                "identity": bank_identity(bank),
+                "scores": [asdict(row) for row in comparison.of(bank).scores()],
+            }
+            for bank in comparison.banks
+        ],
         "scores": [asdict(row) for row in comparison.scores()],
         "families": {family: [asdict(row) for row in comparison.of(family).scores()] for family in comparison.families},
         "episodes": {
@@ -173,7 +186,7 @@ def draw_intervals(axes: Axes, intervals: Mapping[str, Interval], title: str) ->
 def draw_profiles(axes: Axes, comparison: Comparison) -> None:
     """Draw the performance profiles: the fraction of episodes that succeed with J / J* up to a ratio."""
     for index, (name, runs) in enumerate(comparison.runs.items()):
-        value, low, high = profile(runs, RATIOS, comparison.seed)
+        value, low, high = profile(runs, RATIOS)
         color = CURVES[index % len(CURVES)]
         axes.plot(RATIOS, value, color=color, linewidth=1.6, label=name)
         axes.fill_between(RATIOS, low, high, color=color, alpha=0.15, linewidth=0)
@@ -236,7 +249,7 @@ def _regret_or_infinity(episode: Episode) -> float:
 
 def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) -> None:
     """Draw a scenario with its optimum (dashed) and the policy's path (blue if successful, else red)."""
-    bank = next(bank for bank in banks if bank.family == episode.family)
+    bank = bank_of(episode, banks)
     draw_scenario(axes, bank[episode.index])
     axes.plot(*bank.states(episode.index)[:, :2].T, color=OPTIMUM, linewidth=1.2, linestyle="--")
     axes.plot(*episode.states[:, :2].T, color=POLICY if episode.success else FAILURE, linewidth=1.8)

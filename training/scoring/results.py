@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from leapnav.envs.scenarios.bank import LOWER_BOUNDS, ScenarioBank, digest
 from leapnav.envs.settings import EnvironmentSettings
 
 if TYPE_CHECKING:
@@ -22,7 +24,8 @@ class Episode:
     """The result of a policy on one scenario.
 
     Attributes:
-        family, index, scenario: the scenario: its family, its index in the bank, its name.
+        family, bank, index, scenario: the scenario: its family, the identity of its bank (see `bank_identity`), its
+            index in the bank, its name.
         success, collision: outcome of the episode.
         cost: cost J of the episode.
         episode_return: sum of the rewards.
@@ -40,6 +43,7 @@ class Episode:
     """
 
     family: str
+    bank: str
     index: int
     scenario: str
     success: bool
@@ -102,6 +106,29 @@ class Episode:
         """Return the attributes without the states and their costs, and SOC and regret."""
         record = {name: value for name, value in vars(self).items() if name not in _UNLISTED}
         return {**record, "return": self.episode_return, "soc": self.soc, "regret": self.regret}
+
+
+def bank_identity(bank: ScenarioBank) -> str:
+    """Return a digest of the scenarios and the optima of a bank, by which banks of one family are distinguished.
+
+    It depends neither on the path of the file nor on proved lower bounds, which can be added later.
+    """
+    content = {name: value for name, value in bank.checksums.items() if name not in (LOWER_BOUNDS, "attributes")}
+    return digest(json.dumps(content, sort_keys=True).encode())
+
+
+def bank_of(episode: Episode, banks: Sequence[ScenarioBank]) -> ScenarioBank:
+    """Return the bank of an episode.
+
+    Raises:
+        ValueError: it is none of the given ones.
+
+    """
+    for bank in banks:
+        if bank_identity(bank) == episode.bank:
+            return bank
+    given = ", ".join(str(bank.path) for bank in banks) or "none"
+    raise ValueError(f"banks: expected that of the episode {episode.scenario!r} ({episode.family}), got {given}")
 
 
 @dataclass(frozen=True, eq=False)
