@@ -10,6 +10,7 @@ from play_helpers import SCENARIO, ask_server, fields, served
 from leapnav.cli import main
 from leapnav.commands.play import Play
 from leapnav.envs import Scenario
+from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.utils import colors
 from leapnav.experts import find_optimum, find_reached_optimum
 from leapnav.play.server import MAX_REQUEST_SIZE, SCRIPTS
@@ -29,6 +30,7 @@ def ask(port):
 def test_the_page_begins_with_its_scenario(ask):
     status, initial = ask("/initial")
     assert status == 200 and initial["scenario"] == SCENARIO.to_dict() and initial["policies"] == ["open"]
+    assert initial["families"] == list(FAMILIES)
     for path in ("/", "/page.css", *(f"/{name}" for name in SCRIPTS)):
         status, content = ask(path)
         assert status == 200 and len(content) > 1000

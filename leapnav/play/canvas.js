@@ -41,25 +41,29 @@ function drawPoints(points, color, radius) {
   }
 }
 
-const hasHeading = (pose) => pose[2] !== null && pose[2] !== undefined;
-
 const arrowTip = ([x, y, heading]) => {
-  const length = Math.max(2.2 * shownScenario().robot.radius, (26 * unit) / view.scale);
+  const { robot } = shownScenario(), widest = Math.max(...discsOf(robot).map(({ radius }) => radius));
+  const length = Math.max(frontOf(robot) + 1.2 * widest, (26 * unit) / view.scale);
   return [x + length * Math.cos(heading), y + length * Math.sin(heading)];
 };
 
 function drawRobot(pose, color, hasArrow, isSelected = false) {
-  const [x, y] = toScreen(pose), radius = Math.max(view.scale * shownScenario().robot.radius, 3 * unit);
+  const { robot } = shownScenario(), [x, y] = toScreen(pose), pixels = (radius) => Math.max(view.scale * radius, 3 * unit);
+  const discs = placedDiscs(robot, pose).map(({ center, radius }) => [...toScreen(center), pixels(radius)]);
   context.lineWidth = (isSelected ? 4 : 2) * unit;
   context.strokeStyle = color;
   context.beginPath();
-  context.arc(x, y, radius, 0, 2 * Math.PI);
+  for (const [cx, cy, radius] of discs) {
+    context.moveTo(cx + radius, cy);
+    context.arc(cx, cy, radius, 0, 2 * Math.PI);
+  }
   context.fillStyle = color + "44";
   context.fill();
   context.stroke();
-  if (isSelected) drawSelection(x, y, radius);
+  if (isSelected) drawSelection(discs);
   if (!hasHeading(pose)) return;
-  const end = hasArrow ? toScreen(arrowTip(pose)) : [x + radius * Math.cos(pose[2]), y - radius * Math.sin(pose[2])];
+  const front = pixels(frontOf(robot));
+  const end = hasArrow ? toScreen(arrowTip(pose)) : [x + front * Math.cos(pose[2]), y - front * Math.sin(pose[2])];
   context.lineWidth = 2 * unit;
   context.beginPath();
   context.moveTo(x, y);
@@ -72,7 +76,10 @@ function drawRobot(pose, color, hasArrow, isSelected = false) {
   context.fill();
 }
 
-function drawSelection(x, y, radius) {
+// A dashed circle around discs on a line (pixels).
+function drawSelection(discs) {
+  const first = discs[0], last = discs[discs.length - 1], [x, y] = [0, 1].map((i) => (first[i] + last[i]) / 2);
+  const radius = Math.max(...discs.map(([cx, cy, pixels]) => Math.hypot(cx - x, cy - y) + pixels));
   context.strokeStyle = play.colors.wall;
   context.lineWidth = unit;
   context.setLineDash([4 * unit, 3 * unit]);

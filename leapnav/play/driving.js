@@ -95,10 +95,11 @@ function isAtGoal({ goal }, [x, y, heading]) {
 }
 
 // Whether the robot is in contact with an obstacle or a wall. The server decides; this only ends the driving.
-function isInContact(scenario, [x, y]) {
-  const { radius } = scenario.robot, [x0, y0, x1, y1] = scenario.arena;
-  if (Math.min(x - x0, x1 - x, y - y0, y1 - y) <= radius) return true;
-  return (scenario.obstacles || []).some((obstacle) => isInside(obstacle, [x, y], radius));
+function isInContact(scenario, pose) {
+  const [x0, y0, x1, y1] = scenario.arena;
+  return placedDiscs(scenario.robot, pose).some(({ center: [x, y], radius }) =>
+    Math.min(x - x0, x1 - x, y - y0, y1 - y) <= radius ||
+    (scenario.obstacles || []).some((obstacle) => isInside(obstacle, [x, y], radius)));
 }
 
 async function finishDriving() {

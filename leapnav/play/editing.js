@@ -101,7 +101,9 @@ function findHandle(point, pointerType = "mouse") {
   for (const name of ["goal", "start"]) {
     const pose = poseOf(name);
     if (hasHeading(pose) && isWithin(arrowTip(pose), point, size)) return { kind: "heading", name };
-    if (isWithin(pose, point, Math.max(view.scale * play.scenario.robot.radius, size))) return { kind: "position", name };
+    const discs = placedDiscs(play.scenario.robot, pose);
+    const isOnRobot = discs.some(({ center, radius }) => isWithin(center, point, view.scale * radius));
+    if (isOnRobot || isWithin(pose, point, size)) return { kind: "position", name };
   }
   const obstacles = obstaclesOf();
   for (let i = obstacles.length - 1; i >= 0; i -= 1) if (isInside(obstacles[i], point)) return { kind: "obstacle", i };

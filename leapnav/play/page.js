@@ -3,6 +3,7 @@
 // The panels of the page and their controls.
 
 const DEFAULT_HORIZON = 10, DEFAULT_TIME_WEIGHT = 0.5; // s, 1/s
+const DEFAULT_FAMILY = "clutter";
 
 const settings = () => document.querySelectorAll("[data-group]"); // number inputs of robot and cost
 
@@ -104,14 +105,15 @@ function showSettings() {
 
 const modelOf = (scenario) => (scenario.robot || {}).model || "unicycle";
 
-let shownModel = null; // the model whose numbers have inputs
+let shownFields = null; // the names of the robot's numbers that have inputs, as one text
 
+// A robot of several discs has no radius; its discs are not edited.
 function showRobotFields() {
-  const model = modelOf(play.scenario);
-  byId("model").value = model;
-  if (model === shownModel) return;
-  shownModel = model;
-  const numbers = Object.keys(robotOf(play.scenario).fields).filter((field) => field !== "model");
+  byId("model").value = modelOf(play.scenario);
+  const hidden = (play.scenario.robot || {}).footprint ? ["model", "radius"] : ["model"];
+  const numbers = Object.keys(robotOf(play.scenario).fields).filter((field) => !hidden.includes(field));
+  if (numbers.join() === shownFields) return;
+  shownFields = numbers.join();
   byId("robot-fields").replaceChildren(...numbers.flatMap((field) => {
     const label = document.createElement("label"), input = document.createElement("input");
     input.id = label.htmlFor = field.replaceAll("_", "-");
@@ -129,14 +131,16 @@ document.addEventListener("change", ({ target: input }) => {
   if (group && canEdit()) edit({ [group]: { ...play.scenario[group], [field]: Number(input.value) } });
 });
 
-// Another model starts with its defaults and the present radius; weights that it does not use get their default.
+// Another model starts with its defaults and the present radius or discs; weights that it does not use get their default.
 byId("model").addEventListener("change", () => {
   if (!canEdit()) return;
-  const { fields, weights } = play.robots[byId("model").value], { start_motion, goal_motion, ...scenario } = play.scenario;
+  const { fields: { radius, ...fields }, weights } = play.robots[byId("model").value];
+  const { start_motion, goal_motion, ...scenario } = play.scenario;
   const kept = [...weights, "proximity_weight", "proximity_scale", "time_weight"];
   const cost = Object.entries(scenario.cost || {}).filter(([name]) => kept.includes(name));
-  const radius = scenario.robot && scenario.robot.radius;
-  changeScenario({ ...scenario, robot: { ...fields, ...(radius ? { radius } : {}) }, cost: Object.fromEntries(cost) });
+  const { radius: present, footprint } = scenario.robot || {};
+  const size = footprint ? { footprint } : { radius: present || radius };
+  changeScenario({ ...scenario, robot: { ...fields, ...size }, cost: Object.fromEntries(cost) });
 });
 
 byId("horizon").addEventListener("change", () => {
@@ -230,6 +234,8 @@ observer.observe(byId("plots"));
     play.robots = initial.robots;
     for (const model of Object.keys(initial.robots)) byId("model").add(new Option(model.replaceAll("_", " "), model));
     document.documentElement.style.setProperty("--failure", initial.colors.failure);
+    for (const family of initial.families) byId("family").add(new Option(family, family));
+    byId("family").value = DEFAULT_FAMILY;
     for (const policy of initial.policies) byId("policy").add(new Option(policy, policy));
     if (await openLink()) return;
     const { notice } = play;

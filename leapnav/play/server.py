@@ -17,6 +17,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from leapnav.envs.robots.base import MODELS
+from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario, check_headings
 from leapnav.envs.utils import colors
@@ -97,7 +98,13 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
 
     async def initial(request: Request) -> Response:
         return JSONResponse(
-            {"scenario": scenario.to_dict(), "policies": solver.policies, "colors": COLORS, "robots": robots()}
+            {
+                "scenario": scenario.to_dict(),
+                "families": list(FAMILIES),
+                "policies": solver.policies,
+                "colors": COLORS,
+                "robots": robots(),
+            }
         )
 
     async def bank(request: Request) -> Response:

@@ -1,6 +1,25 @@
 "use strict";
 
-// Geometry of obstacles: discs, convex polygons and capsules. Other shapes are drawn by their outline, not edited.
+// Geometry of robots, which consist of discs, and of obstacles: discs, convex polygons and capsules. Obstacles of other
+// shapes are drawn by their outline, not edited.
+
+// The discs of a robot: offsets along its axis, positive ahead, and radii (m).
+const discsOf = (robot) => robot.footprint || [{ offset: 0, radius: robot.radius }];
+
+const hasHeading = (pose) => pose[2] !== null && pose[2] !== undefined;
+
+// The discs of a robot at a pose. If its heading is free: the one that is covered at any heading, or a point.
+function placedDiscs(robot, [x, y, heading]) {
+  const discs = discsOf(robot);
+  if (!hasHeading([x, y, heading])) {
+    return [{ center: [x, y], radius: Math.max(...discs.map(({ offset, radius }) => radius - Math.abs(offset)), 0) }];
+  }
+  return discs.map(({ offset, radius }) =>
+    ({ center: [x + offset * Math.cos(heading), y + offset * Math.sin(heading)], radius }));
+}
+
+// The distance (m) from the reference point of a robot to its front.
+const frontOf = (robot) => Math.max(...discsOf(robot).map(({ offset, radius }) => offset + radius));
 
 function segmentDistance([x, y], [ax, ay], [bx, by]) {
   const [dx, dy] = [bx - ax, by - ay], length = dx * dx + dy * dy;
