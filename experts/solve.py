@@ -10,12 +10,18 @@ from typing import Any, Literal
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.utils.validation import check_at_least, check_choice, check_integer, check_positive
+from leapnav.envs.utils.validation import (
+    as_matrix,
+    as_vector,
+    check_at_least,
+    check_choice,
+    check_integer,
+    check_positive,
+)
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
-from leapnav.experts.search.candidates import best_candidate
-from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.initial_guess import initial_guess
 from leapnav.experts.solvers.collocation import collocation
 from leapnav.experts.solvers.initial_paths import initial_paths
 from leapnav.experts.solvers.leapfrog import leapfrog
@@ -87,11 +93,10 @@ def solve(
     elif ocp.horizon is None and ocp.starts_at_goal:
         extremal = failure(ocp, Status.ZERO_HORIZON)
     elif isinstance(problem, Scenario):
-        candidate = best_candidate(Lattice(problem))
-        if candidate is None:
+        path = initial_guess(problem, ocp)
+        if path is None:
             extremal = failure(ocp, Status.NO_PATH)
         else:
-            path = Trajectory(candidate.times, candidate.poses)
             extremal = METHODS[method](ocp.with_winding_of(path.states), path, options)
     else:
         extremal = _without_guess(METHODS[method], ocp, options)
@@ -168,17 +173,13 @@ def _options(
 def _check_path(guess: Trajectory, problem: OptimalControlProblem) -> Trajectory:
     """The guess as arrays of floats."""
     n = problem.system.n
-    costates = None if guess.costates is None else np.asarray(guess.costates, dtype=float)
-    path = Trajectory(np.asarray(guess.times, dtype=float), np.asarray(guess.states, dtype=float), costates)
-    times = path.times
-    if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
+    times = as_vector("guess.times", guess.times)
+    states = as_matrix("guess.states", guess.states, len(times), n)
+    costates = None if guess.costates is None else as_matrix("guess.costates", guess.costates, len(times), n)
+    path = Trajectory(times, states, costates)
+    if len(times) < 2 or not np.all(np.diff(times) > 0):
         raise ValueError("guess: its times must be an increasing array of at least two")
     horizon = problem.horizon_of(path)
     if abs(times[0]) > 1e-6 * horizon or abs(times[-1] - horizon) > 1e-6 * horizon:
         raise ValueError(f"guess: its times must run from 0 to {horizon:g}, not {times[0]:g} to {times[-1]:g}")
-    for name, array in (("states", path.states), ("costates", path.costates)):
-        if array is not None and array.shape != (len(times), n):
-            raise ValueError(f"guess: its {name} must have shape {(len(times), n)}, got {array.shape}")
-        if array is not None and not np.isfinite(array).all():
-            raise ValueError(f"guess: its {name} are not finite")
     return path

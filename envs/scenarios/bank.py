@@ -48,7 +48,7 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import HORIZON, Scenario
-from leapnav.envs.shapes.field import check_field, with_grid
+from leapnav.envs.shapes.field import check_field
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 FORMAT, VERSION, VERSION_WITHOUT_GRIDS = "leapnav-bank", 4, 5
@@ -338,7 +338,7 @@ class ScenarioBank(Sequence[Scenario]):
 
         Raises:
             IndexError: the index is out of range.
-            ValueError: a shape of an obstacle is not registered in this process.
+            ValueError: the field is damaged, or a shape of an obstacle is not registered in this process.
 
         """
         i = self._check_index(index)
@@ -347,8 +347,7 @@ class ScenarioBank(Sequence[Scenario]):
             return self._fields[i]
         start, end = self._span("field_ends", i)
         stored = self._array("fields")[start:end]
-        check_field(stored)
-        self._fields[i] = with_grid(stored)
+        self._fields[i] = check_field(stored)
         if len(self._fields) > MAX_FIELDS:
             self._fields.popitem(last=False)
         return self._fields[i]

@@ -29,7 +29,7 @@ from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.records import Finite, Frozen, Positive, as_tuples
-from leapnav.envs.utils.validation import check_positive
+from leapnav.envs.utils.validation import as_vector, check_positive
 
 # Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
 # goal heading NaN if free), the horizon, the limits (m) and weights (m) of the controls, the further states (n - 3) at
@@ -205,9 +205,10 @@ class Scenario(Frozen):
 
         Raises:
             ScenarioError: the robot is in contact with an obstacle, or no time is left.
+            ValueError: the state has another length, or is not finite.
 
         """
-        x, y, heading, *motion = (float(value) for value in state)
+        x, y, heading, *motion = as_vector("state", state, len(self.robot.state_names)).tolist()
         update: dict[str, Any] = {"start": (x, y, heading)}
         if self.horizon is not None:
             update["horizon"] = float(self.horizon - time)
@@ -220,9 +221,10 @@ class Scenario(Frozen):
 
         Raises:
             ScenarioError: the robot is in contact with an obstacle at the state.
+            ValueError: the state has another length, or is not finite.
 
         """
-        x, y, heading, *motion = (float(value) for value in state)
+        x, y, heading, *motion = as_vector("state", state, len(self.robot.state_names)).tolist()
         update: dict[str, Any] = {
             "goal": (x, y, None if self.goal[2] is None else math.remainder(heading, 2 * math.pi))
         }

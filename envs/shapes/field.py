@@ -28,7 +28,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numba import float64
@@ -221,17 +222,86 @@ def record_outline(record: np.ndarray) -> tuple[np.ndarray, float]:
     return record[VERTICES:end].reshape(-1, 2), float(record[ROUNDING])
 
 
-def check_field(packed: np.ndarray) -> None:
-    """Check that the shapes of a stored field are known in this process.
+# Fields that `check_field` has accepted, by their identity; the check takes as long as a short search.
+_checked: WeakValueDictionary[int, np.ndarray] = WeakValueDictionary()
+
+
+def check_field(packed: np.ndarray) -> np.ndarray:
+    """Check that kernels can read a packed field, and return it, read-only and with its grid.
 
     Raises:
-        ValueError: a shape is not.
+        ValueError: it is not a packed field, or one of its shapes is not known in this process.
 
     """
-    at = SHAPES + 3 * int(packed[CIRCLES])
-    if packed[RECORDS] > 0 and packed[at] < 0:
-        for record in unpack_field(packed).records:
-            compile_shape(shape_class(-int(record[KIND])))
+    if _checked.get(id(packed)) is packed:
+        return packed
+    if not isinstance(cast(object, packed), np.ndarray) or packed.dtype != np.float64 or packed.ndim != 1:
+        raise ValueError(f"field: expected a vector of float64 (Scenario.field), got {packed!r}")
+    if packed.flags.writeable or not packed.flags.c_contiguous:
+        packed = packed.copy()
+        packed.flags.writeable = False
+    try:
+        end = _check_obstacles(packed)
+        packed = with_grid(packed)
+        _check_grid(packed[end:])
+    except (IndexError, OverflowError) as error:
+        raise ValueError(f"field: not a packed field (Scenario.field): {error}") from None
+    _checked[id(packed)] = packed
+    return packed
+
+
+def _check_obstacles(packed: np.ndarray) -> int:
+    """Check all of a field but its grid; return the index at which the grid begins."""
+    weight, scale, radius = packed[:CIRCLES].tolist()
+    end = _count_at(packed, GRID)
+    if not (np.isfinite(packed).all() and weight >= 0 and scale > 0 and radius > 0 and end <= len(packed)):
+        raise IndexError("its first entries or its length are invalid")
+    at = SHAPES + 3 * _count_at(packed, CIRCLES)
+    count, is_polygon = _count_at(packed, CIRCLES), False
+    for _ in range(_count_at(packed, RECORDS)):
+        if packed[at] < 0 and not is_polygon:
+            length, kind = 2 + _count_at(packed, at + LENGTH), shape_class(-int(packed[at + KIND]))
+            if length < VERTICES or length < VERTICES + 2 * _count_at(packed, at + N_VERTICES):
+                raise IndexError(f"the record of a {kind.kind} is too short")
+            compile_shape(kind)
+            at += length
+        else:
+            is_polygon = True
+            if _count_at(packed, at) < 3:
+                raise IndexError("a polygon has fewer than 3 edges")
+            at += 1 + 5 * int(packed[at])
+        count += 1
+        if at > end:
+            break
+    if at + count != end or sorted(packed[at:end].tolist()) != list(range(count)):
+        raise IndexError("the obstacles do not end where the grid begins")
+    return end
+
+
+def _count_at(packed: np.ndarray, index: int) -> int:
+    """Return an entry that is a number of entries."""
+    value = float(packed[index])
+    if not (value.is_integer() and 0 <= value <= len(packed)):
+        raise IndexError(f"entry {index}: expected a count, got {value!r}")
+    return int(value)
+
+
+def _check_grid(grid: np.ndarray) -> None:
+    """Check that the offsets and the counts of the cells of a grid lie within it."""
+    columns, lines = _count_at(grid, 3), _count_at(grid, 4)
+    if columns * lines == 0:
+        return
+    offsets = grid[5 : 5 + columns * lines]
+    if len(offsets) < columns * lines or not grid[2] > 0:
+        raise IndexError("the grid is incomplete")
+    if not ((offsets >= 5 + columns * lines) & (offsets <= len(grid) - 3) & (offsets % 1 == 0)).all():
+        raise IndexError("a cell begins outside of the grid")
+    n, p, m = (grid[offsets.astype(int) + k] for k in range(3))
+    counts = np.array([n, p, m])
+    if (counts < 0).any() or (counts % 1 != 0).any() or (counts[:2] % LANES != 0).any():
+        raise IndexError("a cell has invalid counts")
+    if (offsets + 3 + 3 * n + 3 * p * m > len(grid)).any():
+        raise IndexError("a cell ends outside of the grid")
 
 
 def obstacle_centres(packed: np.ndarray) -> np.ndarray:

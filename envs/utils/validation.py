@@ -84,3 +84,37 @@ def is_number(value: Any) -> bool:
 def is_finite_number(value: Any) -> bool:
     """Return whether a value is a finite real number of Python or NumPy; booleans are not."""
     return is_number(value) and math.isfinite(value)
+
+
+def as_vector(name: str, values: Any, length: int | None = None, *, finite: bool = True) -> np.ndarray:
+    """Return values as a vector of floats that kernels can read: contiguous, of a given length, finite.
+
+    Raises:
+        ValueError: the shape is another one, a value is not a number, or not finite unless `finite` is False.
+
+    """
+    return _as_array(name, values, (length,), finite)
+
+
+def as_matrix(
+    name: str, values: Any, rows: int | None, columns: int | None = None, *, finite: bool = True
+) -> np.ndarray:
+    """Return values as a matrix of floats that kernels can read; None accepts any size. See `as_vector`."""
+    return _as_array(name, values, (rows, columns), finite)
+
+
+def _as_array(name: str, values: Any, shape: tuple[int | None, ...], finite: bool) -> np.ndarray:
+    expected = f"({', '.join('any' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
+    try:
+        array = np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected numbers of the shape {expected}, got {values!r}") from None
+    # A scalar becomes a vector of one number, which is not accepted in place of one.
+    is_shape = np.ndim(values) == len(shape) and all(
+        size is None or size == found for size, found in zip(shape, array.shape, strict=True)
+    )
+    if not is_shape:
+        raise ValueError(f"{name}: expected the shape {expected}, got {np.shape(values)}")
+    if finite and not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
+    return array

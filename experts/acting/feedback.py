@@ -132,12 +132,25 @@ class Feedback:
         return self._stored.nodes[-1, self._n :].copy()
 
     def control(self, time: float) -> np.ndarray:
-        """Return the controls (m,) of the stored solution at a time."""
+        """Return the controls (m,) of the stored solution at a time.
+
+        Raises:
+            FloatingPointError: the solution diverges on the way to this time.
+
+        """
         arrays, (times, nodes, _) = self._arrays, self._stored
-        return control_at(arrays.flow, arrays.control, times, nodes, time, self._m)
+        control = control_at(arrays.flow, arrays.control, times, nodes, time, self._m)
+        if not np.isfinite(control).all():
+            raise FloatingPointError(f"the stored solution diverges before {time:g} s")
+        return control
 
     def gains(self) -> Gains:
-        """Compute neighbouring-extremal gains along the stored solution."""
+        """Compute neighbouring-extremal gains along the stored solution.
+
+        Raises:
+            FloatingPointError: the sensitivities diverge along the solution.
+
+        """
         arrays = self._arrays
         start, end = float(self._stored.times[0]), float(self._stored.times[-1])
         times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_SAMPLING - 1e-9) + 1))
@@ -147,7 +160,10 @@ class Feedback:
         for k, transition in enumerate(transitions):
             transition[:] = np.eye(2 * n)
             duration = times[k + 1] - times[k]
-            propagate(arrays.flow, extremal[k].copy(), transition, duration, FLOW_ACCURACY, 0.0, False)
+            z = extremal[k].copy()
+            success, *_ = propagate(arrays.flow, z, transition, duration, FLOW_ACCURACY, 0.0, False)
+            if not success:
+                raise FloatingPointError(f"the sensitivities of the stored solution diverge after {times[k]:g} s")
         slopes, factors = np.zeros((len(times), n, n)), np.empty((len(times) - 1, n, n))
         free = arrays.free
         for k in range(len(times) - 2, -1, -1):
@@ -179,7 +195,7 @@ class Feedback:
         check_clearance = np.abs(state[:3] - nodes[0, :3]).max() > LARGE_DEVIATION
         if found is None:
             found, check_clearance = self._approach(times, nodes, state, tol), True
-        if found is not None and check_clearance and self._clearance(found) <= 0.0:
+        if found is not None and check_clearance and not self._clearance(found) > 0.0:  # NaN where it diverges
             found = None
         if found is not None or not self._search(state, time):
             return found

@@ -260,10 +260,10 @@ class ExpertPolicy:
             path = Trajectory(optimum.times, optimum.states, optimum.costates)
         try:
             feedback = Feedback(scenario, path, quick=self._quick)
-        except ValueError as error:
+            gains = feedback.gains() if self._feedback == "gains" else None
+        except (ValueError, FloatingPointError) as error:
             raise NoOptimumError(str(error), scenario) from None
         limits = np.array(scenario.robot.limits())
-        gains = feedback.gains() if self._feedback == "gains" else None
         robot = _Robot(scenario, situation.time, limits, feedback, gains, self._no_label)
         self._robots[i] = robot
         return robot

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import float64, int64
 
@@ -18,18 +20,20 @@ MAX_ITERATIONS = 8  # Newton steps; a state that needs more is usually closer to
 
 @kernel(VECTOR(FLOW, VECTOR, MATRIX, float64))
 def follow(flow, times, nodes, time):
-    """Integrate (q, lambda) to a time from the preceding node."""
+    """Integrate (q, lambda) to a time from the preceding node; NaN if the flow diverges."""
     k = min(max(np.searchsorted(times, time, side="right") - 1, 0), len(times) - 2)
     z = nodes[k].copy()
     duration = min(time, times[-1]) - times[k]
     if duration > 0.0:
-        propagate(flow, z, np.empty((len(z), 0)), duration, FLOW_ACCURACY, 0.0, False)
+        success, _, _, _, _ = propagate(flow, z, np.empty((len(z), 0)), duration, FLOW_ACCURACY, 0.0, False)
+        if not success:
+            z[:] = np.nan
     return z
 
 
 @kernel(MATRIX(FLOW, VECTOR, MATRIX, VECTOR))
 def follow_all(flow, times, nodes, moments):
-    """Integrate the states (K, n) to times (K,)."""
+    """Integrate the states (K, n) to times (K,); NaN where the flow diverges."""
     states = np.empty((len(moments), nodes.shape[1] // 2))
     for k in range(len(moments)):
         z = follow(flow, times, nodes, moments[k])
@@ -40,9 +44,11 @@ def follow_all(flow, times, nodes, moments):
 
 @kernel(VECTOR(FLOW, CONTROL_FUNCTION, VECTOR, MATRIX, float64, int64))
 def control_at(flow, control, times, nodes, time, m):
-    """The optimal control (m,) at a time."""
-    u = np.empty(m)
-    control(follow(flow, times, nodes, time), flow.data, u)
+    """The optimal control (m,) at a time; NaN if the flow diverges."""
+    z, u = follow(flow, times, nodes, time), np.empty(m)
+    control(z, flow.data, u)
+    if math.isnan(z[0]):  # limits of a control would replace NaN by a number
+        u[:] = np.nan
     return u
 
 

@@ -112,12 +112,12 @@ def next_step(h, error):
     return h * min(6.0, max(0.2, 0.9 * max(error, 1e-10) ** -0.125))
 
 
-@kernel(tuple_of(float64, float64, float64, int64)(FLOW, VECTOR, MATRIX, float64, float64, float64, boolean))
+@kernel(tuple_of(boolean, float64, float64, float64, int64)(FLOW, VECTOR, MATRIX, float64, float64, float64, boolean))
 def propagate(flow, z, S, duration, tolerance, first_step, once):
     """Advance z (2n,) and S (2n, columns) in place by `duration`, or by one accepted step if `once`.
 
-    Returns (cost, elapsed time, next step size, evaluations of the flow). The number of evaluations is negative if the
-    flow diverged or the step size fell to rounding level.
+    Returns (success, cost, elapsed time, next step size, evaluations of the flow). Without success the flow diverged or
+    the step size fell to rounding level; then z, S and the cost are NaN, so that no caller can use them by mistake.
     """
     size, columns = S.shape
     length = size * (1 + columns)
@@ -156,10 +156,10 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
         if failed or (once and error <= 1.0):
             break
     for i in range(size):
-        z[i] = y[i]
+        z[i] = np.nan if failed else y[i]
         for c in range(columns):
-            S[i, c] = y[size + i * columns + c]
-    return cost, elapsed, h, -evaluations if failed else evaluations
+            S[i, c] = np.nan if failed else y[size + i * columns + c]
+    return not failed, np.nan if failed else cost, elapsed, h, evaluations
 
 
 @kernel(NOTHING(FLOW, VECTOR, VECTOR, STAGES_TYPE, float64, float64, MATRIX))

@@ -14,7 +14,7 @@ from numba import boolean, float64, int64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR
 
-MIN_PIVOT = 1e-14  # relative to the largest entry: rounding level
+MIN_PIVOT = 1e-14  # rounding level, relative to the entries of the matrix
 
 
 @kernel(float64(MATRIX, boolean, float64))
@@ -78,19 +78,29 @@ def solve_dense(A, b):
 def solve_banded(rows, b, half):
     """Replace b by the solution of a banded system, by Gaussian elimination with partial pivoting; False if singular.
 
+    A pivot counts as zero at rounding level relative to the smallest row: in the equations of shooting, the magnitudes
+    of the rows differ by the growth over a segment, and the largest entry would hide the pivots of the others.
+
     The matrix is changed in place. `rows[i, j - i + half]` is its entry in row i and column j, with |i - j| <= half.
     Partial pivoting fills up to `half` more columns on the right, so `rows` has 3 half + 1 columns. The cost is
     O(n half^2).
     """
     n = len(b)
     width = 3 * half + 1
+    smallest = np.inf  # of the largest entries of the rows
+    for i in range(n):
+        largest = 0.0
+        for j in range(max(half - i, 0), min(2 * half, n - 1 - i + half) + 1):
+            largest = max(largest, abs(rows[i, j]))
+        smallest = min(smallest, largest)
+    min_pivot = MIN_PIVOT * smallest
     for k in range(n):
         last = min(k + half, n - 1)
         pivot = k
         for i in range(k + 1, last + 1):
             if abs(rows[i, k - i + half]) > abs(rows[pivot, k - pivot + half]):
                 pivot = i
-        if not abs(rows[pivot, k - pivot + half]) > MIN_PIVOT:
+        if not abs(rows[pivot, k - pivot + half]) > min_pivot:
             return False
         right = min(k + 2 * half, n - 1)
         if pivot != k:

@@ -98,9 +98,9 @@ def linearise(flow, times, factor, Z, start, end, accuracy, system):
             z[i] = Z[k, i]
         set_identity(S, 0)
         duration = times[k + 1] - times[k]
-        cost, _, hint, count = propagate(flow, z, S, factor * duration, accuracy, system.hints[k], False)
-        evaluations += abs(count)
-        if count < 0:
+        success, cost, _, hint, count = propagate(flow, z, S, factor * duration, accuracy, system.hints[k], False)
+        evaluations += count
+        if not success:
             return np.inf, np.inf, evaluations
         system.costs[k] = cost
         system.hints[k] = hint

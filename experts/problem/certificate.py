@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.integrator import DENSE_TERMS, propagate
 from leapnav.experts.problem.conjugate_points import conjugate_time, first_even_conjugate_time, first_focal_time
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, Status
@@ -44,10 +45,18 @@ def certify(
         history: the solver's iterations.
         evaluations: number of evaluations of the extremal flow by the solver.
 
+    Raises:
+        ValueError: the times are not increasing or fewer than two, or an array has a wrong shape.
+
     """
     arrays = problem.arrays
     n, m = problem.system.n, problem.system.m
-    times, nodes = np.ascontiguousarray(times, dtype=float), np.ascontiguousarray(nodes, dtype=float)
+    times = as_vector("times", times)
+    nodes = as_matrix("nodes", nodes, len(times), 2 * n, finite=False)
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        raise ValueError(f"times: expected at least two increasing numbers, got {times}")
+    if not np.isfinite(nodes).all():
+        return failure(problem, Status.DIVERGED if converged is Status.SUCCESS else converged, history, evaluations)
     accuracy = ACCURACY if converged is Status.SUCCESS else UNCONVERGED_ACCURACY
     capacity = max(MIN_ROWS, ROWS_PER_SEGMENT * len(times))
     sensitivity, final = np.empty((2 * n, n)), np.empty((2 * n, n))
@@ -80,13 +89,16 @@ def certify(
         n_nodes=len(times),
         n_evaluations=evaluations,
     )
-    if arrays.free.any():
-        conjugate_point = first_focal_time(extremal, arrays.free)
-    else:
-        conjugate_point = first_even_conjugate_time(extremal, out[:, -1])
-        if conjugate_step >= 0:
-            crossing = conjugate_time(extremal, conjugate_step, sensitivity)
-            conjugate_point = min((t for t in (conjugate_point, crossing) if t is not None), default=None)
+    try:
+        if arrays.free.any():
+            conjugate_point = first_focal_time(extremal, arrays.free)
+        else:
+            conjugate_point = first_even_conjugate_time(extremal, out[:, -1])
+            if conjugate_step >= 0:
+                crossing = conjugate_time(extremal, conjugate_step, sensitivity)
+                conjugate_point = min((t for t in (conjugate_point, crossing) if t is not None), default=None)
+    except FloatingPointError:
+        conjugate_point = math.nan
     clearance = None
     if problem.field is not None and problem.system.position is not None:
         system = problem.system

@@ -3,6 +3,8 @@
 A conjugate point is a zero of det dq(t)/dlambda(0). A determinant that only changes its sign is found during the
 re-integration; a zero of even order, which is typical of symmetric problems, is a local minimum of |det| at which the
 matrix loses rank.
+
+The functions raise FloatingPointError where the sensitivities diverge, so that the question cannot be decided.
 """
 
 from __future__ import annotations
@@ -15,13 +17,21 @@ from scipy.optimize import brentq, minimize_scalar
 
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.problem.extremal import Extremal
-from leapnav.experts.problem.frames import MIN_DETERMINANT, SENSITIVITY_ACCURACY, carry_back, orthonormalise, pull_back
+from leapnav.experts.problem.frames import (
+    DIVERGED,
+    MIN_DETERMINANT,
+    SENSITIVITY_ACCURACY,
+    carry_back,
+    orthonormalise,
+    pull_back,
+)
 
 # A local minimum of |det| may be a zero of even order if it is below this fraction of the largest value before it ...
 MAX_DIP = 0.3
 # ... and if the parabola through it and its neighbours has its minimum below this fraction of it.
 MAX_PARABOLA_MINIMUM = 0.7
 ZERO_SINGULAR_VALUE = 1e-5  # of an orthonormal frame; smaller values count as zero
+DIVERGENCE = "the sensitivities diverge along the extremal"
 
 
 def conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float | None:
@@ -36,13 +46,12 @@ def conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float
         The time; None if it is the horizon itself, which does not contradict a minimum.
 
     """
-    arrays = extremal.problem.arrays
 
     def determinant(duration: float) -> float:
         z = np.concatenate([extremal.states[k], extremal.costates[k]])
         S = sensitivity.copy()
         if duration > 0.0:
-            propagate(arrays.flow, z, S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+            _transport(extremal, z, S, duration)
         return orthonormalise(S)
 
     step = float(extremal.times[k + 1] - extremal.times[k])
@@ -60,7 +69,7 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
     """
     if not _dips(extremal.times, determinants, check_parabola=True):
         return None
-    arrays, n = extremal.problem.arrays, extremal.problem.system.n
+    n = extremal.problem.system.n
     z = np.concatenate([extremal.states, extremal.costates], axis=1)
     S = np.concatenate([np.zeros((n, n)), np.eye(n)])
     frames = [S.copy()]
@@ -68,7 +77,7 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
     def advance(k: int, S: np.ndarray, time: float) -> np.ndarray:
         S, duration = S.copy(), time - float(extremal.times[k])
         if duration > 0.0:
-            propagate(arrays.flow, z[k].copy(), S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+            _transport(extremal, z[k].copy(), S, duration)
             orthonormalise(S)
         return S
 
@@ -80,6 +89,13 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
         return advance(k, frames[k], time)
 
     return _first_rank_loss(extremal.times, determinants, frame, check_parabola=True)
+
+
+def _transport(extremal: Extremal, z: np.ndarray, S: np.ndarray, duration: float) -> None:
+    """Advance a point (2n,) and its sensitivities in place by a duration (s) > 0."""
+    success, *_ = propagate(extremal.problem.arrays.flow, z, S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+    if not success:
+        raise FloatingPointError(DIVERGENCE)
 
 
 def _dips(times: np.ndarray, determinants: np.ndarray, check_parabola: bool) -> list[int]:
@@ -143,13 +159,15 @@ def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
     frames[0] = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
     z = np.concatenate([extremal.states, extremal.costates], axis=1)
     step = carry_back(arrays.flow, extremal.times, z, frames, determinants)
+    if step == DIVERGED:
+        raise FloatingPointError(DIVERGENCE)
 
     def back(k: int, time: float) -> tuple[np.ndarray, float]:
         """Return the orthonormal frame at a time within the step before times[k], and its determinant."""
         duration, basis = float(times[k]) - time, frames[k].copy()
         if duration > 0.0:
             z, S = extremal.interpolate(np.array([time]))[0], np.eye(2 * n)
-            propagate(arrays.flow, z, S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+            _transport(extremal, z, S, duration)
             pull_back(S, basis)
         return basis, orthonormalise(basis)
 

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from leapnav.envs.utils.json_utils import encode, plain
+from leapnav.envs.utils.validation import as_vector
 from leapnav.experts.problem.problem import OptimalControlProblem
 
 
@@ -68,7 +69,8 @@ class Certificate:
         defect: largest difference between a node and the extremal flow from the node before it, integrated at 1e-12.
         hamiltonian_drift: largest minus smallest Hamiltonian. The Hamiltonian is constant along an extremal.
         conjugate_point: time (s) of a conjugate point before the horizon, at which dq(t)/dlambda(0) loses rank; with
-            free final components, of a focal point. None if there is none: the extremal is a local minimum.
+            free final components, of a focal point. None if there is none: the extremal is a local minimum. NaN if the
+            sensitivities diverge, so that this cannot be decided; such an extremal is not certified.
         clearance: smallest clearance (m) to an obstacle or a wall along the interpolated path; None without obstacles.
         time_curvature: with a free horizon, d2J/dT2 for extremals with the same ends, positive at a minimum over T;
             None with a fixed horizon.
@@ -98,7 +100,7 @@ class Certificate:
         if self.clearance is not None and not self.clearance > 0:
             return Status.COLLISION
         if self.conjugate_point is not None:
-            return Status.CONJUGATE_POINT
+            return Status.NOT_CERTIFIED if math.isnan(self.conjugate_point) else Status.CONJUGATE_POINT
         if self.time_curvature is None or self.horizon_error is None:
             return Status.SUCCESS
         if not self.time_curvature > 0:
@@ -214,7 +216,7 @@ class Extremal:
             ValueError: there is no path, because the solve failed.
 
         """
-        values = self.interpolate(np.atleast_1d(np.asarray(t, dtype=float)))
+        values = self.interpolate(as_vector("t", np.atleast_1d(t)))
         n = self.problem.system.n
         arrays = self.problem.arrays
         controls = np.empty((len(values), self.problem.system.m))
@@ -227,11 +229,12 @@ class Extremal:
         """Return states and costates (K, 2n) at times (K,).
 
         Raises:
-            ValueError: there is no path, because the solve failed.
+            ValueError: there is no path, because the solve failed, or a time is not a finite number.
 
         """
         if len(self.times) == 0:
             raise ValueError(f"there is no path: {self.status.value}")
+        times = as_vector("times", times)
         return np.ascontiguousarray(self._interpolate(times)[:, :-1])
 
     def _interpolate(self, times: np.ndarray) -> np.ndarray:
@@ -253,7 +256,7 @@ class Extremal:
         """
         if len(self.times) == 0:
             raise ValueError(f"there is no path: {self.status.value}")
-        values = self.cost - self._interpolate(np.atleast_1d(np.asarray(t, dtype=float)))[:, -1]
+        values = self.cost - self._interpolate(as_vector("t", np.atleast_1d(t)))[:, -1]
         return values if np.ndim(t) else float(values[0])
 
     def plot(self, path: str | os.PathLike[str] | None = None, title: str | None = None) -> Any:

@@ -15,6 +15,7 @@ from leapnav.experts.numerics.linear import eliminate
 
 SENSITIVITY_ACCURACY = 1e-6  # integrator tolerance for the sensitivities
 MIN_DETERMINANT = 1e-9  # below this, rounding decides the sign of a determinant
+NO_CHANGE, DIVERGED = -1, -2  # results of `carry_back` other than the index of a step
 
 
 @kernel(float64(MATRIX))
@@ -66,7 +67,8 @@ def carry_back(flow, times, z, frames, determinants):
     """Transport frames[0] (2n, n), given at the last time, backwards until its determinant changes sign.
 
     Fills the orthonormal `frames` (N, 2n, n) and the `determinants` (N,) of their upper blocks, in the order of
-    decreasing time. Returns the index of the step with the sign change, or -1.
+    decreasing time. Returns the index of the step with the sign change, NO_CHANGE, or DIVERGED if the sensitivities
+    cannot be integrated.
     """
     last = len(times) - 1
     size = z.shape[1]
@@ -78,7 +80,10 @@ def carry_back(flow, times, z, frames, determinants):
         for i in range(size):
             for j in range(size):
                 S[i, j] = 1.0 if i == j else 0.0
-        propagate(flow, state, S, times[early + 1] - times[early], SENSITIVITY_ACCURACY, 0.0, False)
+        duration = times[early + 1] - times[early]
+        success, _, _, _, _ = propagate(flow, state, S, duration, SENSITIVITY_ACCURACY, 0.0, False)
+        if not success:
+            return DIVERGED
         for i in range(size):
             for j in range(frames.shape[2]):
                 frames[k + 1, i, j] = frames[k, i, j]
@@ -88,4 +93,4 @@ def carry_back(flow, times, z, frames, determinants):
             if sign * determinants[k + 1] < 0.0:
                 return k
             sign = math.copysign(1.0, determinants[k + 1])
-    return -1
+    return NO_CHANGE

@@ -12,6 +12,8 @@ import numpy as np
 
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.field import check_field
+from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
@@ -49,9 +51,12 @@ class Trajectory:
 
     def resample(self, times: np.ndarray) -> Trajectory:
         """Return the path at other times (K,), by linear interpolation."""
-        arrays = [self.states] if self.costates is None else [self.states, self.costates]
-        at, own = np.ascontiguousarray(times, float), np.ascontiguousarray(self.times, float)
-        return Trajectory(times, *(interpolate(at, own, np.ascontiguousarray(array, float)) for array in arrays))
+        own = as_vector("times", self.times)
+        arrays = [as_matrix("states", self.states, len(own))]
+        if self.costates is not None:
+            arrays.append(as_matrix("costates", self.costates, *arrays[0].shape))
+        at = as_vector("times", times, finite=True)
+        return Trajectory(at, *(interpolate(at, own, array) for array in arrays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +133,9 @@ class OptimalControlProblem:
         if self.control_bounds is not None:
             bounds = tuple((float(low), float(high)) for low, high in self.control_bounds)
             object.__setattr__(self, "control_bounds", bounds)
+        if self.field is not None:
+            object.__setattr__(self, "field", check_field(self.field))
+        self._check_footprint()
         state_cost = as_expression("state_cost", self.state_cost)
         if self.horizon is None and self.time_weight == 0 and state_cost == 0 and self.field is None:
             raise ValueError(
@@ -137,6 +145,15 @@ class OptimalControlProblem:
         if unknown:
             raise ValueError(
                 f"state_cost: unknown symbol {sorted(map(str, unknown))[0]!r}; the state is {self.system.state}"
+            )
+
+    def _check_footprint(self) -> None:
+        if self.footprint is not None and not (
+            len(self.footprint) > 0
+            and all(len(disc) == 2 and all(map(_is_finite, disc)) and disc[1] > 0 for disc in self.footprint)
+        ):
+            raise ValueError(
+                f"footprint: expected pairs (offset, radius > 0) of finite numbers, got {self.footprint!r}"
             )
 
     @classmethod
@@ -164,7 +181,9 @@ class OptimalControlProblem:
 
     def wound_goal(self, states: np.ndarray) -> tuple[float | None, ...]:
         """Return the goal of `with_winding_of`."""
-        goal = list(self.goal)
+        goal, states = list(self.goal), as_matrix("states", states, None, self.system.n)
+        if len(states) == 0:
+            raise ValueError("states: expected at least one row, got none")
         for symbol in self.system.angles:
             i = self.system.state.index(symbol)
             value = goal[i]
@@ -257,17 +276,22 @@ class OptimalControlProblem:
         The control that follows the path in the least-squares sense gives the switching functions p = -R u. The result
         is the costate of least norm with these switching functions.
         """
-        drift, fields = self.dynamics(path.states)
+        times = as_vector("times", path.times)
+        states = as_matrix("states", path.states, len(times), self.system.n)
+        if len(times) < 2 or not (np.diff(times) > 0).all():
+            raise ValueError(f"times: expected at least two increasing numbers, got {times}")
+        drift, fields = self.dynamics(states)
         costates = np.empty_like(drift)
-        rates = np.gradient(path.states, path.times, axis=0)
+        rates = np.gradient(states, times, axis=0)
         minimum_norm_costates(drift, fields, rates, np.array(self.control_weight, dtype=float), costates)
         return costates
 
     def dynamics(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the drift a(q) (N, n) and the control vector fields B(q) (N, n, m) at states (N, n)."""
         arrays, n, m = self.arrays, self.system.n, self.system.m
+        states = as_matrix("states", states, None, n)
         drift, fields = np.empty((len(states), n)), np.empty((len(states), n, m))
-        sample_dynamics(arrays.flow, arrays.control, np.ascontiguousarray(states), drift, fields)
+        sample_dynamics(arrays.flow, arrays.control, states, drift, fields)
         return drift, fields
 
     def straight_line(self, points: int = 33) -> Trajectory:

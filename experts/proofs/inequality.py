@@ -98,13 +98,17 @@ def _basis(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
 
 @kernel(float64(CUBE, int64, int64, int64, VECTOR))
 def take(local, k, i, j, around):
-    """Copy the 27 coefficients around a cell, relative to that of the cell; return the largest magnitude."""
+    """Copy the 27 coefficients around a cell, relative to that of the cell.
+
+    Returns the largest magnitude, infinity if a coefficient is not finite.
+    """
     index, largest, middle = 0, 0.0, local[k, i, j]
     for a in range(k - 1, k + 2):
         for b in range(i - 1, i + 2):
             for c in range(j - 1, j + 2):
                 around[index] = local[a, b, c] - middle
-                largest = max(largest, abs(around[index]))
+                if not abs(around[index]) <= largest:  # also if it is NaN, which `max` would ignore
+                    largest = abs(around[index]) if math.isfinite(around[index]) else np.inf
                 index += 1
     return largest
 
@@ -112,7 +116,11 @@ def take(local, k, i, j, around):
 MATRICES = types.Array(float64, 2, "C")
 
 
-@kernel(NOTHING(MATRICES, VECTOR, VECTOR), fastmath=True)
+# Flags that let the compiler reorder sums, but not assume that there is no NaN or infinity: the checker tests for them.
+IEEE_SPECIAL_VALUES = {"contract", "reassoc", "nsz"}
+
+
+@kernel(NOTHING(MATRICES, VECTOR, VECTOR), fastmath=IEEE_SPECIAL_VALUES)
 def evaluate(matrix, around, points):
     """Control points (99,) from the coefficients around a cell (27,)."""
     for r in range(2 * N_POINTS + N_LATERAL):
@@ -125,7 +133,12 @@ def evaluate(matrix, around, points):
 
 @kernel(float64(VECTOR, float64, float64))
 def largest_square(points, excess, error):
-    """Upper bound of the left side of the inequality from control points with an error of at most `error`."""
+    """Upper bound of the left side of the inequality from control points with an error of at most `error`.
+
+    It is infinite if the error is not finite.
+    """
+    if not error < np.inf:
+        return np.inf
     lateral = 0.0
     for r in range(2 * N_POINTS, 2 * N_POINTS + N_LATERAL):
         lateral = max(lateral, abs(points[r]))

@@ -302,11 +302,6 @@ def shortest_durations(poses: np.ndarray, scenario: Scenario) -> np.ndarray:
     return np.maximum(np.hypot(step[:, 0], step[:, 1]) / max_speed, step[:, 2] / max_turn_rate)
 
 
-def best_candidate(lattice: Lattice) -> Candidate | None:
-    """Return the cheapest path of a lattice, or None if the goal cannot be reached."""
-    return next(CandidateSearch(lattice, partial=True).candidates(), None)
-
-
 def cell_costs(metric: Metric, seeds: Nodes) -> np.ndarray:
     """Return the costs of the cells from those of the seeds if rotation were free."""
     cells = np.unique(seeds.nodes // HEADINGS)

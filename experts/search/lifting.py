@@ -50,7 +50,7 @@ class Lifting:
             return path
         if self._companion is not None:
             companion = self._companion.with_winding_of(path.states)
-            direct = optimise(companion, discretise(companion, path), self._scenario.cost.speed_weight)
+            direct = optimise(companion, discretise(companion, path))
             path = Trajectory(direct.times, direct.states)
             shape = path.resample(COMPARED_FRACTIONS * path.times[-1]).states
             if any(np.abs(shape - other).max() < DUPLICATE_DISTANCE for other in self._seen):

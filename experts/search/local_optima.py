@@ -47,8 +47,7 @@ FAILURE_WEIGHT = 4  # evaluations for an expensive path without an extremal coun
 # Free horizon: factor and largest number of lengthenings of a path that the limits make infeasible, largest number of
 # changes of the horizon, and the change after which there is no other.
 LENGTHENING, MAX_LENGTHENED, MAX_RESCALED, SMALL_CHANGE = 1.25, 3, 4, 0.1
-# A control is at its limit within this relative tolerance; a path is limited if more than this fraction of it is.
-LIMIT_TOLERANCE, MAX_LIMITED_FRACTION = 1e-3, 0.1
+LIMIT_TOLERANCE = 1e-3  # relative; a control is at its limit within this tolerance
 # Depth in an obstacle (robot radii) up to which a collision-free path of similar cost may exist close to an extremal.
 MAX_SLIGHT_DEPTH = TOLERATED_DEPTH
 # A path repeats a failure if it reaches this fraction of the failed path's depth, within this distance (robot radii).
@@ -157,24 +156,22 @@ class LocalOptima:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
         is_expensive = math.isfinite(guess.cost) and self._is_expensive(guess, DIRECT_ERROR)
         iterations = EXPENSIVE_ITERATIONS if is_expensive else MAX_ITERATIONS
-        weight = self.scenario.cost.speed_weight
-        path = optimise(problem, guess, weight, iterations)
+        path = optimise(problem, guess, iterations)
         if problem.horizon is None:
             for _ in range(MAX_LENGTHENED):
                 # Otherwise more time would not help: the path is feasible, or the descent is slow.
                 if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):
                     break
                 guess = guess.scaled(LENGTHENING)
-                path = optimise(problem, guess, weight, iterations)
+                path = optimise(problem, guess, iterations)
         self.is_in_time = self.is_in_time or (path.converged and path.violation < MAX_VIOLATION)
         return path
 
     def _is_limited(self, path: DirectPath) -> bool:
-        """Return whether controls are at their limits for a large fraction of a path."""
-        at_limit = np.abs(path.controls) > (1.0 - LIMIT_TOLERANCE) * self._limits
-        return float(at_limit.any(axis=1).mean()) > MAX_LIMITED_FRACTION
+        """Return whether controls are at their limits somewhere on a path."""
+        return bool((np.abs(path.controls) > (1.0 - LIMIT_TOLERANCE) * self._limits).any())
 
-    def _refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
+    def refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
         """Return the optimum on halved intervals; a free horizon is changed until the cost is almost stationary."""
         refined = direct.refined()
         if problem.horizon is not None or not direct.converged:
@@ -196,7 +193,7 @@ class LocalOptima:
         if self._is_discarded(problem, direct, direct, DIRECT_ERROR):
             return
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
-        refined = self._refine(problem, direct)
+        refined = self.refine(problem, direct)
         refined_shape = _shape(refined.times, refined.states)
         is_duplicate = self._is_seen(refined_shape)
         self._seen += [shape, refined_shape]

@@ -211,8 +211,8 @@ class FeasiblePath:
         self.evaluations += evaluations
         return states, costates
 
-    def split(self) -> None:
-        """Divide every arc in two, which changes neither the path nor its cost."""
+    def split(self) -> bool:
+        """Divide every arc in two, which changes neither the path nor its cost; False if an arc diverges."""
         arrays, size = self.problem.arrays, self.nodes.shape[1]
         times, nodes = np.repeat(self.times, 2)[:-1], np.repeat(self.nodes, 2, axis=0)[:-1]
         times[1::2] = (self.times[1:] + self.times[:-1]) / 2
@@ -220,11 +220,14 @@ class FeasiblePath:
         for k in range(self.segments):
             half = times[2 * k + 1] - times[2 * k]
             z, none = self.nodes[k].copy(), np.empty((size, 0))
-            cost, _, _, evaluations = propagate(arrays.flow, z, none, half, self.accuracy, 0.0, False)
+            success, cost, _, _, evaluations = propagate(arrays.flow, z, none, half, self.accuracy, 0.0, False)
+            self.evaluations += evaluations
+            if not success:
+                return False
             nodes[2 * k + 1] = z
             costs[2 * k : 2 * k + 2] = cost, self.costs[k] - cost
-            self.evaluations += abs(evaluations)
         self.times, self.nodes, self.costs = times, nodes, costs
+        return True
 
     def _record(self, phase: str, rejected: tuple[int, ...]) -> None:
         """Append an iteration to the history; increase the accuracy of the integrator if the defects require it."""
@@ -258,7 +261,8 @@ def dense_path(
         points: smallest number of points.
 
     Returns:
-        Times (K,) and states (K, n), K >= points.
+        Times (K,) and states (K, n), K >= points. States are NaN from where the flow diverges to the next node, which
+        leaves a gap in a plot.
 
     """
     arrays, n = problem.arrays, problem.system.n
@@ -271,6 +275,9 @@ def dense_path(
         states[at] = z[:n]
         for j in range(at + 1, at + steps + 1):
             step = dense[j] - dense[j - 1]
-            propagate(arrays.flow, z, none, step, DISPLAY_ACCURACY, 0.0, False)
+            success, *_ = propagate(arrays.flow, z, none, step, DISPLAY_ACCURACY, 0.0, False)
+            if not success:
+                states[j : at + steps + 1] = np.nan
+                break
             states[j] = z[:n]
     return dense, states

@@ -93,7 +93,9 @@ def _sweep_and_reduce(iterate: FeasiblePath, options: SolverOptions) -> Extremal
                 if iterate.segments > MAX_SEGMENTS:
                     status = Status.SUBPROBLEM
                     break
-                iterate.split()
+                if not iterate.split():
+                    status = Status.DIVERGED
+                    break
                 n_rejected_sweeps = 0
             continue
         removed = iterate.reduce()
@@ -111,7 +113,8 @@ def _sweep_and_reduce(iterate: FeasiblePath, options: SolverOptions) -> Extremal
             failures += 1
             min_gain *= 0.1
             while iterate.segments < MIN_SEGMENTS // 2:
-                iterate.split()
+                if not iterate.split():
+                    return _certify(iterate, Status.DIVERGED)
     return _certify(iterate, status)
 
 

@@ -94,10 +94,10 @@ def solve_costate(flow, z, end, time, options, z_end, log):
             for i in range(2 * n):
                 trial[i] = start[i]
             set_identity(S, n)
-            trial_cost, _, following, count = propagate(flow, trial, S, duration, required, hint, False)
-            evaluations += abs(count)
+            success, trial_cost, _, following, count = propagate(flow, trial, S, duration, required, hint, False)
+            evaluations += count
             norm, residual = 0.0, 0.0
-            if count < 0:
+            if not success:
                 norm = np.inf
             else:
                 if end.free_time:
@@ -284,11 +284,11 @@ def segment_growth(flow, times, Z, growth):
         for i in range(size):
             z[i] = Z[k, i]
         set_identity(S, 0)
-        _, _, _, count = propagate(flow, z, S, times[k + 1] - times[k], COARSE_ACCURACY, 0.0, False)
-        evaluations += abs(count)
+        success, _, _, _, count = propagate(flow, z, S, times[k + 1] - times[k], COARSE_ACCURACY, 0.0, False)
+        evaluations += count
         largest = 0.0
         for i in range(size):
             for j in range(size):
                 largest = max(largest, abs(S[i, j]))
-        growth[k] = largest if count > 0 else np.inf
+        growth[k] = largest if success else np.inf
     return evaluations

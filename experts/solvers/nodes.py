@@ -47,9 +47,14 @@ def start_nodes(
     Returns:
         Times (segments + 1,) and nodes (segments + 1, 2n).
 
+    Raises:
+        ValueError: the path has another number of states.
+
     """
     times = np.linspace(0.0, problem.horizon_of(path), segments + 1) if isinstance(segments, int) else segments
     resampled = path.resample(times)
+    if resampled.states.shape[1] != problem.system.n:
+        raise ValueError(f"states: expected {problem.system.n} columns, got {resampled.states.shape[1]}")
     costates = resampled.costates if resampled.costates is not None else problem.estimate_costates(resampled)
     arrays = problem.arrays
     nodes = np.concatenate([resampled.states, costates], axis=1)

@@ -62,7 +62,8 @@ def _condition(end, at_horizon):
 def measure_defects(flow, path, end, accuracy):
     """Return the largest defects of states and of costates at the nodes, and the number of evaluations of the flow.
 
-    If the final time is free, the Hamiltonian at the start counts as a defect of the costates.
+    If the final time is free, the Hamiltonian at the start counts as a defect of the costates. Where the flow diverges,
+    both defects are infinite.
     """
     times, Z = path.times, path.nodes
     n = len(end.goal)
@@ -73,8 +74,10 @@ def measure_defects(flow, path, end, accuracy):
         costates = abs(hamiltonian(flow, Z[0], np.empty(2 * n)))
     for k in range(p):
         z = Z[k].copy()
-        _, _, _, count = propagate(flow, z, S, times[k + 1] - times[k], accuracy, 0.0, False)
-        evaluations += abs(count)
+        success, _, _, _, count = propagate(flow, z, S, times[k + 1] - times[k], accuracy, 0.0, False)
+        evaluations += count
+        if not success:
+            return np.inf, np.inf, evaluations
         for i in range(n):
             if k < p - 1:
                 states = max(states, abs(z[i] - Z[k + 1, i]))
@@ -122,17 +125,25 @@ def connect(flow, path, end, options):
     return failed, evaluations
 
 
-@kernel(tuple_of(float64, float64, int64)(FLOW, VECTOR, float64, float64, float64))
+@kernel(tuple_of(boolean, float64, float64, int64)(FLOW, VECTOR, float64, float64, float64))
 def _half_cost(flow, z, duration, cost, accuracy):
-    """Advance z, in place, to half of the cost of its extremal; return (elapsed time, cost so far, evaluations)."""
+    """Advance z, in place, to half of the cost of its extremal.
+
+    Returns (success, elapsed time, cost so far, evaluations); without success the flow diverged, and z is NaN.
+    """
     S = np.empty((len(z), 0))
     probe, evaluations = z.copy(), 0
     reached, elapsed, step, target = 0.0, 0.0, duration / MIN_HALF_COST_STEPS, cost / 2.0
     part, taken = 0.0, 0.0
     while elapsed < duration:
-        part, taken, following, count = propagate(flow, probe, S, min(step, duration - elapsed), accuracy, step, True)
-        evaluations += abs(count)
-        if count < 0 or reached + part > target:
+        rest = min(step, duration - elapsed)
+        success, part, taken, following, count = propagate(flow, probe, S, rest, accuracy, step, True)
+        evaluations += count
+        if not success:
+            for i in range(len(z)):
+                z[i] = np.nan
+            return False, elapsed, reached, evaluations
+        if reached + part > target:
             break
         for i in range(len(z)):
             z[i] = probe[i]
@@ -141,8 +152,8 @@ def _half_cost(flow, z, duration, cost, accuracy):
         step = min(following, duration / MIN_HALF_COST_STEPS)
     # Within the last step the cost grows almost linearly in time.
     rest = taken * (target - reached) / part if part > 0 else 0.0
-    part, _, _, count = propagate(flow, z, S, rest, accuracy, 0.0, False)
-    return elapsed + rest, reached + part, evaluations + abs(count)
+    success, part, _, _, count = propagate(flow, z, S, rest, accuracy, 0.0, False)
+    return success, elapsed + rest, reached + part, evaluations + count
 
 
 @kernel(int64(FLOW, ARC_PATH, END_CONDITION, NEWTON_OPTIONS, boolean, int64, int64, FLAGS))
@@ -178,19 +189,22 @@ def sweep(flow, path, end, options, half_cost, first, stride, rejected):
         else:
             rejected[i] = True
             continue
-        elapsed, first_cost = 0.0, 0.0
+        elapsed, first_cost, success = 0.0, 0.0, False
         for e in range(2 * n):
             middle[e] = z[e]
         if half_cost and cost > 0.0:
-            elapsed, first_cost, count = _half_cost(flow, middle, duration, cost, accuracy)
+            success, elapsed, first_cost, count = _half_cost(flow, middle, duration, cost, accuracy)
             evaluations += count
         # Half of the cost is reached close to a neighbour, or nowhere, if the cost accrues at one end or is negative.
-        if not MIN_FRACTION * duration < elapsed < (1.0 - MIN_FRACTION) * duration:
+        if not success or not MIN_FRACTION * duration < elapsed < (1.0 - MIN_FRACTION) * duration:
             for e in range(2 * n):
                 middle[e] = z[e]
             elapsed = duration / 2.0
-            first_cost, _, _, count = propagate(flow, middle, S, elapsed, accuracy, 0.0, False)
-            evaluations += abs(count)
+            success, first_cost, _, _, count = propagate(flow, middle, S, elapsed, accuracy, 0.0, False)
+            evaluations += count
+        if not success:  # the extremal cannot be integrated to its middle, although shooting found its end
+            rejected[i] = True
+            continue
         for e in range(2 * n):
             Z[i - 1, e], Z[i, e] = z[e], middle[e]
             if i == p - 1:

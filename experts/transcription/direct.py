@@ -119,7 +119,6 @@ def follow_controls(problem: OptimalControlProblem, states: np.ndarray, rates: n
 def optimise(
     problem: OptimalControlProblem,
     guess: DirectPath,
-    speed_weight: float | None = None,
     max_iterations: int = MAX_ITERATIONS,
 ) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
@@ -127,45 +126,46 @@ def optimise(
     Args:
         problem: the problem of a scenario, with the winding of the goal heading chosen.
         guess: initial guess; its states, controls and costates need not be consistent.
-        speed_weight: cost weight of the squared speed, the unit of the costs; None for that of the first control.
         max_iterations: number of iterations after which the result has not converged, for a path of up to
             2 INTERVALS_PER_LIMIT intervals.
 
     """
     max_iterations *= min(max(1, len(guess.controls) // INTERVALS_PER_LIMIT), MAX_LIMITS)
     arrays = problem.arrays
-    speed_weight = speed_weight or problem.control_weight[0]
     scale = max(math.dist(problem.start[:2], arrays.goal[:2]) / 5.0, 0.1)
     tolerance = STEP_TOLERANCE * min(scale, 1.0)
     states, controls = guess.states.copy(), guess.controls.copy()
     states[0] = arrays.start
     h = np.diff(guess.times)
-    costates = guess.costates / speed_weight
-    converged, cost, violation, within_limits = False, math.inf, math.inf, True
     on_arcs = _on_arcs(problem)
+    # The unit of the costs: the weight of the squared speed, of which the kernels of arcs assume that it is 1.
+    unit = problem.control_weight[0] if on_arcs is None else on_arcs[0]
+    costates = guess.costates / unit
+    converged, cost, violation, within_limits = False, math.inf, math.inf, True
     if on_arcs is not None:
-        turn_weight, limits, wheels = on_arcs
+        _, turn_weight, limits, wheels = on_arcs
         motion = controls if wheels is None else np.ascontiguousarray(np.linalg.solve(wheels, controls.T).T)
-        task = arcs.DiscreteProblem(h, arrays.end, turn_weight, 1.0 / speed_weight, limits, arrays.field)
+        task = arcs.DiscreteProblem(h, arrays.end, turn_weight, 1.0 / unit, limits, arrays.field)
         converged, cost, violation = arcs_descent.descend(task, states, motion, costates, tolerance, max_iterations)
-        cost += problem.time_weight * guess.times[-1] / speed_weight
+        cost += problem.time_weight * guess.times[-1] / unit
         controls = motion if wheels is None else motion @ wheels.T
         within_limits = wheels is None or bool((np.abs(controls) <= arrays.data[4:6] + 1e-9).all())
     if on_arcs is None or not within_limits:
         general = midpoint.DiscreteProblem(
-            h, arrays.end, arrays.data, arrays.field, 1.0 / speed_weight, *problem.compiled_dynamics
+            h, arrays.end, arrays.data, arrays.field, 1.0 / unit, *problem.compiled_dynamics
         )
         converged, cost, violation = descent.descend(general, states, controls, costates, tolerance, max_iterations)
-    costates, cost = costates * speed_weight, cost * speed_weight
+    costates, cost = costates * unit, cost * unit
     return DirectPath(guess.times, states, controls, costates, cost, violation, converged)
 
 
-def _on_arcs(problem: OptimalControlProblem) -> tuple[float, np.ndarray, np.ndarray | None] | None:
+def _on_arcs(problem: OptimalControlProblem) -> tuple[float, float, np.ndarray, np.ndarray | None] | None:
     """Return how a problem is that of a unicycle, whose limits may be wider; None if it is not.
 
     Returns:
-        The turn weight divided by the speed weight, the limits (2,) of speed (m/s) and turn rate (rad/s), and the
-        matrix (2, 2) that maps speed and turn rate to wheel speeds, None if the controls are speed and turn rate.
+        The speed weight, the turn weight divided by the speed weight, the limits (2,) of speed (m/s) and turn rate
+        (rad/s), and the matrix (2, 2) that maps speed and turn rate to wheel speeds, None if the controls are speed and
+        turn rate.
 
     """
     if problem.footprint is not None:
@@ -173,10 +173,11 @@ def _on_arcs(problem: OptimalControlProblem) -> tuple[float, np.ndarray, np.ndar
     limits = problem.arrays.data[4:6]
     first, second = problem.control_weight[:2]
     if problem.system == unicycle():
-        return second / first, limits, None
+        return first, second / first, limits, None
     if problem.system == differential_drive() and first == second:
         track = problem.parameters[0]
-        return track**2 / 4, np.array([limits.max(), 2 * limits.max() / track]), _wheels(problem)
+        # The sum of the squared wheel speeds is 2 v^2 + track^2 omega^2 / 2.
+        return 2 * first, track**2 / 4, np.array([limits.max(), 2 * limits.max() / track]), _wheels(problem)
     return None
 
 

@@ -19,8 +19,7 @@ from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.search.candidates import best_candidate
-from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.initial_guess import best_path
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.feasible_path import dense_path
 from leapnav.experts.solvers.multiple_shooting import polish
@@ -68,10 +67,10 @@ def compare_methods() -> dict[str, Any]:
 
     """
     scenario = METHODS_SCENARIO
-    candidate = best_candidate(Lattice(scenario))
-    assert candidate is not None
-    guess = Trajectory(candidate.times, candidate.poses)
-    problem = OptimalControlProblem.from_scenario(scenario).with_winding_of(guess.states)
+    problem = OptimalControlProblem.from_scenario(scenario)
+    guess = best_path(scenario)
+    assert guess is not None
+    problem = problem.with_winding_of(guess.states)
     times, nodes = start_nodes(problem, guess, SEGMENTS)
     optimum = find_optimum(scenario)
     methods = [

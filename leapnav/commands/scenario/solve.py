@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +60,7 @@ class Solve:
             print(f"  residual           {certificate.residual:.1e}")
             print(f"  defect             {certificate.defect:.1e}")
             print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")
-            print(f"  conjugate point    {'none' if conjugate is None else f'{conjugate:.3f} s'}")
+            print(f"  conjugate point    {_describe_conjugate_point(conjugate)}")
             print(f"  clearance          {certificate.clearance:.3f} m")
             scope = " (of the best candidate only)" if self.method == "optimum" else ""
             print(f"  iterations         {len(extremal.history)}{scope}")
@@ -85,19 +86,24 @@ class Solve:
             print(f"wrote {self.plot}")
 
 
+def _describe_conjugate_point(time: float | None) -> str:
+    if time is None:
+        return "none"
+    return "unknown: the sensitivities diverge" if math.isnan(time) else f"{time:.3f} s"
+
+
 def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
     """Solve by every method from the same initial guess, and print the results side by side."""
-    from leapnav.experts import OptimalControlProblem, Status, Trajectory, solve
+    from leapnav.experts import OptimalControlProblem, Status, solve
     from leapnav.experts.problem.certificate import failure
-    from leapnav.experts.search.candidates import best_candidate
-    from leapnav.experts.search.lattice import Lattice
+    from leapnav.experts.search.initial_guess import initial_guess
     from leapnav.experts.solve import Method
 
-    candidate = best_candidate(Lattice(scenario))
-    if candidate is None:
+    problem = OptimalControlProblem.from_scenario(scenario)
+    guess = initial_guess(scenario, problem)
+    if guess is None:
         print(f"{scenario.name}: {Status.NO_PATH.name}: {Status.NO_PATH.value}")
-        return dict.fromkeys(get_args(Method), failure(OptimalControlProblem.from_scenario(scenario), Status.NO_PATH))
-    guess = Trajectory(candidate.times, candidate.poses)
+        return dict.fromkeys(get_args(Method), failure(problem, Status.NO_PATH))
     extremals, seconds = {}, {}
     for method in get_args(Method):
         # The first solve loads or compiles the kernels, so that the second one measures the method alone.
