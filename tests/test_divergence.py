@@ -124,8 +124,8 @@ def test_feedback_does_not_act_on_a_solution_that_diverges():
     feedback = Feedback(SCENARIO, Trajectory(optimum.times, optimum.states, optimum.costates))
     good = feedback._stored
     feedback._stored = good._replace(nodes=np.full_like(good.nodes, 1e15))
-    assert np.isnan(follow(feedback._arrays.flow, *feedback._stored[:2], 0.1)).all()
-    assert np.isnan(follow_all(feedback._arrays.flow, *feedback._stored[:2], np.array([0.1, 0.2]))).all()
+    assert np.isnan(follow(good.arrays.flow, *feedback._stored[:2], 0.1)).all()
+    assert np.isnan(follow_all(good.arrays.flow, *feedback._stored[:2], np.array([0.1, 0.2]))).all()
     with pytest.raises(FloatingPointError, match=r"diverges before 0\.1 s"):
         feedback.control(0.1)
     with pytest.raises(FloatingPointError, match="diverge"):

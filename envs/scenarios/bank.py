@@ -40,8 +40,8 @@ import re
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, overload
 
 import numpy as np
@@ -49,6 +49,7 @@ import numpy as np
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import HORIZON, Scenario
 from leapnav.envs.shapes.field import check_field
+from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 FORMAT, VERSION, VERSION_WITHOUT_GRIDS = "leapnav-bank", 4, 5
@@ -205,6 +206,7 @@ class ScenarioBank(Sequence[Scenario]):
         self.lower_bounds = arrays.get(LOWER_BOUNDS, unknown)
         self._scenarios: dict[int, Scenario] = {}
         self._fields: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._lock = Lock()  # of the fields, whose order threads change
         self._check_widths()
 
     @property
@@ -342,15 +344,15 @@ class ScenarioBank(Sequence[Scenario]):
 
         """
         i = self._check_index(index)
-        if i in self._fields:
-            self._fields.move_to_end(i)
-            return self._fields[i]
-        start, end = self._span("field_ends", i)
-        stored = self._array("fields")[start:end]
-        self._fields[i] = check_field(stored)
-        if len(self._fields) > MAX_FIELDS:
-            self._fields.popitem(last=False)
-        return self._fields[i]
+        with self._lock:
+            if i in self._fields:
+                self._fields.move_to_end(i)
+                return self._fields[i]
+            start, end = self._span("field_ends", i)
+            field = self._fields[i] = check_field(self._array("fields")[start:end])
+            if len(self._fields) > MAX_FIELDS:
+                self._fields.popitem(last=False)
+            return field
 
     def states(self, index: int) -> np.ndarray:
         """Return the states (N, n_q) of the optimum of a scenario, see `Reference`.
@@ -396,7 +398,7 @@ def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed"
     return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), name])
 
 
-@cache
+@computed_once()
 def _shipped(name: str, split: str) -> ScenarioBank:
     return ScenarioBank(BANK_DIRECTORY / f"{name}-{split}.bank")
 

@@ -106,7 +106,7 @@ def as_matrix(
 def _as_array(name: str, values: Any, shape: tuple[int | None, ...], finite: bool) -> np.ndarray:
     expected = f"({', '.join('any' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
     try:
-        array = np.ascontiguousarray(values, dtype=np.float64)
+        array = np.require(values, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected numbers of the shape {expected}, got {values!r}") from None
     # A scalar becomes a vector of one number, which is not accepted in place of one.

@@ -10,13 +10,14 @@ import numpy as np
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearances
+from leapnav.envs.utils.validation import as_vector
 from leapnav.experts.acting.gains import Gains
 from leapnav.experts.acting.tracking import FLOW_ACCURACY, advance, control_at, follow, follow_all
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.optimum import find_optimum
-from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.problem.problem import OptimalControlProblem, ProblemArrays, Trajectory
 from leapnav.experts.solvers.newton import CONVERGED, MARGIN
 from leapnav.experts.solvers.nodes import start_nodes
 
@@ -34,11 +35,20 @@ GAIN_HOLD = 0.25  # s before the horizon from which the gains are constant, beca
 
 
 class _Solution(NamedTuple):
-    """Times (K + 1,) in the episode, nodes (K + 1, 2n) of states and costates, and costs (K,) of the segments."""
+    """A solution from a state to the goal.
+
+    Attributes:
+        times: (K + 1,), in the episode (s).
+        nodes: (K + 1, 2n), states and costates.
+        costs: (K,), of the segments.
+        arrays: the problem, whose goal has the winding of the solution.
+
+    """
 
     times: np.ndarray
     nodes: np.ndarray
     costs: np.ndarray
+    arrays: ProblemArrays
 
 
 class Feedback:
@@ -66,23 +76,13 @@ class Feedback:
         self.searches = 0
         self._next_search = 0.0  # s; earliest time of the next search
         self._n, self._m = scenario.robot.sizes()
-        problem = OptimalControlProblem.from_scenario(scenario)
-        if not self._adopt(problem, path, 0.0) and not self._search(np.array(scenario.start_state), 0.0):
+        found = _solve_along(OptimalControlProblem.from_scenario(scenario), path, 0.0)
+        if found is None:
+            self.searches += 1
+            found = self._search(np.array(scenario.start_state), 0.0)
+        if found is None:
             raise ValueError(f"scenario {scenario.name!r}: no optimum was found")
-
-    def _adopt(self, problem: OptimalControlProblem, path: Trajectory, start_time: float) -> bool:
-        """Solve a problem that starts at `start_time`, and store the solution; False without one."""
-        problem = problem.with_winding_of(path.states)
-        previous, self._arrays = getattr(self, "_arrays", problem.arrays), problem.arrays
-        for duration in SEGMENT_DURATIONS:
-            segments = max(1, math.ceil(problem.horizon_of(path) / duration - 1e-9))
-            times, nodes = start_nodes(problem, path, segments)
-            found, _, _ = self._newton(times + start_time, nodes, problem.arrays.start, start_time, TOLERANCE)
-            if found is not None:
-                self._stored = found
-                return True
-        self._arrays = previous
-        return False
+        self._stored = found
 
     def update(self, state: np.ndarray, time: float) -> bool:
         """Re-solve from a state at a time, and store the solution.
@@ -95,13 +95,18 @@ class Feedback:
             Whether there is a solution; without one, the previous solution remains stored.
 
         """
-        found = self._resolve(np.array(state, dtype=float), time, TOLERANCE)
+        found, has_searched = self._resolve(as_vector("state", state, self._n), time, TOLERANCE)
+        self.searches += has_searched
         if found is not None:
             self._stored = found
+        elif has_searched:
+            self._next_search = time + SEARCH_PAUSE
         return found is not None
 
     def value(self, state: np.ndarray, time: float, tol: float = 1e-9) -> tuple[float, np.ndarray]:
-        """Return the cost-to-go and its gradient, the costate (n,); the stored solution is unchanged.
+        """Return the cost-to-go and its gradient, the costate (n,).
+
+        Nothing is changed, so that several threads may ask at once.
 
         Args:
             state: the robot's state, shape (n,).
@@ -112,11 +117,7 @@ class Feedback:
             ValueError: no solution was found.
 
         """
-        stored = self._arrays, self._stored, self._next_search
-        try:
-            found = self._resolve(np.array(state, dtype=float), time, tol)
-        finally:
-            self._arrays, self._stored, self._next_search = stored
+        found, _ = self._resolve(as_vector("state", state, self._n), time, tol)
         if found is None:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
         return float(found.costs.sum()), found.nodes[0, self._n :].copy()
@@ -138,7 +139,7 @@ class Feedback:
             FloatingPointError: the solution diverges on the way to this time.
 
         """
-        arrays, (times, nodes, _) = self._arrays, self._stored
+        times, nodes, _, arrays = self._stored
         control = control_at(arrays.flow, arrays.control, times, nodes, time, self._m)
         if not np.isfinite(control).all():
             raise FloatingPointError(f"the stored solution diverges before {time:g} s")
@@ -151,10 +152,10 @@ class Feedback:
             FloatingPointError: the sensitivities diverge along the solution.
 
         """
-        arrays = self._arrays
-        start, end = float(self._stored.times[0]), float(self._stored.times[-1])
+        stored_times, stored_nodes, _, arrays = self._stored
+        start, end = float(stored_times[0]), float(stored_times[-1])
         times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_SAMPLING - 1e-9) + 1))
-        extremal = np.array([follow(arrays.flow, *self._stored[:2], time) for time in times])
+        extremal = np.array([follow(arrays.flow, stored_times, stored_nodes, time) for time in times])
         n = self._n
         transitions = np.empty((len(times) - 1, 2 * n, 2 * n))
         for k, transition in enumerate(transitions):
@@ -184,48 +185,30 @@ class Feedback:
         slopes[last:] = slopes[last]
         return Gains(times, extremal, slopes, arrays.control, arrays.data, self._m)
 
-    def _resolve(self, state: np.ndarray, time: float, tol: float) -> _Solution | None:
-        """The solution from a state and time, None without one."""
-        left = self._stored.times[-1] - time
+    def _resolve(self, state: np.ndarray, time: float, tol: float) -> tuple[_Solution | None, bool]:
+        """Return the solution from a state and time, None without one, and whether a search was made."""
+        stored = self._stored
+        left = stored.times[-1] - time
         if left <= 0.0 and self.scenario.horizon is not None:
-            return None
-        if left <= MIN_FREE_TIME and self.scenario.horizon is None:  # the robot has missed the goal
-            return self._stored if self._search(state, time) else None
-        found, times, nodes = self._newton(*self._stored[:2], state, time, tol)
-        check_clearance = np.abs(state[:3] - nodes[0, :3]).max() > LARGE_DEVIATION
-        if found is None:
-            found, check_clearance = self._approach(times, nodes, state, tol), True
+            return None, False
+        found, check_clearance = None, True
+        if left > MIN_FREE_TIME or self.scenario.horizon is not None:  # otherwise the robot has missed the goal
+            found, times, nodes = _solve_from(stored, state, time, tol)
+            check_clearance = np.abs(state[:3] - nodes[0, :3]).max() > LARGE_DEVIATION
+            if found is None:
+                found, check_clearance = _approach(stored._replace(times=times, nodes=nodes), state, tol), True
         if found is not None and check_clearance and not self._clearance(found) > 0.0:  # NaN where it diverges
             found = None
-        if found is not None or not self._search(state, time):
-            return found
-        return self._stored if tol >= TOLERANCE else self._newton(*self._stored[:2], state, time, tol)[0]
-
-    def _newton(
-        self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, time: float, tol: float
-    ) -> tuple[_Solution | None, np.ndarray, np.ndarray]:
-        """Solve from a state at a time by Newton's method, with the remaining nodes as the initial guess.
-
-        Returns the solution, None without convergence, and the times and values of the remaining nodes.
-        """
-        arrays = self._arrays
-        code, times, nodes, costs, remaining = advance(arrays.flow, times, nodes, state, time, arrays.end, MARGIN * tol)
-        return (_Solution(times, nodes, costs) if code == CONVERGED else None), times, remaining
-
-    def _approach(self, times: np.ndarray, nodes: np.ndarray, state: np.ndarray, tol: float) -> _Solution | None:
-        """Solve by continuation in the state, with steps that are halved when they fail."""
-        start = nodes[0, : self._n]
-
-        def advance_to(fraction: float, previous: _Solution) -> _Solution | None:
-            target = start + fraction * (state - start)
-            return self._newton(previous.times, previous.nodes, target, times[0], tol)[0]
-
-        guess = _Solution(times, nodes, np.zeros(len(times) - 1))
-        return step_halving(advance_to, guess, first_step=0.5, min_step=MIN_STEP)
+        if found is not None or time < self._next_search:
+            return found, False
+        found = self._search(state, time)
+        if found is not None and tol < TOLERANCE:
+            found = _solve_from(found, state, time, tol)[0]
+        return found, True
 
     def _clearance(self, solution: _Solution) -> float:
         """Smallest clearance (m) of states of a solution that are evenly spaced in time."""
-        arrays, (times, nodes, _) = self._arrays, solution
+        times, nodes, _, arrays = solution
         count = math.ceil((times[-1] - times[0]) / CLEARANCE_SAMPLING) + 1
         moments = np.linspace(times[0], times[-1], count)
         states = follow_all(arrays.flow, times, nodes, moments)
@@ -238,20 +221,52 @@ class Feedback:
         except ScenarioError:
             return None
 
-    def _search(self, state: np.ndarray, time: float) -> bool:
-        """Search for the optimum from a state and time, and store it; False without one."""
-        if time < self._next_search:
-            return False
-        self.searches += 1
+    def _search(self, state: np.ndarray, time: float) -> _Solution | None:
+        """Search for the optimum from a state and time; None without one."""
         scenario = self._remaining_scenario(state, time)
         if scenario is None:
-            return False
+            return None
         optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
+        if not optimum.success:
+            return None
         path = Trajectory(optimum.times, optimum.states, optimum.costates)
-        if optimum.success and self._adopt(optimum.problem, path, time):
-            return True
-        self._next_search = time + SEARCH_PAUSE
-        return False
+        return _solve_along(optimum.problem, path, time)
+
+
+def _solve_along(problem: OptimalControlProblem, path: Trajectory, start_time: float) -> _Solution | None:
+    """Return the solution close to a path of a problem that starts at `start_time` (s) in the episode."""
+    problem = problem.with_winding_of(path.states)
+    for duration in SEGMENT_DURATIONS:
+        segments = max(1, math.ceil(problem.horizon_of(path) / duration - 1e-9))
+        times, nodes = start_nodes(problem, path, segments)
+        guess = _Solution(times + start_time, nodes, np.zeros(segments), problem.arrays)
+        found, _, _ = _solve_from(guess, problem.arrays.start, start_time, TOLERANCE)
+        if found is not None:
+            return found
+    return None
+
+
+def _solve_from(
+    guess: _Solution, state: np.ndarray, time: float, tol: float
+) -> tuple[_Solution | None, np.ndarray, np.ndarray]:
+    """Solve from a state at a time by Newton's method, with the remaining nodes of a solution as the initial guess.
+
+    Returns the solution, None without convergence, and the times and values of the remaining nodes.
+    """
+    times, nodes, _, arrays = guess
+    code, times, nodes, costs, remaining = advance(arrays.flow, times, nodes, state, time, arrays.end, MARGIN * tol)
+    return (_Solution(times, nodes, costs, arrays) if code == CONVERGED else None), times, remaining
+
+
+def _approach(guess: _Solution, state: np.ndarray, tol: float) -> _Solution | None:
+    """Solve by continuation in the state, with steps that are halved when they fail."""
+    times, start = guess.times, guess.nodes[0, : len(state)]
+
+    def advance_to(fraction: float, previous: _Solution) -> _Solution | None:
+        target = start + fraction * (state - start)
+        return _solve_from(previous, target, times[0], tol)[0]
+
+    return step_halving(advance_to, guess, first_step=0.5, min_step=MIN_STEP)
 
 
 def _free_final_time(slopes: np.ndarray, factors: np.ndarray, rates: np.ndarray, free: np.ndarray) -> None:

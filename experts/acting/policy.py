@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -133,7 +134,8 @@ class ExpertPolicy:
 
     def drives(self, env: Any) -> bool:
         """Whether the policy belongs to an environment."""
-        return all(one is other for one, other in zip(self._envs, unwrap(env), strict=False))
+        others = unwrap(env)
+        return len(self._envs) == len(others) and all(map(operator.is_, self._envs, others))
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -6,7 +6,6 @@ controls independently, and needs the dynamics f(q, u) = a(q) + B(q) u, their Ja
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ from numba import float64, types
 
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
+from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.generated_flow import (
     PHI,
@@ -49,7 +49,7 @@ class CompiledDynamics(NamedTuple):
     state_cost: FunctionPointer
 
 
-@lru_cache(maxsize=64)
+@computed_once(maxsize=64)
 def compile_dynamics(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles) -> CompiledDynamics:
     """Compile the dynamics and the state cost of a system, see `leapnav.experts.problem.generated_flow.compile_flow`.
 

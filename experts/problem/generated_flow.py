@@ -9,13 +9,13 @@ a Python module with common subexpressions removed, and compiled into the user's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any, Literal
 
 import sympy as sp
 
 from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
@@ -30,7 +30,7 @@ IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.numerics.flow"
 Obstacles = Literal["none", "disc", "footprint"]
 
 
-@lru_cache(maxsize=64)
+@computed_once(maxsize=64)
 def compile_flow(
     system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles
 ) -> tuple[FunctionPointer, FunctionPointer]:

@@ -248,7 +248,7 @@ class LocalOptima:
             is_doubt = is_feasible and clearance.min() >= -self._slight_depth
             self._stalled.append(_Failure(refined.cost if is_doubt else np.inf, problem, refined))
             self._close_place(refined, clearance)
-        elif not any(_is_same(extremal, other) for other in (*self.certified, *self.refused)):
+        elif not self._is_known(extremal):
             self._seen.append(_shape(extremal.times, extremal.states))
             (self.certified if extremal.success else self.refused).append(extremal)
             if extremal.status is Status.COLLISION:
@@ -334,6 +334,15 @@ class LocalOptima:
         """Return whether a path, given by its `_shape`, is a duplicate of an earlier one."""
         return any(self._is_close(shape, other) for other in self._seen)
 
+    def _is_known(self, extremal: Extremal) -> bool:
+        """Return whether an extremal is a duplicate of an earlier one."""
+        shape = _shape(extremal.times, extremal.states)
+        for other in (*self.certified, *self.refused):
+            is_same_cost = abs(extremal.cost - other.cost) <= DUPLICATE_COST_TOLERANCE * abs(other.cost)
+            if is_same_cost and self._is_close(shape, _shape(other.times, other.states)):
+                return True
+        return False
+
     def _is_close(self, shape: np.ndarray, other: np.ndarray) -> bool:
         return bool(np.abs(shape - other).max() < self._duplicate_distance)
 
@@ -376,7 +385,7 @@ class LocalOptima:
             extremal, _ = self._extremal(problem, path, is_clear=False)
             if extremal is None:
                 self._stalled.append(_Failure(path.cost, problem, path))
-            elif not any(_is_same(extremal, other) for other in (*self.certified, *self.refused)):
+            elif not self._is_known(extremal):
                 (self.certified if extremal.success else self.refused).append(extremal)
         self._colliding = []
 
@@ -436,11 +445,3 @@ def _stalled(problem: OptimalControlProblem, direct: DirectPath) -> Extremal:
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the poses of a path at fixed fractions of the horizon, to compare it with others."""
     return interpolate(COMPARED_FRACTIONS * times[-1], times, np.ascontiguousarray(states[:, :3]))
-
-
-def _is_same(extremal: Extremal, other: Extremal) -> bool:
-    """Return whether two extremals are duplicates."""
-    if abs(extremal.cost - other.cost) > DUPLICATE_COST_TOLERANCE * abs(other.cost):
-        return False
-    shapes = (_shape(e.times, e.states) for e in (extremal, other))
-    return bool(np.abs(np.subtract(*shapes)).max() < DUPLICATE_DISTANCE)
