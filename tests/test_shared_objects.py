@@ -1,0 +1,113 @@
+"""Objects and caches that several threads use at once."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import sympy as sp
+from helpers import best_known
+
+from leapnav.envs import NavigateVectorEnv, ScenarioBank
+from leapnav.envs.utils.caching import computed_once
+from leapnav.experts import ControlAffineSystem, ExpertPolicy, OptimalControlProblem, Trajectory, find_optimum
+from leapnav.experts.acting.feedback import Feedback
+
+N_THREADS = 8
+
+
+def in_threads(function):
+    """Call a function with the number of each of eight threads, which start at once."""
+    barrier = threading.Barrier(N_THREADS)
+
+    def call(number):
+        barrier.wait()
+        return function(number)
+
+    with ThreadPoolExecutor(N_THREADS) as pool:
+        return list(pool.map(call, range(N_THREADS)))
+
+
+def test_a_result_is_computed_by_one_thread():
+    calls, waiting = [], threading.Event()
+
+    @computed_once()
+    def slow(argument):
+        calls.append(argument)
+        waiting.wait(0.05)
+        return object()
+
+    assert len(set(map(id, in_threads(lambda _: slow(1))))) == 1
+    assert calls == [1]
+
+
+def test_a_system_is_compiled_once():
+    x, y = sp.symbols("x y")
+    system = ControlAffineSystem(state=(x, y), drift=[y, -sp.sin(x) - sp.Rational(17, 1003) * y], fields=[[0, 1]])
+
+    def functions(_):
+        problem = OptimalControlProblem(system, [0.0, 0.0], [1.0, 0.0], 2.0, [1.0])
+        return problem.arrays.flow.function, problem.arrays.control, problem.compiled_dynamics.rates
+
+    found = in_threads(functions)
+    assert all(one is other for pair in found for one, other in zip(pair, found[0], strict=True))
+
+
+def test_the_value_of_many_states_at_once_is_that_of_each_alone():
+    scenario, _ = best_known()[0]
+    optimum = find_optimum(scenario)
+    path = Trajectory(optimum.times, optimum.states, optimum.costates)
+    feedback = Feedback(scenario, path)
+    rng = np.random.default_rng(0)
+    times = np.linspace(0.0, 0.6 * scenario.horizon, N_THREADS)
+    states = optimum.evaluate(times)[0] + 0.02 * rng.normal(size=(N_THREADS, 3))
+    before = feedback.control(0.5), feedback.stored, feedback.searches
+    alone = [Feedback(scenario, path).value(state, time) for state, time in zip(states, times, strict=True)]
+    for _ in range(3):
+        found = in_threads(lambda number: feedback.value(states[number], times[number]))
+        for (cost, costate), (expected, expected_costate) in zip(found, alone, strict=True):
+            assert cost == pytest.approx(expected, rel=1e-7)
+            np.testing.assert_allclose(costate, expected_costate, atol=1e-5)
+    # Also while the stored solution is replaced.
+    in_threads(lambda number: feedback.update(states[0], 0.0) if number == 0 else feedback.value(states[0], 0.0))
+    feedback = Feedback(scenario, path)
+    feedback.value(states[3], times[3])
+    np.testing.assert_array_equal(feedback.control(0.5), before[0])
+    assert (feedback.stored[0], feedback.searches) == (before[1][0], before[2])
+
+
+def test_the_fields_of_a_bank_are_read_by_threads():
+    bank = ScenarioBank.shipped("clutter", "test")
+    expected = [bank[i].field for i in range(40)]
+
+    def read(number):
+        order = np.random.default_rng(number).permutation(40)
+        return all(np.array_equal(bank.field(int(i)), expected[i]) for _ in range(20) for i in order)
+
+    assert all(in_threads(read))
+
+
+def test_the_expert_acts_in_threads_as_alone():
+    def actions(workers):
+        env = NavigateVectorEnv(N_THREADS, "rooms")
+        expert = ExpertPolicy(env, workers=workers)
+        observations, _ = env.reset(seed=5)
+        found = []
+        for _ in range(5):
+            action, _ = expert.predict(observations)
+            found.append(action)
+            observations, *_ = env.step(action)
+        return np.array(found), expert.value()
+
+    (alone, value), (threaded, threaded_value) = actions(1), actions(N_THREADS)
+    np.testing.assert_allclose(threaded, alone, atol=1e-6)
+    np.testing.assert_allclose(threaded_value, value, rtol=1e-8)
+
+
+def test_a_policy_does_not_drive_a_part_of_its_environments():
+    envs = [NavigateVectorEnv(2, "open") for _ in range(2)]
+    first = ExpertPolicy(envs[0])
+    assert first.drives(envs[0])
+    assert not first.drives(envs[1])
+    first._envs = [*first._envs, *ExpertPolicy(envs[1])._envs]
+    assert not first.drives(envs[0])
