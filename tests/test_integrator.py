@@ -90,3 +90,20 @@ def test_the_linear_solvers_agree_with_numpy():
     assert not solve_positive(-np.eye(2), np.ones((2, 1)))
     assert not solve_dense(np.zeros((2, 2)), np.ones(2))
     assert not solve_banded(np.zeros((4, 4)), np.ones(4), 1)
+
+
+@pytest.mark.parametrize("factor", [1e-200, 1e-15, 1.0, 1e15, 1e200])
+def test_the_unit_of_a_banded_system_does_not_matter(factor):
+    rng = np.random.default_rng(1)
+    half, size = 2, 12
+    rows = np.zeros((size, 3 * half + 1))
+    for i in range(size):
+        for j in range(max(0, i - half), min(size, i + half + 1)):
+            rows[i, j - i + half] = rng.normal() + (4.0 if i == j else 0.0)
+    right = rng.normal(size=size)
+    expected, found = right.copy(), factor * right
+    assert solve_banded(rows.copy(), expected, half)
+    assert solve_banded(factor * rows, found, half)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    rows[5] = 0.0  # singular in every unit
+    assert not solve_banded(factor * rows, factor * right, half)

@@ -16,7 +16,7 @@ from leapnav.experts.bounds.lower_bound import first_grid
 from leapnav.experts.proofs.cells import CellSet, Grid
 from leapnav.experts.proofs.checker import check_proof
 from leapnav.experts.proofs.gauge import gauge, gauge_minimum, gradient_bound, make_source
-from leapnav.experts.proofs.inequality import functionals, largest_square
+from leapnav.experts.proofs.inequality import functionals, gradient_ratios, largest_square
 from leapnav.experts.proofs.intervals import Interval
 from leapnav.experts.proofs.proof import Proof, ProofError, Spline, Stage
 from leapnav.experts.proofs.running_cost import running_cost
@@ -132,3 +132,21 @@ def test_functionals_that_overflow_are_refused():
     proof = Proof(scenario, 5e5, 0.5, width / 10, headings, (Stage(0, cells.layout.blocks, start, goal),))
     with pytest.raises(ProofError, match="the cells are too small"):
         check_proof(proof)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_coefficients_that_are_not_finite_bound_nothing(value: float):
+    """The compiler must not assume that there is no NaN or infinity: the ratio of such a cell is not finite."""
+    scenario = sample_scenario("open", seed=0)
+    grid = Grid.over(scenario.arena, 1.0, 8)
+    cells = CellSet.full(grid)
+    cost = running_cost(scenario, grid, cells.columns())
+    table = functionals(grid, (1.0, 0.5), cost.squares.shape[2])
+    values = np.zeros(cells.mask.shape, dtype=np.float32)
+    ratios = np.zeros_like(values)
+    _, worst = gradient_ratios(values, cells.layout, cells.mask, cost, table, 1.0, 1.0, ratios)
+    assert worst <= 1.0
+    values[0, 3, 4, 4] = value
+    _, worst = gradient_ratios(values, cells.layout, cells.mask, cost, table, 1.0, 1.0, ratios)
+    assert not worst <= 1e30
+    assert largest_square(np.full(99, 0.5), 0.1, np.nan) == np.inf

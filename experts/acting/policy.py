@@ -16,7 +16,7 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.unwrapping import unwrap
-from leapnav.envs.utils.validation import check_choice
+from leapnav.envs.utils.validation import as_matrix, as_vector, check_choice
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.gains import Gains
 from leapnav.experts.optimum import find_optimum
@@ -91,6 +91,17 @@ class _Robot:
     progress: float = 0.0
 
 
+def _check_reference(scenario: Scenario, path: Trajectory) -> Trajectory:
+    """Return the optimum of a scenario as arrays that kernels can read."""
+    n = len(scenario.robot.state_names)
+    times = as_vector("references: times", path.times)
+    states = as_matrix("references: states", path.states, len(times), n)
+    costates = None if path.costates is None else as_matrix("references: costates", path.costates, len(times), n)
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        raise ValueError(f"references: times: expected at least two increasing numbers, got {times}")
+    return Trajectory(times, states, costates)
+
+
 class ExpertPolicy:
     """Optimal policy for all robots of an environment, from any state.
 
@@ -110,7 +121,7 @@ class ExpertPolicy:
 
     Raises:
         TypeError: the environment is not one of leapnav's.
-        ValueError: `feedback` is unknown.
+        ValueError: `feedback` is unknown, or a reference has a wrong shape.
 
     """
 
@@ -127,7 +138,7 @@ class ExpertPolicy:
         self._quick = quick
         self._envs = unwrap(env)
         self._n, self._m = self._envs[0].settings.model.sizes()
-        self._references = dict(references or {})
+        self._references = {s: _check_reference(s, path) for s, path in (references or {}).items()}
         self._feedback = feedback
         self._workers = workers or os.cpu_count() or 1
         self._robots: list[_Robot | None] = [None] * sum(getattr(inner, "num_envs", 1) for inner in self._envs)
