@@ -27,6 +27,7 @@ test: lint .venv/examples
 test-all: test
 	$(PYTEST) -m "slow"
 	HYPOTHESIS_PROFILE=long $(PYTEST) tests/test_fuzz.py
+	NUMBA_BOUNDSCHECK=1 LEAPNAV_CACHE_DIR=$(CURDIR)/build/bounds-checked $(PYTEST)
 	$(BIN)/python scripts/build_banks.py --check
 	$(BIN)/python scripts/check_installations.py
 

@@ -63,8 +63,9 @@ def solve(
         method: "leapfrog", "multiple_shooting", "single_shooting" or "collocation".
         guess: a path, whose costates are estimated from its motion if it has none, or an extremal, possibly of a
             problem with another horizon, goal or obstacle. Its duration is the guess of a free horizon. None: for a
-            scenario the best path of the lattice search; for a problem the cheapest of several local minima over
-            piecewise constant controls, including neighbouring windings of the goal angles.
+            scenario the best path of the lattice search, improved by direct transcription; for a problem the cheapest
+            of several local minima over piecewise constant controls, including neighbouring windings of the goal
+            angles.
         tol: largest residual of the boundary and continuity conditions. The certificate requires 1e-8 in any case.
         max_iterations: maximum number of Newton steps.
         segments: number of shooting segments, of Leapfrog segments or of intervals of the first collocation mesh. None

@@ -18,6 +18,7 @@ from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.utils.validation import check_choice, check_integer
 from leapnav.experts.optimum import Optimum, as_optimum, find_optimum, shortest_horizon
 from leapnav.experts.problem.extremal import Extremal, Status
+from leapnav.experts.search.initial_guess import best_path
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
 from leapnav.play.episodes import play_policy, replay_actions
@@ -76,9 +77,14 @@ class PlaySolver:
             return result
 
     def sweeps(self, scenario: Scenario) -> dict[str, Any]:
-        """Return Leapfrog's feasible paths, from the best path of the lattice search to the extremal."""
+        """Return Leapfrog's feasible paths to the extremal.
+
+        The first is the best path of the lattice search, or for a robot with further states the initial guess of
+        `solve`.
+        """
         with self._lock:
-            extremal = solve(scenario, method="leapfrog", polish=False)
+            guess = best_path(scenario) if scenario.robot.sizes()[0] == 3 else None
+            extremal = solve(scenario, method="leapfrog", guess=guess, polish=False)
         rows = [row for row in extremal.history if row.times is not None]
         sweeps = []
         for index in select_sweeps(len(rows), FIRST_SWEEPS, MAX_SWEEPS):

@@ -28,8 +28,8 @@ class Solve:
     scenario: tyro.conf.Positional[Path]
     """Scenario file (JSON)."""
     method: Literal["optimum", "leapfrog", "multiple_shooting", "single_shooting", "collocation", "all"] = "optimum"
-    """Method: "optimum" searches globally; the others solve from the best path of the lattice search; "all" compares
-    them."""
+    """Method: "optimum" searches globally; the others solve from the best path of the lattice search, improved by
+    direct transcription; "all" compares them."""
     plot: Path | None = None
     """Picture of the solution (.png, .pdf or .svg); with "all", of the certified one of lowest cost."""
     json: Path | None = None
@@ -111,7 +111,7 @@ def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
         start = perf_counter()
         extremals[method] = solve(scenario, method=method, guess=guess)
         seconds[method] = perf_counter() - start
-    print(f"{scenario.name}: every method from the best path of the lattice search")
+    print(f"{scenario.name}: every method from the best path of the lattice search, improved by direct transcription")
     _print_comparison(extremals, seconds)
     for method, extremal in extremals.items():
         if not extremal.success:
