@@ -12,26 +12,23 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from leapnav.envs.kernels import prepare
+from leapnav.envs.kernels.compilation import called_kernels
+from leapnav.envs.kernels.numba_internals import Kernel
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearances
-from leapnav.envs.shapes.sampling import sample_grid
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
-from leapnav.experts.numerics.interpolation import interpolate
-from leapnav.experts.numerics.shooting import hamiltonians
-from leapnav.experts.problem.certificate import CERTIFICATE_KERNELS, failure
+from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import LATTICE_ERROR, Candidate, CandidateSearch, shortest_durations
+from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
-from leapnav.experts.search.shortest_paths import LATTICE_KERNELS
 from leapnav.experts.solve import solve
-from leapnav.experts.solvers.newton import solve_nodes
-from leapnav.experts.transcription import arcs_descent, descent
+from leapnav.experts.transcription import descent
 
 # Factor of the number of candidates for a robot that cannot rotate in place: the costs of its lattice paths differ from
 # those of the extremals by up to 20 %. Of 400 test scenarios of the car, 13 optima would be missed without this factor,
@@ -119,17 +116,21 @@ class Optimum(Extremal):
         return heading_winding(self.states[:, 2])
 
 
-# The kernels of a search, compiled together at first use.
-KERNELS = (
-    sample_grid,
-    clearances,
-    interpolate,
-    *LATTICE_KERNELS,
-    arcs_descent.descend,
-    solve_nodes,
-    *CERTIFICATE_KERNELS,
-    hamiltonians,
-)
+# Kernels that a search for the unicycle does not call: those of the general transcription and of the lattices of robots
+# that cannot rotate in place.
+NOT_FOR_UNICYCLE = frozenset({descent.descend, general_tree})
+
+
+@cache
+def search_kernels(is_unicycle: bool) -> tuple[Kernel, ...]:
+    """Return the kernels of a search, which are compiled together at first use.
+
+    Args:
+        is_unicycle: whether the robot is the unicycle without a footprint.
+
+    """
+    called = called_kernels(find_optimum)
+    return tuple(one for one in called if not (is_unicycle and one in NOT_FOR_UNICYCLE))
 
 
 class Grids(NamedTuple):
@@ -180,7 +181,7 @@ def find_optimum(
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
     is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
-    prepare(*KERNELS, *(() if is_unicycle else (descent.descend,)))
+    prepare(*search_kernels(is_unicycle))
     problem = OptimalControlProblem.from_scenario(scenario)
     if problem.horizon is None and problem.starts_at_goal:
         return as_optimum(failure(problem, Status.ZERO_HORIZON))

@@ -84,7 +84,7 @@ ENTRIES = {
     "NavigateVectorEnv.step": (step(NavigateVectorEnv), np.zeros((1, 2), dtype=np.float32)),
 }
 # Arrays that look wrong and are not: None is a free component of the goal, nodes of a solver that diverged are not
-# finite, and some functions take any number of rows or columns.
+# finite, a path that is not finite is interpolated as such, and some functions take any number of rows or columns.
 ACCEPTED = {
     ("certify: nodes", "NaN"),
     ("certify: nodes", "infinite"),
@@ -92,7 +92,8 @@ ACCEPTED = {
     ("problem: goal", "objects"),
     ("problem: field", "a column more"),
     ("problem.dynamics", "empty"),
-    ("trajectory.resample", "empty"),
+    *(("trajectory.resample", kind) for kind in ("NaN", "infinite", "objects", "empty")),
+    *(("trajectory.resample: states", kind) for kind in ("NaN", "infinite", "objects")),
     ("trajectory.resample", "a column more"),
     ("trajectory.resample", "a column less"),
     ("trajectory.resample: states", "a column more"),

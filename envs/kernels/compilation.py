@@ -5,14 +5,19 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from dis import get_instructions
+from functools import cached_property, partial
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import unwrap
 from pathlib import Path
 from pkgutil import walk_packages
 from queue import SimpleQueue
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
 
 from filelock import FileLock
 
@@ -139,6 +144,61 @@ def serve() -> None:
         module, name = line.split()
         named(module, name).prepare()
         print(name, flush=True)
+
+
+def called_kernels(function: Callable[..., Any]) -> list[Kernel]:
+    """Return the kernels that a function and the functions of leapnav below it call from Python.
+
+    A function is taken to call every function that it names, and every method of a class that it names. Not found are
+    the functions that are called under another name, such as the entries of a dictionary and the methods of an object
+    whose class no function below names.
+    """
+    found: dict[Kernel, None] = {}
+    visited: set[int] = set()
+    waiting: list[Any] = [function]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, Kernel):
+            found[value] = None
+            continue
+        if isinstance(value, property):
+            value = value.fget
+        if isinstance(value, cached_property | partial):
+            value = value.func
+        value = unwrap(value)
+        if id(value) in visited or not _is_own(value):
+            continue
+        visited.add(id(value))
+        if isinstance(value, type):
+            members = [member for member in vars(value).values() if not isinstance(member, Kernel)]
+            waiting += [*value.__bases__, *members]
+        elif isinstance(value, FunctionType):
+            waiting += _named_globals(value.__code__, value.__globals__)
+    return list(found)
+
+
+def _is_own(value: object) -> bool:
+    """Whether a function, a class or a module belongs to leapnav."""
+    name = getattr(value, "__name__" if isinstance(value, ModuleType) else "__module__", None)
+    return isinstance(name, str) and name.startswith("leapnav.")
+
+
+def _named_globals(code: CodeType, scope: dict[str, Any]) -> Iterator[Any]:
+    """The objects of leapnav that a function and those nested in it name; of a module, the members that they name."""
+    if any(_is_own(scope.get(name)) for name in code.co_names):
+        module: ModuleType | None = None
+        for instruction in get_instructions(code):  # which distinguishes globals from attributes of the same name
+            named: Any = None
+            if instruction.opname == "LOAD_GLOBAL":
+                named = scope.get(instruction.argval)
+            elif module is not None and instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+                named = vars(module).get(instruction.argval)
+            module = named if isinstance(named, ModuleType) and _is_own(named) else None
+            if _is_own(named):
+                yield named
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _named_globals(constant, scope)
 
 
 def all_kernels() -> list[Kernel]:

@@ -104,17 +104,18 @@ def as_matrix(
 
 
 def _as_array(name: str, values: Any, shape: tuple[int | None, ...], finite: bool) -> np.ndarray:
-    expected = f"({', '.join('any' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
     try:
-        array = np.require(values, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
+        array = np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected numbers of the shape {expected}, got {values!r}") from None
-    # A scalar becomes a vector of one number, which is not accepted in place of one.
-    is_shape = np.ndim(values) == len(shape) and all(
-        size is None or size == found for size, found in zip(shape, array.shape, strict=True)
-    )
-    if not is_shape:
-        raise ValueError(f"{name}: expected the shape {expected}, got {np.shape(values)}")
+        raise ValueError(f"{name}: expected numbers of the shape {_in_words(shape)}, got {values!r}") from None
+    found = array.shape if isinstance(values, np.ndarray) and values.ndim else np.shape(values)
+    if len(found) != len(shape) or any(size not in (None, actual) for size, actual in zip(shape, found, strict=True)):
+        raise ValueError(f"{name}: expected the shape {_in_words(shape)}, got {found}")
     if finite and not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
-    return array
+    return array if array.flags.writeable else array.copy()
+
+
+def _in_words(shape: tuple[int | None, ...]) -> str:
+    sizes = ", ".join("any" if size is None else str(size) for size in shape)
+    return f"({sizes},)" if len(shape) == 1 else f"({sizes})"

@@ -51,9 +51,9 @@ def certify(
     """
     arrays = problem.arrays
     n, m = problem.system.n, problem.system.m
-    times = as_vector("times", times)
+    times = as_vector("times", times, finite=False)
     nodes = as_matrix("nodes", nodes, len(times), 2 * n, finite=False)
-    if len(times) < 2 or not (np.diff(times) > 0).all():
+    if len(times) < 2 or not (times[1:] > times[:-1]).all() or not math.isfinite(times[-1]):
         raise ValueError(f"times: expected at least two increasing numbers, got {times}")
     if not np.isfinite(nodes).all():
         return failure(problem, Status.DIVERGED if converged is Status.SUCCESS else converged, history, evaluations)

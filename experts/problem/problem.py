@@ -51,12 +51,15 @@ class Trajectory:
 
     def resample(self, times: np.ndarray) -> Trajectory:
         """Return the path at other times (K,), by linear interpolation."""
-        own = as_vector("times", self.times)
-        arrays = [as_matrix("states", self.states, len(own))]
-        if self.costates is not None:
-            arrays.append(as_matrix("costates", self.costates, *arrays[0].shape))
-        at = as_vector("times", times, finite=True)
-        return Trajectory(at, *(interpolate(at, own, array) for array in arrays))
+        own = as_vector("times", self.times, finite=False)
+        at = as_vector("times", times, finite=False)
+        states = as_matrix("states", self.states, len(own), finite=False)
+        if len(own) == 0:
+            raise ValueError("times: expected at least one, got none")
+        if self.costates is None:
+            return Trajectory(at, interpolate(at, own, states))
+        costates = as_matrix("costates", self.costates, *states.shape, finite=False)
+        return Trajectory(at, interpolate(at, own, states), interpolate(at, own, costates))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,15 +184,16 @@ class OptimalControlProblem:
 
     def wound_goal(self, states: np.ndarray) -> tuple[float | None, ...]:
         """Return the goal of `with_winding_of`."""
-        goal, states = list(self.goal), as_matrix("states", states, None, self.system.n)
-        if len(states) == 0:
-            raise ValueError("states: expected at least one row, got none")
+        goal, n = list(self.goal), self.system.n
+        if np.ndim(states) != 2 or len(states) == 0:
+            raise ValueError(f"states: expected the shape (any, {n}), got {np.shape(states)}")
+        last = as_vector("states", states[-1], n)
         for symbol in self.system.angles:
             i = self.system.state.index(symbol)
             value = goal[i]
             if value is not None:
                 # Rounded, because the path need not end exactly at the goal.
-                goal[i] = value + 2 * math.pi * round((float(states[-1, i]) - value) / (2 * math.pi))
+                goal[i] = value + 2 * math.pi * round((float(last[i]) - value) / (2 * math.pi))
         return tuple(goal)
 
     @property
