@@ -9,10 +9,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from leapnav.envs.utils.validation import as_matrix, as_vector
-from leapnav.experts.numerics.integrator import DENSE_TERMS, propagate
+from leapnav.experts.numerics.integrator import DENSE_TERMS
 from leapnav.experts.problem.conjugate_points import conjugate_time, first_even_conjugate_time, first_focal_time
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, Status
-from leapnav.experts.problem.frames import MIN_DETERMINANT, orthonormalise
+from leapnav.experts.problem.frames import MIN_DETERMINANT
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.problem.tracing import FULL, TraceRecord, dense_clearance, trace
 
@@ -23,8 +23,6 @@ UNCONVERGED_ACCURACY = 1e-9
 # Initial size of the table of integration steps; it grows by a factor of 4 when it is full.
 MIN_ROWS, ROWS_PER_SEGMENT = 512, 24
 MAX_ROWS = 100_000  # integration steps; an extremal that needs more has diverged
-
-CERTIFICATE_KERNELS = (trace, dense_clearance, propagate, orthonormalise)
 
 
 def certify(

@@ -351,6 +351,3 @@ def energy_of(lengths, phi, horizon):
         else:
             high = middle
     return math.exp(0.5 * (low + high))
-
-
-LATTICE_KERNELS = (plane_costs, plane_parents, tree, meeting_nodes, path_through, mark, energy_of)
