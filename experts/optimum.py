@@ -12,10 +12,11 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from leapnav.envs.kernels import prepare
-from leapnav.envs.kernels.compilation import called_kernels
+from leapnav.envs.kernels.compilation import called_kernels, missing
 from leapnav.envs.kernels.numba_internals import Kernel
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
 from leapnav.experts.problem.certificate import failure
@@ -121,16 +122,20 @@ class Optimum(Extremal):
 NOT_FOR_UNICYCLE = frozenset({descent.descend, general_tree})
 
 
-@cache
-def search_kernels(is_unicycle: bool) -> tuple[Kernel, ...]:
-    """Return the kernels of a search, which are compiled together at first use.
+def search_kernels(is_unicycle: bool) -> list[Kernel]:
+    """Return the kernels of a search.
 
     Args:
         is_unicycle: whether the robot is the unicycle without a footprint.
 
     """
-    called = called_kernels(find_optimum)
-    return tuple(one for one in called if not (is_unicycle and one in NOT_FOR_UNICYCLE))
+    return [one for one in called_kernels(find_optimum) if not (is_unicycle and one in NOT_FOR_UNICYCLE)]
+
+
+@computed_once()
+def _compile_kernels(is_unicycle: bool) -> None:
+    """Compile the kernels of a search that are not in the cache; the others are loaded when they are called."""
+    prepare(*missing(search_kernels(is_unicycle)))
 
 
 class Grids(NamedTuple):
@@ -181,7 +186,7 @@ def find_optimum(
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
     is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
-    prepare(*search_kernels(is_unicycle))
+    _compile_kernels(is_unicycle)
     problem = OptimalControlProblem.from_scenario(scenario)
     if problem.horizon is None and problem.starts_at_goal:
         return as_optimum(failure(problem, Status.ZERO_HORIZON))

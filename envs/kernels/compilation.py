@@ -165,7 +165,8 @@ def called_kernels(function: Callable[..., Any]) -> list[Kernel]:
             value = value.fget
         if isinstance(value, cached_property | partial):
             value = value.func
-        value = unwrap(value)
+        if callable(value):
+            value = unwrap(value)
         if id(value) in visited or not _is_own(value):
             continue
         visited.add(id(value))

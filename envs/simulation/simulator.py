@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from leapnav.envs.geodesics import geodesic_map, solve_eikonal
+from leapnav.envs.geodesics import geodesic_map
 from leapnav.envs.kernels import prepare
+from leapnav.envs.kernels.compilation import called_kernels
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.robots.base import ARCS, GENERAL
 from leapnav.envs.scenarios.bank import ScenarioBank
@@ -432,5 +433,10 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
             settings.model.advance,
             settings.model.state_cost or no_state_cost,
         )
-    mapping = (solve_eikonal,) if settings.observation == "geodesic" else ()
-    return stepping.start_episodes, *moving, stepping.end_periods, observe_robots, *mapping
+    observing = {"map": check_map, "geodesic": geodesic_map}.get(settings.observation)
+    if observing is not None:
+        moving = *moving, *called_kernels(observing)
+    if not settings.terminate_on_collision:
+        contact = BatchSimulator._drive_in_contact, BatchSimulator._command
+        moving = *moving, settings.model.advance, *(one for method in contact for one in called_kernels(method))
+    return stepping.start_episodes, *moving, stepping.end_periods, observe_robots

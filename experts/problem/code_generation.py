@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -103,19 +103,22 @@ class Assignments:
         return [*lines, f"{indent}{target} = {PRINTER.doprint(expression)}"]
 
 
-def load(kind: str, version: str, declaration: str, imported: Iterable[str], generate: Any) -> ModuleType:
+def load(
+    kind: str, generator: str, declaration: str, imported: Iterable[str], generate: Callable[[], str]
+) -> ModuleType:
     """Return a generated module, which is written if the cache does not contain it.
 
     Args:
         kind: prefix of the module's name.
-        version: version of the generator.
-        declaration: text that determines the content of the module.
+        generator: name of the module that generates it. The content depends on its source, and on the version of SymPy.
+        declaration: text that determines the content of the module, together with the generator.
         imported: the modules that it imports. The functions that it calls are compiled into it, so its name depends on
             their source.
         generate: function that returns the source.
 
     """
-    identity = "\n".join([version, declaration, *map(source_stamp, imported)])
+    stamps = map(source_stamp, (generator, *imported))
+    identity = "\n".join([sp.__version__, declaration, *stamps])
     name = f"{kind}_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
     path = cache_root() / f"{name}.py"
     if not path.exists():

@@ -37,7 +37,6 @@ RATES_FUNCTION = types.FunctionType(RATES_SIGNATURE)
 DERIVATIVES_FUNCTION = types.FunctionType(DERIVATIVES_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
 
-GENERATOR_VERSION = "1"  # part of the file name; to be increased whenever the generated code changes
 IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.problem.generated_dynamics"
 
 
@@ -59,9 +58,7 @@ def compile_dynamics(system: ControlAffineSystem, state_cost: sp.Expr, obstacles
     """
     check_obstacles(system, obstacles)
     declaration = declare(system, state_cost, obstacles)
-    module = load(
-        "dynamics", GENERATOR_VERSION, declaration, IMPORTED, lambda: _generate(system, state_cost, obstacles)
-    )
+    module = load("dynamics", __name__, declaration, IMPORTED, lambda: _generate(system, state_cost, obstacles))
     return CompiledDynamics(
         FunctionPointer(module.rates, RATES_FUNCTION),
         FunctionPointer(module.derivatives, DERIVATIVES_FUNCTION),

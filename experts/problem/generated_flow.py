@@ -20,7 +20,6 @@ from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
 
-GENERATOR_VERSION = "5"  # part of the file name; to be increased whenever the generated code changes
 # The modules that the generated module imports.
 IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.numerics.flow"
 
@@ -51,7 +50,7 @@ def compile_flow(
     """
     check_obstacles(system, obstacles)
     declaration = declare(system, state_cost, obstacles)
-    module = load("flow", GENERATOR_VERSION, declaration, IMPORTED, lambda: _generate(system, state_cost, obstacles))
+    module = load("flow", __name__, declaration, IMPORTED, lambda: _generate(system, state_cost, obstacles))
     return FunctionPointer(module.flow, FLOW_FUNCTION), FunctionPointer(module.control, CONTROL_FUNCTION)
 
 
