@@ -72,8 +72,8 @@ def _continue(
 ) -> Extremal:
     """The extremal of the target, by continuation from the extremal `start`."""
     origin = start.problem
-    target = _unwind(target, start)
     blend(origin, target, 0.5)  # raises an error before any computation if the problems cannot be blended
+    target = _unwind(target, start)
     failed: Extremal | None = None
 
     def advance(fraction: float, guess: Extremal) -> Extremal | None:

@@ -376,8 +376,11 @@ def test_no_path_has_its_own_status():
             {"guess": Trajectory(np.array([0.0, 1.0]), np.zeros((2, 3)))},
             "guess: its times must run from 0 to 5.4, not 0 to 1",
         ),
-        ({"guess": Trajectory(np.array([0.0, 5.4]), np.zeros((2, 2)))}, "guess: its states must have shape"),
-        ({"guess": Trajectory(np.array([0.0, 5.4]), np.full((2, 3), np.nan))}, "guess: its states are not finite"),
+        ({"guess": Trajectory(np.array([0.0, 5.4]), np.zeros((2, 2)))}, "guess.states: expected the shape \\(2, 3\\)"),
+        (
+            {"guess": Trajectory(np.array([0.0, 5.4]), np.full((2, 3), np.nan))},
+            "guess.states: expected finite numbers, got nan",
+        ),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
