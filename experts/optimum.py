@@ -16,6 +16,7 @@ from leapnav.envs.kernels.compilation import called_kernels, missing
 from leapnav.envs.kernels.numba_internals import Kernel
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.proximity import footprint_proximity
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
@@ -122,20 +123,22 @@ class Optimum(Extremal):
 NOT_FOR_UNICYCLE = frozenset({descent.descend, general_tree})
 
 
-def search_kernels(is_unicycle: bool) -> list[Kernel]:
+def search_kernels(is_unicycle: bool, has_footprint: bool) -> list[Kernel]:
     """Return the kernels of a search.
 
     Args:
         is_unicycle: whether the robot is the unicycle without a footprint.
+        has_footprint: whether the robot has a footprint; its proximity cost is called by the generated flow only.
 
     """
-    return [one for one in called_kernels(find_optimum) if not (is_unicycle and one in NOT_FOR_UNICYCLE)]
+    called = [*called_kernels(find_optimum), *([footprint_proximity] if has_footprint else [])]
+    return [one for one in called if not (is_unicycle and one in NOT_FOR_UNICYCLE)]
 
 
 @computed_once()
-def _compile_kernels(is_unicycle: bool) -> None:
+def _compile_kernels(is_unicycle: bool, has_footprint: bool) -> None:
     """Compile the kernels of a search that are not in the cache; the others are loaded when they are called."""
-    prepare(*missing(search_kernels(is_unicycle)))
+    prepare(*missing(search_kernels(is_unicycle, has_footprint)))
 
 
 class Grids(NamedTuple):
@@ -186,7 +189,7 @@ def find_optimum(
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
     is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
-    _compile_kernels(is_unicycle)
+    _compile_kernels(is_unicycle, scenario.robot.footprint is not None)
     problem = OptimalControlProblem.from_scenario(scenario)
     if problem.horizon is None and problem.starts_at_goal:
         return as_optimum(failure(problem, Status.ZERO_HORIZON))
