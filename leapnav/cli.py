@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from concurrent.futures import BrokenExecutor
 from typing import Any
 
 import tyro
@@ -76,7 +77,8 @@ def parse(arguments: list[str]) -> Any:
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
-    Invalid input is reported in one line on standard error, with exit code 2.
+    Invalid input is reported in one line on standard error, with exit code 2; a worker process that has ended before
+    its work was done, with exit code 1.
 
     Args:
         arguments: the words after `leapnav`; None takes those of the process.
@@ -94,6 +96,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"leapnav: {_message(error)}", file=sys.stderr)
         return BAD_INPUT
+    except BrokenExecutor as error:  # a worker process has ended, for example because memory was short
+        print(f"leapnav: {' '.join(str(error).split())}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         resumption = getattr(command, "resumption", None)
         print(f"leapnav: interrupted{f'; {resumption}' if resumption else ''}", file=sys.stderr)

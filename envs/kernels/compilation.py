@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager, suppress
 from dis import get_instructions
 from functools import cached_property, partial
 from importlib import import_module
@@ -17,7 +18,7 @@ from pathlib import Path
 from pkgutil import walk_packages
 from queue import SimpleQueue
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import IO, Any
 
 from filelock import FileLock
 
@@ -27,6 +28,7 @@ from leapnav.envs.kernels.numba_internals import Kernel
 
 MIN_PARALLEL = 6  # kernels; fewer are compiled in this process: starting others takes two seconds
 WORKER = "from leapnav.envs.kernels.compilation import serve; serve()"
+COMPILED, FAILED = "compiled", "failed"  # answers of a worker process
 
 
 def prepare(*kernels: Kernel, jobs: int | None = None, advise: bool = True) -> None:
@@ -39,6 +41,9 @@ def prepare(*kernels: Kernel, jobs: int | None = None, advise: bool = True) -> N
         kernels: the kernels.
         jobs: number of processes; None for one per core.
         advise: whether the progress line mentions `leapnav compile`.
+
+    Raises:
+        BrokenExecutor: a process that compiled a kernel has ended, for example because memory was short.
 
     """
     if all(one.is_ready for one in kernels):
@@ -77,15 +82,23 @@ def _compile(kernels: list[Kernel], jobs: int, advise: bool) -> None:
     """Compiles kernels in processes; one is started when those that it calls are finished."""
     waiting = dict.fromkeys(one for one in kernels if _is_importable(one))
     unfinished, running = set(waiting), dict[Future[None], Kernel]()
-    idle: SimpleQueue[subprocess.Popen[str]] = SimpleQueue()
+    idle: SimpleQueue[_Worker] = SimpleQueue()
 
     def compile_one(one: Kernel) -> None:
         worker = idle.get()
-        _ask(worker, one)
-        idle.put(worker)
+        try:
+            is_compiled = worker.compile(one)
+        finally:
+            idle.put(worker)
+        if not is_compiled:
+            one.prepare()  # raises the error here
 
     count = min(jobs, len(waiting))
-    with _workers(count) as workers, progress.counted(waiting, advise) as done, ThreadPoolExecutor(jobs) as pool:
+    with (
+        progress.counted(waiting, advise) as done,
+        ThreadPoolExecutor(jobs) as pool,
+        _workers(count) as workers,  # ended before the threads, which would wait for them after an error
+    ):
         for worker in workers:
             idle.put(worker)
         while waiting or running:
@@ -105,45 +118,82 @@ def _is_importable(one: Kernel) -> bool:
     return one.py_func.__module__.startswith("leapnav.")
 
 
-@contextmanager
-def _workers(count: int) -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes that compile the kernels whose names they read."""
-    command = [sys.executable, "-c", WORKER]
-    workers = [
-        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        for _ in range(count)
-    ]
-    try:
-        yield workers
-    finally:
-        for worker in workers:
-            worker.kill()
-            worker.wait()
-            for stream in (worker.stdin, worker.stdout):
+class _Worker:
+    """A process that compiles the kernels whose names it reads.
+
+    Args:
+        label: description of the process in the message of an error.
+        errors: file of its standard error, readable.
+
+    """
+
+    def __init__(self, label: str, errors: IO[str]) -> None:
+        self._label, self._errors = label, errors
+        command = [sys.executable, "-c", WORKER]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+
+    def compile(self, one: Kernel) -> bool:
+        """Compile a kernel, and return whether this was successful.
+
+        Raises:
+            BrokenExecutor: the process has ended.
+
+        """
+        stdin, stdout, function = self._process.stdin, self._process.stdout, one.py_func
+        assert stdin is not None and stdout is not None
+        with suppress(OSError):  # of a process that has ended, which the missing answer shows, too
+            stdin.write(f"{function.__module__} {function.__qualname__}\n")
+            stdin.flush()
+        answer = stdout.readline().strip()
+        if answer in (COMPILED, FAILED):
+            return answer == COMPILED
+        name = f"{function.__module__}.{function.__qualname__}"
+        raise BrokenExecutor(f"{self._label}, which compiled {name}, ended with {self._reason()}")
+
+    def _reason(self) -> str:
+        """The exit code of the process, and the last line that it has written to standard error."""
+        code = self._process.wait()
+        self._errors.seek(0)
+        lines = [line.strip() for line in self._errors if not line.startswith(progress.TITLE)]
+        last = next((line for line in reversed(lines) if line), "no message")
+        return f"{f'signal {-code}' if code < 0 else f'exit code {code}'}: {last}"
+
+    def end(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):  # closing a pipe writes what a process that has ended did not read
                 if stream is not None:
                     stream.close()
 
 
-def _ask(worker: subprocess.Popen[str], one: Kernel) -> None:
-    """Compile a kernel in a worker process. If that fails, this process compiles it later and shows the error."""
-    assert worker.stdin is not None and worker.stdout is not None
-    function = one.py_func
-    try:
-        worker.stdin.write(f"{function.__module__} {function.__qualname__}\n")
-        worker.stdin.flush()
-        worker.stdout.readline()
-    except BrokenPipeError:  # the process has ended
-        return
+@contextmanager
+def _workers(count: int) -> Iterator[list[_Worker]]:
+    """Processes that compile kernels."""
+    workers: list[_Worker] = []
+    with ExitStack() as stack:
+        for number in range(1, count + 1):
+            errors = stack.enter_context(tempfile.TemporaryFile("w+", errors="replace"))
+            workers.append(_Worker(f"worker process {number} of {count}", errors))
+            stack.callback(workers[-1].end)
+        yield workers
 
 
 def serve() -> None:
-    """The loop of a process that compiles: reads names of kernels and reports when each is in the cache."""
+    """The loop of a process that compiles: reads names of kernels, and reports when each is in the cache."""
     from leapnav.envs.kernels.numba_internals import named
 
     for line in sys.stdin:
         module, name = line.split()
-        named(module, name).prepare()
-        print(name, flush=True)
+        try:
+            named(module, name).prepare()
+        except Exception:  # the process that asked compiles the kernel itself, and raises the error
+            print(FAILED, flush=True)
+        else:
+            print(COMPILED, flush=True)
 
 
 def called_kernels(function: Callable[..., Any]) -> list[Kernel]:

@@ -9,6 +9,7 @@ from time import monotonic
 
 from leapnav.envs.kernels.numba_internals import Kernel
 
+TITLE = "leapnav: compiling"  # beginning of each line
 INTERVAL = 5.0  # s between two lines where standard error is no terminal
 
 
@@ -24,7 +25,7 @@ class _Progress:
     def report(self, advise: bool) -> None:
         """Writes how far the compilation is: in place on a terminal, elsewhere as lines."""
         count, total, now = len(self.compiled), len(self.expected), monotonic()
-        text = f"leapnav: compiling, once per installation: {count} of {total} kernels"
+        text = f"{TITLE}, once per installation: {count} of {total} kernels"
         if sys.stderr.isatty():
             print(f"\r{text} ", end="\n" if count == total else "", file=sys.stderr)
         elif not self._is_announced or now - self._reported >= INTERVAL:
