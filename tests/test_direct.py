@@ -120,3 +120,12 @@ def test_an_infeasible_problem_does_not_converge():
     )
     converged, _, violation = descend(problem, states, controls, costates, 1e-3, 40)
     assert not converged or violation > 0.5
+
+
+@pytest.mark.parametrize("robot", ["unicycle", "differential_drive"])
+def test_the_scale_of_the_cost_has_no_effect_on_arcs(robot):
+    scenario = Scenario.from_dict({**best_known()[0][0].to_dict(), "robot": {"model": robot}})
+    problem, path = first_candidate(scenario)
+    first, second = (optimise(problem, discretise(problem, path), cost_scale=scale) for scale in (None, 3.0))
+    assert first.converged
+    assert first.cost == second.cost

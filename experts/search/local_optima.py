@@ -156,14 +156,15 @@ class LocalOptima:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
         is_expensive = math.isfinite(guess.cost) and self._is_expensive(guess, DIRECT_ERROR)
         iterations = EXPENSIVE_ITERATIONS if is_expensive else MAX_ITERATIONS
-        path = optimise(problem, guess, iterations)
+        scale = self.scenario.cost.speed_weight
+        path = optimise(problem, guess, iterations, scale)
         if problem.horizon is None:
             for _ in range(MAX_LENGTHENED):
                 # Otherwise more time would not help: the path is feasible, or the descent is slow.
                 if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):
                     break
                 guess = guess.scaled(LENGTHENING)
-                path = optimise(problem, guess, iterations)
+                path = optimise(problem, guess, iterations, scale)
         self.is_in_time = self.is_in_time or (path.converged and path.violation < MAX_VIOLATION)
         return path
 

@@ -120,6 +120,7 @@ def optimise(
     problem: OptimalControlProblem,
     guess: DirectPath,
     max_iterations: int = MAX_ITERATIONS,
+    cost_scale: float | None = None,
 ) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
 
@@ -128,6 +129,8 @@ def optimise(
         guess: initial guess; its states, controls and costates need not be consistent.
         max_iterations: number of iterations after which the result has not converged, for a path of up to
             2 INTERVALS_PER_LIMIT intervals.
+        cost_scale: weight of the squared speed, to which the penalty of the general transcription is relative; None for
+            the weight of the first control. It changes the iterates, not the optimum, and has no effect on arcs.
 
     """
     max_iterations *= min(max(1, len(guess.controls) // INTERVALS_PER_LIMIT), MAX_LIMITS)
@@ -138,8 +141,8 @@ def optimise(
     states[0] = arrays.start
     h = np.diff(guess.times)
     on_arcs = _on_arcs(problem)
-    # The unit of the costs: the weight of the squared speed, of which the kernels of arcs assume that it is 1.
-    unit = problem.control_weight[0] if on_arcs is None else on_arcs[0]
+    # The unit of the costs; the kernels of arcs assume that the weight of the squared speed is 1.
+    unit = (cost_scale or problem.control_weight[0]) if on_arcs is None else on_arcs[0]
     costates = guess.costates / unit
     converged, cost, violation, within_limits = False, math.inf, math.inf, True
     if on_arcs is not None:
