@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from threading import Lock
 
 import numpy as np
 from numba import float32, float64
@@ -40,6 +41,7 @@ X_MIN, Y_MIN, STEP, NX, NY, VALUES = range(6)
 FAR = 1e6
 
 _cache: OrderedDict[tuple[bytes, float, float], np.ndarray] = OrderedDict()
+_cache_lock = Lock()
 
 
 def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
@@ -53,7 +55,10 @@ def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
 
     """
     key = field.tobytes(), goal_x, goal_y
-    found = _cache.get(key)
+    with _cache_lock:
+        found = _cache.get(key)
+        if found is not None:
+            _cache.move_to_end(key)
     if found is None:
         width, height = field[ARENA + 2] - field[ARENA], field[ARENA + 3] - field[ARENA + 1]
         spacing = max(SPACING, math.sqrt(width * height / MAX_POINTS))
@@ -62,11 +67,10 @@ def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
         solve_eikonal(field, goal_x, goal_y, spacing, distances)
         header = field[ARENA], field[ARENA + 1], spacing, *size
         found = np.concatenate([header, distances.ravel()]).astype(np.float32)
-        _cache[key] = found
-        if len(_cache) > CACHE_SIZE:
-            _cache.popitem(last=False)
-    else:
-        _cache.move_to_end(key)
+        with _cache_lock:
+            _cache[key] = found
+            if len(_cache) > CACHE_SIZE:
+                _cache.popitem(last=False)
     return found
 
 

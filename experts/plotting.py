@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -157,8 +156,8 @@ def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> N
         (panels[1], controls, "controls", known[system.n :]),
         (panels[2], costates, "costates", [rf"$\lambda_{{{name}}}$" for name in names]),
     ):
-        for color, column, symbol in zip(cycle(CURVES), values.T, labels, strict=False):
-            axes.plot(times, column, color=color, linewidth=1.5, label=symbol)
+        for k, (column, symbol) in enumerate(zip(values.T, labels, strict=True)):
+            axes.plot(times, column, color=CURVES[k % len(CURVES)], linewidth=1.5, label=symbol)
         axes.set_ylabel(name)
     if problem.control_bounds is not None:
         _draw_bounds(panels[1], controls, problem.control_bounds)
@@ -180,9 +179,10 @@ def _draw_bounds(axes: Axes, controls: np.ndarray, bounds: Sequence[tuple[float,
     """Draw control bounds as faint lines; those far from the controls are outside the axes, to keep the scale."""
     low, high = axes.get_ylim()
     limit = MAX_BOUND * float(np.abs(controls).max())
-    for color, pair in zip(cycle(CURVES), bounds, strict=False):
+    for k, pair in enumerate(bounds):
         for bound in pair:
             if np.isfinite(bound):
+                color = CURVES[k % len(CURVES)]
                 axes.axhline(bound, color=color, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.5, zorder=1)
             if abs(bound) <= limit:
                 low, high = min(low, 1.06 * bound), max(high, 1.06 * bound)
@@ -291,7 +291,7 @@ def plot_bank(bank: ScenarioBank, path: str | os.PathLike[str], count: int = 24,
     rows = math.ceil(len(chosen) / columns)
     figure = Figure(figsize=(2.4 * columns, 2.65 * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, index in zip(grid, chosen.tolist(), strict=False):
+    for axes, index in zip(grid[: len(chosen)], chosen.tolist(), strict=True):
         reference = bank.reference(index)
         draw_scenario(axes, bank[index])
         axes.plot(*reference.states[:, :2].T, color=OPTIMUM, linewidth=1.4)

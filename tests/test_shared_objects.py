@@ -1,6 +1,8 @@
 """Objects and caches that several threads use at once."""
 
 import threading
+import time
+from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -8,7 +10,8 @@ import pytest
 import sympy as sp
 from helpers import best_known
 
-from leapnav.envs import NavigateVectorEnv, ScenarioBank
+from leapnav.envs import NavigateVectorEnv, ScenarioBank, geodesics
+from leapnav.envs.geodesics import geodesic_map
 from leapnav.envs.utils.caching import computed_once
 from leapnav.experts import ControlAffineSystem, ExpertPolicy, OptimalControlProblem, Trajectory, find_optimum
 from leapnav.experts.acting.feedback import Feedback
@@ -83,6 +86,37 @@ def test_the_fields_of_a_bank_are_read_by_threads():
     def read(number):
         order = np.random.default_rng(number).permutation(40)
         return all(np.array_equal(bank.field(int(i)), expected[i]) for _ in range(20) for i in order)
+
+    assert all(in_threads(read))
+
+
+def test_threads_get_the_same_scenarios_of_a_bank():
+    path = ScenarioBank.shipped("clutter", "test").path
+    for _ in range(20):
+        bank = ScenarioBank(path)
+        first, *others = in_threads(lambda _, bank=bank: [id(bank[i]) for i in range(4)])
+        assert all(other == first for other in others)
+
+
+class InterruptedCache(OrderedDict):
+    """A cache in which another thread runs after each look-up."""
+
+    def get(self, key):
+        found = super().get(key)
+        time.sleep(1e-4)
+        return found
+
+
+def test_geodesic_maps_are_shared_by_threads(monkeypatch):
+    scenario, _ = best_known()[0]
+    goals = [(0.5 + 0.2 * k, 1.0) for k in range(3)]
+    expected = [geodesic_map(scenario.field, *goal) for goal in goals]
+    monkeypatch.setattr(geodesics, "CACHE_SIZE", 1)
+    monkeypatch.setattr(geodesics, "_cache", InterruptedCache())
+
+    def read(number):
+        order = np.random.default_rng(number).integers(len(goals), size=40)
+        return all(np.array_equal(geodesic_map(scenario.field, *goals[k]), expected[k]) for k in order)
 
     assert all(in_threads(read))
 

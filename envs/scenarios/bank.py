@@ -305,9 +305,10 @@ class ScenarioBank(Sequence[Scenario]):
         if i not in self._scenarios:
             start, end = self._span("scenario_ends", i)
             try:
-                self._scenarios[i] = Scenario.from_json(self._array("scenarios")[start:end].tobytes().decode())
+                scenario = Scenario.from_json(self._array("scenarios")[start:end].tobytes().decode())
             except ValueError as error:  # the encoding or the scenario is invalid
                 raise BankError(f"{self.path}: scenario {i}: damaged: {error}") from None
+            self._scenarios.setdefault(i, scenario)  # threads get the same object
         return self._scenarios[i]
 
     def __iter__(self) -> Iterator[Scenario]:

@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.numerics.flow import NewtonOptions
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.certificate import certify
@@ -55,7 +55,7 @@ MINIMUM = "No conjugate point lies before the horizon, so the extremal is a loca
 EXTENSION = 2.0  # the extremal is continued to this multiple of the horizon, to find its conjugate point
 
 
-@lru_cache(maxsize=1)
+@computed_once()
 def compare_methods() -> dict[str, Any]:
     """Solve one scenario by single shooting, multiple shooting and Leapfrog from the same initial guess.
 
@@ -205,7 +205,7 @@ def cusp_scenario(heading: float) -> Scenario:
     )
 
 
-@lru_cache(maxsize=1)
+@computed_once()
 def follow_minimum() -> dict[str, Any]:
     """Follow a local minimum to the fold at which it is lost, and return along the branch of saddles.
 

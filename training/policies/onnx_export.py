@@ -196,10 +196,10 @@ def export_onnx(
 
 def _describe_states(actor: _Actor) -> dict[str, Any]:
     """Return the description of each state: shape, type, the output with its next value, and how it starts."""
-    following = actor.outputs[1:] or actor.outputs
+    following = actor.outputs[1:] or actor.outputs[: len(actor.states)]
     return {
         name: {"shape": ["N", *size], "type": "float32", "next": output, "start": actor.start}
-        for (name, size), output in zip(actor.states.items(), following, strict=False)
+        for (name, size), output in zip(actor.states.items(), following, strict=True)
     }
 
 

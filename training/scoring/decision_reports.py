@@ -104,7 +104,7 @@ def plot_decisions(
     scale = Normalize(0.0, top)
     for axes in grid.ravel()[len(decisions) :]:
         axes.set_visible(False)
-    for axes, one in zip(grid.ravel(), decisions, strict=False):
+    for axes, one in zip(grid.ravel()[: len(decisions)], decisions, strict=True):
         _draw_decisions(axes, banks, one, scale)
     figure.colorbar(ScalarMappable(scale, COLOR_MAP), ax=grid, label="regret per second", extend="max", shrink=0.8)
     figure.savefig(path, dpi=130)
