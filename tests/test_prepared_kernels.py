@@ -36,6 +36,47 @@ def test_a_search_needs_no_kernel_that_is_not_prepared(robot):
     assert done.stdout.split() == []
 
 
+SIMULATION = """
+import sys
+import numpy as np
+from leapnav.envs import NavigateVectorEnv
+from leapnav.envs.kernels.numba_internals import Kernel
+from leapnav.envs.robots import Car
+
+env = NavigateVectorEnv(4, "clutter", **eval(sys.argv[1]))
+call, found = Kernel._compile_for_args, set()
+
+def record(kernel, *args):
+    if not kernel.is_ready:
+        found.add(kernel.py_func.__name__)
+    return call(kernel, *args)
+
+Kernel._compile_for_args = record
+env.reset(seed=0)
+in_contact = False
+for _ in range(60):
+    *_, infos = env.step(np.ones((4, 2), np.float32))
+    in_contact |= bool(env._simulator._contacts)
+assert in_contact or "terminate_on_collision" not in sys.argv[1]
+print(*found)
+"""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        "dict(observation='map')",
+        "dict(terminate_on_collision=False)",
+        "dict(actuation='motor', terminate_on_collision=False)",
+        "dict(robot=Car(), terminate_on_collision=False)",
+    ],
+)
+def test_an_episode_needs_no_kernel_that_is_not_prepared(settings):
+    command = [sys.executable, "-c", SIMULATION, settings]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 class Generated(Exception):  # noqa: N818 (no error: shows that the generator was called)
     pass
 
