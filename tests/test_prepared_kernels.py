@@ -42,16 +42,21 @@ import numpy as np
 from leapnav.envs import NavigateVectorEnv
 from leapnav.envs.kernels.numba_internals import Kernel
 from leapnav.envs.robots import Car
+from leapnav.envs.simulation import simulator
 
-env = NavigateVectorEnv(4, "clutter", **eval(sys.argv[1]))
-call, found = Kernel._compile_for_args, set()
+call, prepare, found = Kernel._compile_for_args, simulator.prepare, set()
 
 def record(kernel, *args):
     if not kernel.is_ready:
         found.add(kernel.py_func.__name__)
     return call(kernel, *args)
 
-Kernel._compile_for_args = record
+def prepare_and_begin(*kernels):
+    prepare(*kernels)
+    found.clear()
+
+Kernel._compile_for_args, simulator.prepare = record, prepare_and_begin
+env = NavigateVectorEnv(4, "clutter", **eval(sys.argv[1]))
 env.reset(seed=0)
 in_contact = False
 for _ in range(60):
