@@ -10,11 +10,13 @@ import pytest
 import sympy as sp
 from helpers import best_known
 
-from leapnav.envs import NavigateVectorEnv, ScenarioBank, geodesics
+from leapnav.envs import NavigateVectorEnv, ScenarioBank, ScenarioError, geodesics
 from leapnav.envs.geodesics import geodesic_map
 from leapnav.envs.utils.caching import computed_once
-from leapnav.experts import ControlAffineSystem, ExpertPolicy, OptimalControlProblem, Trajectory, find_optimum
+from leapnav.experts import ControlAffineSystem, ExpertPolicy, Trajectory, find_optimum
+from leapnav.experts.acting import feedback as feedback_module
 from leapnav.experts.acting.feedback import Feedback
+from leapnav.experts.problem import generated_dynamics, generated_flow
 
 N_THREADS = 8
 
@@ -44,16 +46,66 @@ def test_a_result_is_computed_by_one_thread():
     assert calls == [1]
 
 
-def test_a_system_is_compiled_once():
+def slowed(function, calls):
+    """Return a function that notes its calls and lets other threads run before it returns."""
+
+    def call(*arguments, **options):
+        calls.append(arguments)
+        found = function(*arguments, **options)
+        time.sleep(0.01)
+        return found
+
+    return call
+
+
+def test_a_system_is_compiled_once(monkeypatch):
     x, y = sp.symbols("x y")
     system = ControlAffineSystem(state=(x, y), drift=[y, -sp.sin(x) - sp.Rational(17, 1003) * y], fields=[[0, 1]])
+    calls = []
+    for module in (generated_flow, generated_dynamics):
+        monkeypatch.setattr(module, "load", slowed(module.load, calls))
 
     def functions(_):
-        problem = OptimalControlProblem(system, [0.0, 0.0], [1.0, 0.0], 2.0, [1.0])
-        return problem.arrays.flow.function, problem.arrays.control, problem.compiled_dynamics.rates
+        flow = generated_flow.compile_flow(system, sp.Integer(0), "none")
+        return *flow, generated_dynamics.compile_dynamics(system, sp.Integer(0), "none").rates
 
     found = in_threads(functions)
     assert all(one is other for pair in found for one, other in zip(pair, found[0], strict=True))
+    assert len(calls) == 2  # the flow and the dynamics
+
+
+def test_a_value_that_needs_a_search_changes_no_control_of_another_thread(monkeypatch):
+    scenario, _ = best_known()[0]
+    optimum = find_optimum(scenario)
+    feedback = Feedback(scenario, Trajectory(optimum.times, optimum.states, optimum.costates))
+    searches = []
+    monkeypatch.setattr(feedback_module, "find_optimum", slowed(find_optimum, searches))
+    state = next(state for state in free_states(scenario) if feedback.value(state, 0.5) and searches)
+    expected = feedback.control(0.5)
+    monkeypatch.setattr(feedback_module, "advance", slowed(feedback_module.advance, []))
+    done = threading.Event()
+
+    def use(number):
+        if number == 0:
+            for _ in range(3):
+                feedback.value(state, 0.5)
+            done.set()
+        while not done.is_set():
+            if not np.array_equal(feedback.control(0.5), expected):
+                return False
+        return True
+
+    assert all(in_threads(use))
+
+
+def free_states(scenario):
+    """Yield states of the robot far from its optimum, without contact."""
+    for x in np.arange(0.5, 9.5):
+        for y in np.arange(0.5, 9.5):
+            try:
+                yield np.array([*scenario.from_state([x, y, 0.0], 0.5).start])
+            except ScenarioError:
+                continue
 
 
 def test_the_value_of_many_states_at_once_is_that_of_each_alone():
