@@ -121,6 +121,8 @@ class Optimum(Extremal):
 # Kernels that a search for the unicycle does not call: those of the general transcription and of the lattices of robots
 # that cannot rotate in place.
 NOT_FOR_UNICYCLE = frozenset({descent.descend, general_tree})
+# Kernels of a robot with a footprint that only the generated flow calls.
+FOR_FOOTPRINT = (footprint_proximity,)
 
 
 def search_kernels(is_unicycle: bool, has_footprint: bool) -> list[Kernel]:
@@ -128,10 +130,10 @@ def search_kernels(is_unicycle: bool, has_footprint: bool) -> list[Kernel]:
 
     Args:
         is_unicycle: whether the robot is the unicycle without a footprint.
-        has_footprint: whether the robot has a footprint; its proximity cost is called by the generated flow only.
+        has_footprint: whether the robot has a footprint.
 
     """
-    called = [*called_kernels(find_optimum), *([footprint_proximity] if has_footprint else [])]
+    called = [*called_kernels(find_optimum), *(FOR_FOOTPRINT if has_footprint else ())]
     return [one for one in called if not (is_unicycle and one in NOT_FOR_UNICYCLE)]
 
 

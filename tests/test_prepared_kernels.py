@@ -8,6 +8,7 @@ import sympy as sp
 
 from leapnav.envs.kernels import decorator
 from leapnav.experts import ControlAffineSystem
+from leapnav.experts.optimum import search_kernels
 from leapnav.experts.problem import generated_dynamics, generated_flow
 
 SEARCH = """
@@ -34,6 +35,19 @@ def test_a_search_needs_no_kernel_that_is_not_prepared(robot):
     command = [sys.executable, "-c", SEARCH, robot]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_a_search_prepares_no_kernel_of_another_robot_or_solver():
+    def names(**arguments):
+        kernels = search_kernels(**arguments)
+        return {f"{one.py_func.__module__.rpartition('.')[2]}.{one.py_func.__name__}" for one in kernels}
+
+    unicycle = names(is_unicycle=True, has_footprint=False)
+    others = names(is_unicycle=False, has_footprint=True)
+    assert others - unicycle == {"descent.descend", "general_paths.general_tree", "proximity.footprint_proximity"}
+    modules = {name.partition(".")[0] for name in others}
+    assert not modules & {"sweeps", "condensing", "collocation", "stepping", "eikonal"}
+    assert {"shortest_paths", "newton", "tracing"} <= modules
 
 
 SIMULATION = """

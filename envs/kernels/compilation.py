@@ -203,13 +203,16 @@ def called_kernels(function: Callable[..., Any]) -> list[Kernel]:
     the functions that are called under another name, such as the entries of a dictionary and the methods of an object
     whose class no function below names.
     """
-    found: dict[Kernel, None] = {}
+    found: list[Kernel] = []
     visited: set[int] = set()
     waiting: list[Any] = [function]
     while waiting:
         value = waiting.pop()
+        if id(value) in visited:
+            continue
+        visited.add(id(value))
         if isinstance(value, Kernel):
-            found[value] = None
+            found.append(value)
             continue
         if isinstance(value, property):
             value = value.fget
@@ -217,15 +220,14 @@ def called_kernels(function: Callable[..., Any]) -> list[Kernel]:
             value = value.func
         if callable(value):
             value = unwrap(value)
-        if id(value) in visited or not _is_own(value):
+        if not _is_own(value):
             continue
-        visited.add(id(value))
         if isinstance(value, type):
             members = [member for member in vars(value).values() if not isinstance(member, Kernel)]
             waiting += [*value.__bases__, *members]
         elif isinstance(value, FunctionType):
-            waiting += _named_globals(value.__code__, value.__globals__)
-    return list(found)
+            waiting += _named_globals(value.__code__, value.__globals__, visited)
+    return found
 
 
 def _is_own(value: object) -> bool:
@@ -234,9 +236,12 @@ def _is_own(value: object) -> bool:
     return isinstance(name, str) and name.startswith("leapnav.")
 
 
-def _named_globals(code: CodeType, scope: dict[str, Any]) -> Iterator[Any]:
-    """The objects of leapnav that a function and those nested in it name; of a module, the members that they name."""
-    if any(_is_own(scope.get(name)) for name in code.co_names):
+def _named_globals(code: CodeType, scope: dict[str, Any], visited: set[int]) -> Iterator[Any]:
+    """The objects of leapnav that a function and those nested in it name; of a module, the members that they name.
+
+    Functions that may name only objects that have been visited are omitted, because reading the code takes long.
+    """
+    if any(_is_own(value) and id(value) not in visited for value in map(scope.get, code.co_names)):
         module: ModuleType | None = None
         for instruction in get_instructions(code):  # which distinguishes globals from attributes of the same name
             named: Any = None
@@ -249,7 +254,7 @@ def _named_globals(code: CodeType, scope: dict[str, Any]) -> Iterator[Any]:
                 yield named
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _named_globals(constant, scope)
+            yield from _named_globals(constant, scope, visited)
 
 
 def all_kernels() -> list[Kernel]:
