@@ -75,8 +75,8 @@ def test_runs_that_differ_have_wider_intervals_than_runs_that_do_not():
     """Of five runs with rates from 84 to 96 %, the standard error is that of the five rates."""
     rates = np.array([168, 174, 180, 186, 192])
     apart = [evaluation(np.random.default_rng(k).permutation(200) < n) for k, n in enumerate(rates)]
-    alike = [evaluation(np.random.default_rng(k).permutation(200) < 180) for k in range(5)]
-    widths = [(found := score("method", runs).success).high - found.low for runs in (apart, alike)]
+    equal = [evaluation(np.random.default_rng(k).permutation(200) < 180) for k in range(5)]
+    widths = [(found := score("method", runs).success).high - found.low for runs in (apart, equal)]
     assert widths[0] > 2 * widths[1]
     spread = 2 * 2.776 * np.std(rates / 200, ddof=1) / math.sqrt(5)  # t distribution with 4 degrees of freedom
     assert widths[0] == pytest.approx(spread, rel=0.15)
