@@ -131,13 +131,17 @@ def test_the_value_of_many_states_at_once_is_that_of_each_alone():
     assert (feedback.stored[0], feedback.searches) == (before[1][0], before[2])
 
 
-def test_the_fields_of_a_bank_are_read_by_threads():
-    bank = ScenarioBank.shipped("clutter", "test")
-    expected = [bank[i].field for i in range(40)]
+def test_scenarios_and_optima_of_a_bank_are_read_by_threads():
+    expected, bank = ScenarioBank.shipped("clutter", "test"), ScenarioBank(ScenarioBank.shipped("clutter", "test").path)
 
     def read(number):
         order = np.random.default_rng(number).permutation(40)
-        return all(np.array_equal(bank.field(int(i)), expected[i]) for _ in range(20) for i in order)
+        return all(
+            np.array_equal(bank[i].field, expected[i].field)
+            and np.array_equal(bank.reference(i).states, expected.reference(i).states)
+            for _ in range(20)
+            for i in order.tolist()
+        )
 
     assert all(in_threads(read))
 

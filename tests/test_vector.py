@@ -139,7 +139,7 @@ def test_robots_with_the_same_scenario_share_its_field():
         fields = copy.unwrapped._simulator.fields
         assert fields[0] is fields[2] is fields[3]
         assert fields[1] is fields[4] is not fields[0]
-        assert (fields[1] == env.unwrapped.bank.field(4)).all()
+        assert (fields[1] == env.unwrapped.bank[4].field).all()
         assert len(set(fields.places[:, 0].tolist())) == 2
 
 

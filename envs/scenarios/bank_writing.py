@@ -15,21 +15,17 @@ import numpy as np
 
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.bank import (
-    DURATIONS,
     FORMAT,
     GIVEN,
     LOWER_BOUNDS,
     TYPES,
     VERSION,
-    VERSION_WITHOUT_GRIDS,
     attribute_bytes,
     digest,
 )
+from leapnav.envs.scenarios.bank_checks import count_points
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import without_grid
 from leapnav.envs.utils.files import atomic_path
-
-MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +53,7 @@ class BankEntry:
 
 def point_times(horizon: float) -> np.ndarray:
     """Return the times (N,) at which a bank stores the points of an optimum (s)."""
-    return np.linspace(0.0, horizon, math.ceil(horizon / MAX_POINT_INTERVAL - 1e-6) + 1)
+    return np.linspace(0.0, horizon, int(count_points(np.array(horizon))))
 
 
 def write_bank(
@@ -92,15 +88,14 @@ def write_bank(
     kinds = sorted({scenario.horizon_kind for scenario in scenarios})
     if len(kinds) > 1:
         raise ValueError(f"entries: expected one kind of horizon for all scenarios, got {', '.join(kinds)}")
-    fields = [without_grid(scenario.field) for scenario in scenarios]
-    is_complete = all(len(field) == len(scenario.field) for field, scenario in zip(fields, scenarios, strict=True))
     n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
     columns: dict[str, Any] = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),
         "scenario_ends": np.cumsum([len(text) for text in texts]),
-        "tasks": np.array([scenario.task for scenario in scenarios]).reshape(len(scenarios), -1 if scenarios else 11),
-        "fields": np.concatenate([np.empty(0), *fields]),
-        "field_ends": np.cumsum([len(field) for field in fields]),
+        "horizons": [
+            entry.horizon if scenario.horizon is None else scenario.horizon
+            for entry, scenario in zip(entries, scenarios, strict=True)
+        ],
         "draws": [entry.draw for entry in entries],
         "costs": [entry.cost for entry in entries],
         "second_costs": [math.nan if entry.second_cost is None else entry.second_cost for entry in entries],
@@ -110,12 +105,10 @@ def write_bank(
         "controls": np.concatenate([np.empty((0, m)), *(entry.controls for entry in entries)]),
         "costates": np.concatenate([np.empty((0, n)), *(entry.costates for entry in entries)]),
     }
-    if kinds == ["free"]:
-        columns[DURATIONS] = [entry.horizon for entry in entries]
     arrays = {name: np.asarray(values, dtype=TYPES[name]) for name, values in columns.items()}
     attributes = {
         "format": FORMAT,
-        "version": VERSION if is_complete else VERSION_WITHOUT_GRIDS,
+        "version": VERSION,
         "family": family,
         "seed": seed,
         "drawn": drawn,

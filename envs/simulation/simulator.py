@@ -14,6 +14,7 @@ from leapnav.envs.kernels.compilation import called_kernels
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.robots.base import ARCS, GENERAL
 from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.bank_checks import check_optimum
 from leapnav.envs.scenarios.scenario import GOAL, LIMITS, Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
@@ -75,8 +76,6 @@ class BatchSimulator:
         self._n_motion, self._n_controls = n - 3, m
         self._robots = np.zeros((count, n - 3 + m + 3 + 2))
         self.tasks = np.zeros((count, LIMITS + 2 * m + 2 * (n - 3)))
-        self._footprints: list[np.ndarray | None] = [None] * count
-        self._known_bank: tuple[ScenarioBank, np.ndarray] | None = None
         self._drive, self._drives_paths = settings.model.drive, settings.model.drive == GENERAL
         self._pointers: tuple[FunctionPointer, FunctionPointer] | None = None
         self.fields = SharedFields(count)
@@ -150,67 +149,62 @@ class BatchSimulator:
 
         """
         indices = np.asarray(robots, dtype=np.int64)
-        fields = [_get_field(choice, bank) for choice in choices]
-        for field in fields:
-            self._check_fits(field)
-        tasks = [self._get_task(choice, bank) for choice in choices]
-        footprints = [choice.discs if isinstance(choice, Scenario) else self._bank_discs(bank) for choice in choices]
-        distinct = {id(discs): discs for discs in footprints}  # one for all scenarios of a bank
-        self._make_room(max(map(len, tasks)), max(map(_required_discs, distinct.values())))
-        for i, field in zip(indices.tolist(), fields, strict=True):
-            self.fields[i] = field
+        scenarios = [get_scenario(choice, bank) for choice in choices]
+        for scenario in scenarios:
+            self._check_scenario(scenario)
+        references = [self._reference(choice, bank) for choice in choices]
+        self._make_room(max(len(one.task) for one in scenarios), max(_required_discs(one.discs) for one in scenarios))
         m, first = self._n_controls, self._first_disc
-        for i, choice, task, discs in zip(indices.tolist(), choices, tasks, footprints, strict=True):
+        for i, scenario, reference in zip(indices.tolist(), scenarios, references, strict=True):
+            self.fields[i], task, discs = scenario.field, scenario.task, scenario.discs
             self.tasks[i, : len(task)] = task
             row = self._robots[i]
-            if self._footprints[i] is not discs:
-                self._footprints[i] = discs
-                row[first:] = 0.0
-                row[first : first + discs.size] = discs.ravel()
+            row[first:] = 0.0
+            row[first : first + discs.size] = discs.ravel()
             if self._free_horizon:
                 row[first - 1] = task[-1]
             if self.settings.reward == "shaped":
                 if self._drive == ARCS:
                     row[first - 3 : first - 1] = task[LIMITS + m : LIMITS + 2 * m]
                 else:
-                    scenario = get_scenario(choice, bank)
                     row[first - 3 : first - 1] = scenario.robot.metric(scenario.cost)
-                reference = None if isinstance(choice, Scenario) else _require(bank).states(choice)
                 self._guides[i] = guide_points(task[GOAL : GOAL + 2], reference)
             self._contacts.pop(i, None)
         if self._geodesic:
-            self._store_maps(indices, fields)
+            self._store_maps(indices, [scenario.field for scenario in scenarios])
         stepping.start_episodes(indices, self._arrays)
         if self._disturbed:
             for i, generator in zip(indices.tolist(), generators, strict=True):
                 self._generators[i] = generator
                 self._draw_noise(i)
 
-    def _get_task(self, choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray:
-        """Return the packed task of a scenario.
+    def _reference(self, choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray | None:
+        """Return the path (N, n) of the optimum that guides the shaped reward; None without such a reward or path."""
+        if self.settings.reward != "shaped" or isinstance(choice, Scenario) or bank is None:
+            return None
+        return bank.states(choice)
+
+    def _check_scenario(self, scenario: Scenario) -> None:
+        """Check that a scenario is one for this environment.
 
         Raises:
-            ValueError: the scenario has another robot or another kind of horizon than the environment.
+            ValueError: the scenario has another robot or another kind of horizon, or an obstacle has more vertices than
+                the map.
 
         """
-        if not isinstance(choice, Scenario) and self._known_bank is not None and bank is self._known_bank[0]:
-            return self._known_bank[0].tasks[choice]
-        if isinstance(choice, Scenario):
-            name, robot, horizon = f"scenario {choice.name!r}", choice.robot, choice.horizon_kind
-        else:
-            known = _require(bank)
-            name, robot, horizon = f"bank {known.path.name}", known.robot, known.horizon
-        if robot.model != self.settings.robot:
+        if scenario.robot.model != self.settings.robot:
             raise ValueError(
-                f"robot: this environment is for {self.settings.robot!r}, but {name} has the robot {robot.model!r}; "
-                f"make the environment with robot={robot.model!r}"
+                f"robot: this environment is for {self.settings.robot!r}, but scenario {scenario.name!r} has the robot "
+                f"{scenario.robot.model!r}; make the environment with robot={scenario.robot.model!r}"
             )
-        if horizon != self.settings.horizon:
+        if scenario.horizon_kind != self.settings.horizon:
             raise ValueError(
-                f"horizon: this environment is for a {self.settings.horizon} horizon, but that of {name} is {horizon}; "
-                f"make the environment with horizon={horizon!r}"
+                f"horizon: this environment is for a {self.settings.horizon} horizon, but that of scenario "
+                f"{scenario.name!r} is {scenario.horizon_kind}; make the environment with "
+                f"horizon={scenario.horizon_kind!r}"
             )
-        return choice.task if isinstance(choice, Scenario) else _require(bank).tasks[choice]
+        if self._maps:
+            check_map(scenario.field, self.settings.map_vertices)
 
     def _make_room(self, n_columns: int, n_discs: int) -> None:
         """Enlarge the arrays of tasks and footprints."""
@@ -230,21 +224,14 @@ class BatchSimulator:
             bank: the bank, or None.
 
         Raises:
-            ValueError: an obstacle has more vertices than the map, or the scenario has another robot or another kind of
-                horizon.
+            ValueError: see `_check_scenario`.
 
         """
         if choice is not None:
-            self._get_task(choice, bank)
-            self._check_fits(_get_field(choice, bank))
+            self._check_scenario(get_scenario(choice, bank))
         elif bank is not None:
-            self._get_task(0, bank)
-            for index in range(len(bank)):
-                self._check_fits(bank.field(index))
-
-    def _check_fits(self, field: np.ndarray) -> None:
-        if self._maps:
-            check_map(field, self.settings.map_vertices)
+            for scenario in bank if self._maps else bank[:1]:
+                self._check_scenario(scenario)
 
     def _store_maps(self, robots: np.ndarray, fields: Sequence[np.ndarray]) -> None:
         """Store the geodesic maps of robots whose tasks are stored, with given obstacle fields."""
@@ -353,13 +340,6 @@ class BatchSimulator:
             return np.array([self.state[i, SPEED], self.state[i, TURN_RATE]])
         return self._robots[i, self._n_motion : self._n_motion + self._n_controls].copy()
 
-    def _bank_discs(self, bank: ScenarioBank | None) -> np.ndarray:
-        """Return the footprint of the robot of a bank."""
-        if self._known_bank is None or self._known_bank[0] is not bank:
-            known = _require(bank)
-            self._known_bank = known, known[0].discs
-        return self._known_bank[1]
-
     def _parameters(self, i: int) -> np.ndarray:
         """Return the parameters of a robot's model."""
         return self.tasks[i, LIMITS + 2 * self._n_controls + 2 * self._n_motion :]
@@ -413,15 +393,6 @@ def _required_discs(discs: np.ndarray) -> int:
     return 1 if len(discs) == 1 and discs[0, 0] == 0.0 else max(len(discs), 2)
 
 
-def _require(bank: ScenarioBank | None) -> ScenarioBank:
-    assert bank is not None  # an index always refers to a bank
-    return bank
-
-
-def _get_field(choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray:
-    return choice.field if isinstance(choice, Scenario) else _require(bank).field(choice)
-
-
 def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
     motors = stepping.command, stepping.drive_motors, stepping.read_velocities
@@ -433,6 +404,9 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
             settings.model.advance,
             settings.model.state_cost or no_state_cost,
         )
+    if settings.reward == "shaped":
+        guiding = called_kernels(check_optimum)  # of banks, whose optima guide the robots
+        moving = *moving, *guiding, settings.model.advance, settings.model.state_cost or no_state_cost
     observing = {"map": check_map, "geodesic": geodesic_map}.get(settings.observation)
     if observing is not None:
         moving = *moving, *called_kernels(observing)

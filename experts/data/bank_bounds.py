@@ -166,5 +166,5 @@ def _result(bank: ScenarioBank, index: int, arrays: Arrays) -> BankBound:
 
 
 def _identity(bank: ScenarioBank) -> str:
-    """Return a checksum of the tasks and their optimal costs."""
-    return digest(np.append(bank.tasks, bank.costs))
+    """Return a checksum of the scenarios and their optimal costs."""
+    return digest("".join(bank.checksums[name] for name in ("scenarios", "costs")).encode())
