@@ -26,7 +26,7 @@ leapnav that built the bank), `given` (only of a bank of given scenarios; JSON: 
 `attributes` that of the other attributes).
 
 A bank contains nothing in the form in which kernels read it: obstacle fields and tasks are made from the validated
-scenarios. The optima are checked by `leapnav.envs.scenarios.bank_checks`.
+scenarios. The optima are checked by `leapnav.envs.scenarios.banks.checks`.
 """  # noqa: E501 (tables)
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from typing import Any, overload
 import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.bank_checks import (
+from leapnav.envs.scenarios.banks.checks import (
     Reference,
     check_attributes,
     check_lengths,
@@ -384,7 +384,7 @@ def _locate(file: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
     """Return the first byte of a dataset in the file, its number of bytes, and its shape.
 
     Raises:
-        KeyError, AttributeError, ValueError: there is no such dataset, or it is not stored as the format requires.
+        ValueError: there is no such dataset, or it is not stored as the format requires.
 
     """
     import h5py
@@ -392,7 +392,7 @@ def _locate(file: Any, name: str) -> tuple[int, int, tuple[int, ...]]:
     is_here = isinstance(file.get(name, getlink=True), h5py.HardLink)  # other links can lead to other files
     dataset = file[name] if is_here else None
     if (
-        dataset is None
+        not isinstance(dataset, h5py.Dataset)
         or dataset.dtype != np.dtype(TYPES[name])
         or dataset.chunks is not None
         or len(dataset.shape) != (2 if name in _TABLES else 1)

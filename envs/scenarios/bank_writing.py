@@ -23,7 +23,7 @@ from leapnav.envs.scenarios.bank import (
     attribute_bytes,
     digest,
 )
-from leapnav.envs.scenarios.bank_checks import count_points
+from leapnav.envs.scenarios.banks.checks import count_points
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import atomic_path
 

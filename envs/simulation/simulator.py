@@ -14,7 +14,7 @@ from leapnav.envs.kernels.compilation import called_kernels
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.robots.base import ARCS, GENERAL
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.bank_checks import check_optimum
+from leapnav.envs.scenarios.banks.checks import check_optimum
 from leapnav.envs.scenarios.scenario import GOAL, LIMITS, Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings

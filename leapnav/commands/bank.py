@@ -118,6 +118,8 @@ class Show:
         check_at_least("count", self.count, 0)
         check_outputs(self.json, plot)
         bank.verify_checksums()
+        for index in range(len(bank)):
+            bank.reference(index)  # checks the optimum
         if self.card:
             print(data_card(bank), end="")
             return 0
@@ -274,7 +276,7 @@ def _print_summary(bank: ScenarioBank) -> None:
     kind = "" if bank.horizon == "fixed" else ", free horizon"
     source = f"seed {bank.seed}" if bank.given is None else "given"
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, {source}, leapnav {bank.software}")
-    print("  checksums          verified")
+    print("  checksums, optima  verified")
     print(f"  {'sampled' if bank.given is None else 'given  '}            {bank.drawn}")
     for reason, count in bank.rejected.items():
         print(f"  rejected           {count} ({reason})")

@@ -1,1 +1,1 @@
-"""Banks of scenarios included in leapnav (data)."""
+"""The included scenario banks, and checks of what a bank contains."""
