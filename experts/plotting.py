@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from leapnav.envs import shapes
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
@@ -41,11 +42,11 @@ MAX_LINEAR_SPREAD = 100.0  # in units of the smallest distance; a larger spread 
 def draw_scenario(axes: Axes, scenario: Scenario) -> None:
     """Draw arena, obstacles, start and goal to scale, in metres."""
     x_min, y_min, x_max, y_max = scenario.arena
-    for obstacle in scenario.obstacles:
-        if obstacle.circle is not None:
-            axes.add_patch(Circle(obstacle.circle.center, obstacle.circle.radius, facecolor=OBSTACLE, edgecolor=EDGE))
+    for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
+        if isinstance(part, shapes.Circle):
+            axes.add_patch(Circle(part.center, part.radius, facecolor=OBSTACLE, edgecolor=EDGE))
         else:
-            axes.add_patch(Polygon(obstacle.shape.outline(), facecolor=OBSTACLE, edgecolor=EDGE))
+            axes.add_patch(Polygon(part.outline(), facecolor=OBSTACLE, edgecolor=EDGE))
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
     for pose, color in ((scenario.start, START), (scenario.goal, GOAL)):
         draw_robot(axes, pose, scenario.discs, color)

@@ -18,7 +18,7 @@ T = TypeVar("T")
 _ENVS = {
     "arcs": "simulation.arcs",
     "bank": "scenarios.bank",
-    "crowds": "shapes.proximity_grid",
+    "crowds": "shapes.proximity",
     "driving": "simulation.stepping",
     "families": "scenarios.families",
     "fields": "shapes.field",

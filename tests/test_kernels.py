@@ -141,6 +141,37 @@ def test_on_a_terminal_the_progress_line_is_updated_in_place(monkeypatch, capsys
     assert [part.split(": ")[-1].strip() for part in lines.split("\r")[1:]] == [f"{k} of 2 kernels" for k in (0, 1, 2)]
 
 
+SCRIPT = """
+from beside import SCALE
+from leapnav.envs.kernels import kernel
+
+@kernel("float64(float64)")
+def scaled(x):
+    return SCALE * x
+
+print(scaled(2.0), sum(scaled.stats.cache_hits.values()))
+"""
+
+
+def test_kernels_of_a_script_are_cached_until_it_or_a_module_beside_it_changes(tmp_path):
+    (tmp_path / "script.py").write_text(f"# {tmp_path}{SCRIPT}")  # not in the cache from an earlier test
+
+    def result(*command, scale, **options):
+        (tmp_path / "beside.py").write_text(f"SCALE = {scale}\n")
+        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, *command]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, **options
+        )
+        return done.stdout.split()
+
+    name = str(tmp_path / "script.py")
+    assert result(name, scale=1.0) == ["2.0", "0"]
+    assert result(name, scale=1.0) == ["2.0", "1"]
+    assert result(name, scale=2.0) == ["4.0", "0"]
+    assert result("-", scale=1.0, input=SCRIPT) == ["2.0", "0"]  # without a source file
+
+
 def test_no_two_kernels_have_one_name():
     names = [(one.py_func.__module__, one.py_func.__qualname__) for one in all_kernels()]
     assert len(names) > 80

@@ -1,39 +1,49 @@
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Obstacle, Polygon, Scenario, Unicycle
+from leapnav.envs.shapes.barrier import CONTACT, MIN_EXPONENT, barrier, barrier_value, exponential
 from leapnav.envs.shapes.clearance import clearance, clearances
 from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
-from leapnav.envs.shapes.proximity_grid import MAX_EXPONENT, MIN_EXPONENT, exponential
-from leapnav.envs.simulation.arcs import follow_arc
+from leapnav.envs.simulation.arcs import arc_point, arc_proximity, follow_arc
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
 
 
+def plain_barrier(s):
+    """1 / (exp(s) - 1), and below CONTACT the quadratic polynomial with the same derivatives there."""
+    b = 1 / math.expm1(max(s, CONTACT))
+    slope, bend = -b * (1 + b), b * (1 + b) * (1 + 2 * b)
+    return b + min(s - CONTACT, 0) * slope + min(s - CONTACT, 0) ** 2 * bend / 2
+
+
+def polygon_distance(vertices, point):
+    """Signed distance to a convex polygon: to the nearest segment, or inside to the nearest line."""
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
+    normals *= np.sign(np.sum(normals * (vertices - vertices.mean(axis=0)), axis=1))[:, None]
+    heights = np.sum(normals * (point - vertices), axis=1)
+    if heights.max() <= 0:
+        return heights.max()
+    fraction = np.clip(np.sum((point - vertices) * edges, axis=1) / np.sum(edges**2, axis=1), 0, 1)
+    return np.linalg.norm(point - vertices - fraction[:, None] * edges, axis=1).min()
+
+
 def plain_proximity(scenario, x, y):
-    """The formulas of the design, without protection against overflow."""
+    """The formulas of the theory, without limits of the distance."""
     cost, radius = scenario.cost, scenario.robot.radius
-    k, sigma = cost.proximity_weight, cost.proximity_scale
     x_min, y_min, x_max, y_max = scenario.arena
-    total = sum(k * math.exp(-(d - radius) / sigma) for d in (x - x_min, x_max - x, y - y_min, y_max - y))
+    distances = [x - x_min, x_max - x, y - y_min, y_max - y]
     for obstacle in scenario.obstacles:
         if obstacle.circle:
-            cx, cy = obstacle.circle.center
-            distance = math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + 1e-6)
-            total += k * math.exp(-(distance - obstacle.circle.radius - radius) / sigma)
+            distances.append(math.dist((x, y), obstacle.circle.center) - obstacle.circle.radius)
         else:
-            v = np.array(obstacle.polygon.vertices)
-            centre = v.mean(axis=0)
-            total_weight = 0.0
-            for a, b in zip(v, np.roll(v, -1, axis=0), strict=True):
-                normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
-                normal *= np.sign(normal @ (a - centre))
-                total_weight += math.exp((normal @ (np.array([x, y]) - a) - radius) / sigma)
-            total += k / total_weight
-    return total
+            distances.append(polygon_distance(np.array(obstacle.polygon.vertices), np.array([x, y])))
+    return cost.proximity_weight * sum(plain_barrier((d - radius) / cost.proximity_scale) for d in distances)
 
 
 def points(scenario, count, seed=0):
@@ -46,13 +56,14 @@ def test_the_proximity_cost_is_the_formula(scenario):
     left_out = 1e-13 * scenario.cost.proximity_weight * (len(scenario.obstacles) + 4)  # each term below CUTOFF
     for x, y in points(scenario, 100):
         formula = plain_proximity(scenario, x, y)
-        assert proximity(x, y, scenario.field)[0] == pytest.approx(formula, rel=1e-9, abs=left_out)
+        assert proximity(x, y, scenario.field)[0] == pytest.approx(formula, rel=1e-11, abs=left_out)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_gradient_and_hessian_agree_with_finite_differences(scenario):
-    h = 1e-5
-    for x, y in points(scenario, 100):
+    for x, y in points(scenario, 200):
+        # In proportion to the distance near contact, where the derivatives are large.
+        h = 1e-4 * min(max(abs(clearance(x, y, scenario.field)[0]), 1e-3), 0.1)
         _, gx, gy, hxx, hxy, hyy = values = proximity(x, y, scenario.field)
         right, left = (proximity(x + s, y, scenario.field) for s in (h, -h))
         above, below = (proximity(x, y + s, scenario.field) for s in (h, -h))
@@ -60,6 +71,49 @@ def test_gradient_and_hessian_agree_with_finite_differences(scenario):
         differences += [(right[1] - left[1]) / (2 * h), (right[2] - left[2]) / (2 * h), (above[2] - below[2]) / (2 * h)]
         # The difference quotient's own error, relative to the largest derivative there.
         assert [gx, gy, hxx, hxy, hyy] == pytest.approx(differences, rel=1e-5, abs=1e-6 * max(1, *map(abs, values)))
+
+
+def test_the_barrier_function_and_its_derivatives():
+    for s in np.geomspace(CONTACT * 1.001, 300.0, 2000):
+        b = 1 / math.expm1(s)
+        expected = b, -b * (1 + b), b * (1 + b) * (1 + 2 * b)
+        assert barrier(s, CONTACT) == pytest.approx(expected, rel=1e-13)
+        assert barrier_value(s, CONTACT) == pytest.approx(b, rel=1e-12)
+    for s in (0.3, 2.0):
+        h = 1e-4
+        (left, right), (_, slope, bend) = (barrier(s + sign * h, CONTACT) for sign in (-1, 1)), barrier(s, CONTACT)
+        assert [slope, bend] == pytest.approx(np.subtract(right, left)[:2] / (2 * h), rel=1e-6)
+
+
+@pytest.mark.parametrize("contact", [CONTACT, 0.1])
+def test_the_barrier_continues_below_contact_as_a_polynomial_that_decreases(contact):
+    at, below = barrier(contact * (1 + 1e-9), contact), barrier(contact * (1 - 1e-9), contact)
+    assert at == pytest.approx(below, rel=1e-7)  # twice continuously differentiable
+    inside = np.array([barrier(s, contact) for s in np.linspace(-50.0, contact, 1001)])
+    assert np.isfinite(inside).all()
+    assert (inside[:, 1] < 0).all()
+    assert (np.diff(inside[:, 0]) < 0).all()
+    assert inside[:, 2] == pytest.approx(at[2], rel=1e-7)
+    assert [barrier_value(s, contact) for s in (-3.0, 0.0, contact / 2)] == [
+        barrier(s, contact)[0] for s in (-3.0, 0.0, contact / 2)
+    ]
+
+
+def test_the_cost_inside_an_obstacle_decreases_outwards():
+    """A guess in collision is moved out by the descent."""
+    disc = {"circle": {"center": [5, 5], "radius": 1.0}}
+    box = {"polygon": {"vertices": [[4, 4], [6, 4], [6, 6], [4, 6]]}}
+    bar = {"capsule": {"start": [4, 5], "end": [6, 5], "radius": 0.5}}
+    for obstacle in (disc, box, bar):
+        scenario = Scenario.from_dict(scenario_fields(obstacles=[obstacle]))
+        for turn in np.linspace(0.1, 6.3, 20):
+            outwards = np.array([math.cos(turn), math.sin(turn)])
+            path = (5, 5) + np.linspace(0.05, 2.5, 200)[:, None] * outwards
+            path = path[[clearance(x, y, scenario.field)[0] < 0 for x, y in path]]
+            found = np.array([proximity(x, y, scenario.field) for x, y in path])
+            assert np.isfinite(found).all()
+            assert (np.diff(found[:, 0]) <= 0).all()
+            assert (found[:, 1:3] @ outwards <= 0).all()
 
 
 def test_the_proximity_cost_does_not_overflow_far_inside_or_far_away():
@@ -104,10 +158,10 @@ def test_values_alone_and_by_three_are_those_with_derivatives(scenario):
         three = (x - dx, y - dy), (x, y), (x + dx, y + dy)
         expected = [proximity(*point, scenario.field)[0] for point in three]
         assert [proximity_value(*point, scenario.robot.radius, scenario.field) for point in three] == pytest.approx(
-            expected, abs=1e-9
+            expected, rel=1e-9, abs=1e-8
         )
         found = proximity_values(*three[0], *three[1], *three[2], scenario.robot.radius, scenario.field)
-        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-8)
 
 
 def test_clearance_names_the_nearest_obstacle():
@@ -116,7 +170,7 @@ def test_clearance_names_the_nearest_obstacle():
         distance, nearest = clearance(*obstacle.circle.center, scenario.field)
         assert nearest == number
         assert distance == pytest.approx(-obstacle.circle.radius - scenario.robot.radius)
-    assert clearance(0.0, 5.0, scenario.field)[1] == len(scenario.obstacles)
+    assert clearance(0.0, 5.0, scenario.field)[1] == -1  # the wall
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
@@ -141,6 +195,47 @@ def test_the_clearance_of_an_arc_is_the_smallest_of_its_points(scenario):
             assert lowest <= 1e-9
             assert driven == pytest.approx(fraction[np.argmin(free)], abs=2e-3)  # the first contact
             assert before <= 0 or 0 <= after < 1e-3
+
+
+def accurate_mean(scenario, arc):
+    """Mean of Phi along an arc, by Gauss rules over panels graded towards both ends and the smallest clearance."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    trial = np.linspace(0, 1, 2001)
+    clearances_ = [clearance(*arc_point(*arc, s), scenario.field)[0] for s in trial]
+    steps = np.concatenate([[0.0], 1.5 ** -np.arange(45.0)])
+    centres = 0.0, trial[np.argmin(clearances_)], 1.0
+    ends = np.unique(np.clip([c + sign * steps for c in centres for sign in (-1, 1)], 0, 1))
+    total = 0.0
+    for a, b in pairwise(ends):
+        for node, weight in zip(nodes, weights, strict=True):
+            point = arc_point(*arc, (a + b) / 2 + (b - a) / 2 * node)
+            total += (b - a) / 2 * weight * proximity(*point, scenario.field)[0]
+    return total
+
+
+def test_the_proximity_cost_of_an_arc_is_accurate_near_obstacles_and_up_to_a_contact():
+    rng = np.random.default_rng(0)
+    scenario = Scenario.from_dict(
+        scenario_fields(
+            obstacles=[
+                {"circle": {"center": [5, 5], "radius": 0.5}},
+                {"polygon": {"vertices": [[5.4, 5], [7, 4.5], [7, 5.5]]}},
+            ]
+        )
+    )
+    errors = {True: [], False: []}
+    for _ in range(300):
+        distance, turn = 0.75 + 10 ** rng.uniform(-4, -0.5), rng.uniform(0.8, 5.5)
+        x, y = 5 + distance * math.cos(turn), 5 + distance * math.sin(turn)
+        arc = x, y, rng.uniform(-np.pi, np.pi), rng.uniform(0.01, 0.15), rng.uniform(-0.4, 0.4)
+        lowest, fraction, _ = follow_arc(*arc, clearance(x, y, scenario.field)[0], scenario.field)
+        arc = *arc[:3], arc[3] * fraction, arc[4] * fraction
+        found = arc_proximity(*arc, lowest, scenario.field)
+        errors[fraction < 1].append(abs(found / accurate_mean(scenario, arc) - 1))
+    assert min(map(len, errors.values())) > 60
+    assert max(errors[False]) < 1e-4
+    assert max(errors[True]) < 2e-3
+    assert np.quantile(errors[True], 0.95) < 1e-4
 
 
 def test_a_very_long_arc_through_a_wall_terminates():
@@ -198,14 +293,15 @@ def test_a_grid_of_obstacles_changes_nothing(count, size):
         assert (np.abs(np.array(proximity(x, y, scenario.field)) - expected) <= tolerance).all()
 
 
-def test_the_exponential_of_the_grid_is_exp():
-    x = np.concatenate([np.linspace(MIN_EXPONENT, MAX_EXPONENT, 20_001), np.linspace(-1.0, 1.0, 20_001)])
+def test_the_exponential_function():
+    x = np.concatenate([np.linspace(MIN_EXPONENT, 0.0, 20_001), -np.geomspace(1e-9, 1.0, 20_001)])
     found = np.array([exponential(value) for value in x])
-    np.testing.assert_allclose(found, np.exp(x), rtol=2e-15)  # the reference is off by an ulp, too
-    assert exponential(0.0) == 1.0
-    assert exponential(-1e30) == exponential(MIN_EXPONENT) < 1e-300
-    assert exponential(1e30) == exponential(MAX_EXPONENT) < math.inf
-    assert math.isnan(exponential(math.nan))
+    np.testing.assert_allclose(found[:, 0], np.exp(x), rtol=2e-15)  # the reference is off by an ulp, too
+    np.testing.assert_allclose(found[:, 1], np.expm1(x), rtol=2e-15)
+    assert exponential(0.0) == (1.0, 0.0)
+    assert exponential(-1e30) == exponential(MIN_EXPONENT)
+    assert exponential(-1e30)[0] < 1e-300
+    assert math.isnan(exponential(math.nan)[0])
 
 
 def test_points_far_away_or_not_numbers_are_survived():

@@ -129,8 +129,7 @@ def test_an_optimum_is_certified_and_satisfies_the_minimum_principle_independent
     running += 0.5 * controls**2 @ weights
     sigma = scenario.cost.proximity_scale
     gaps = np.concatenate([states[:, :2], 8.0 - states[:, :2]], axis=1) - scenario.robot.radius
-    smooth = np.sqrt((states[:, 0] - 3.6) ** 2 + (states[:, 1] - 3.9) ** 2 + 1e-6) - 0.7 - scenario.robot.radius
-    running += np.exp(-gaps / sigma).sum(axis=1) + np.exp(-smooth / sigma)
+    running += (1 / np.expm1(gaps / sigma)).sum(axis=1) + 1 / np.expm1(distance / sigma)
     assert np.trapezoid(running, times) == pytest.approx(optimum.cost, rel=1e-5)
     # Within the limits u = -p / r with the switching functions p, and at a limit p points outwards.
     columns = np.tile(parameters, (len(times), 1))

@@ -2,8 +2,10 @@ import math
 
 import numpy as np
 import pytest
+from helpers import scenario_fields
 
 from leapnav.envs import Scenario, ScenarioBank, sample_scenario
+from leapnav.envs.shapes.proximity import disc_proximity
 from leapnav.experts import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.second_opinion import Opinion, second_opinion, verify_bank
@@ -48,6 +50,30 @@ def test_a_whole_bank_gets_opinions_in_order_whatever_the_number_of_workers(tmp_
     assert one == verify_bank(ScenarioBank(bank.path), workers=2, progress=False)
     assert [opinion.name for opinion in one] == [scenario.name for scenario in bank]
     assert all(isinstance(opinion, Opinion) and opinion.improvement < 1e-6 for opinion in one)
+
+
+def test_the_proximity_cost_of_the_transcription_is_that_of_the_kernels():
+    casadi = pytest.importorskip("casadi")
+    from leapnav.experts.search.ipopt import _proximity
+
+    obstacles = [
+        {"circle": {"center": [3, 3], "radius": 0.5}},
+        {"capsule": {"start": [5, 2], "end": [7, 3], "radius": 0.2}},
+        {"capsule": {"start": [5, 8], "end": [5, 8], "radius": 0.2}},
+        {"polygon": {"vertices": [[3, 6], [3, 8], [5, 7]]}},
+    ]
+    small = Scenario.from_dict(scenario_fields(obstacles=obstacles))
+    x, y = casadi.SX.sym("x"), casadi.SX.sym("y")
+    value = _proximity(small, x, y, 0.3)
+    hessian, gradient = casadi.hessian(value, casadi.vertcat(x, y))
+    entries = [value, gradient[0], gradient[1], hessian[0, 0], hessian[0, 1], hessian[1, 1]]
+    function = casadi.Function("proximity", [x, y], entries)
+    for point in np.random.default_rng(0).uniform(0, 10, (500, 2)):
+        expected = np.array(disc_proximity(*point, 0.3, small.field))
+        # Terms below 1e-13 are skipped by the kernels; they are 1e-11 in the Hessian, for a scale of 0.1 m.
+        assert np.ravel(function(*point)) == pytest.approx(
+            expected, rel=1e-9, abs=1e-10 + 1e-9 * np.abs(expected).max()
+        )
 
 
 def test_ipopt_finds_the_same_optimum_by_other_means(scenario):

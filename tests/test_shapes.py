@@ -2,11 +2,7 @@
 
 import json
 import math
-import os
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -17,11 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.path import Path as Outline
 
 from leapnav.envs import Capsule, Circle, NavigateEnv, Obstacle, Polygon, Scenario, ScenarioError, Shape
-from leapnav.envs.kernels import kernel
 from leapnav.envs.shapes import register
-from leapnav.envs.shapes.base import DISTANCE_SIGNATURE, KINDS, SMOOTH_DISTANCE_SIGNATURE, kind_number
+from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.field import MAX_OBSTACLES_WITHOUT_GRID, blend_fields, check_field, obstacle_centres
+from leapnav.envs.shapes.distance import polygon_geometry
+from leapnav.envs.shapes.field import MAX_OBSTACLES_WITHOUT_GRID, blend_fields, obstacle_centres
+from leapnav.envs.shapes.field import SHAPES as FIRST
 from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
 from leapnav.envs.shapes.sampling import PointGrid, sample_grid
 from leapnav.envs.simulation.rendering import Scene, draw_scene
@@ -32,67 +29,32 @@ from leapnav.experts import find_optimum
 from leapnav.experts.plotting import draw_scenario
 from leapnav.experts.search.path_class import path_sides
 
-ROOT = Path(__file__).parent
 
+class Key(Shape):
+    """A key: a disc, a capsule and a polygon, which overlap."""
 
-@kernel(DISTANCE_SIGNATURE)
-def lame_curve_distance(x, y, values):
-    """The distance to a convex shape is the largest one to its tangents: a search over their angles."""
-    x, y, a, b = abs(x - values[0]), abs(y - values[1]), values[2], values[3]
-    best, angle, width = -np.inf, math.pi / 4, math.pi / 4
-    for _ in range(10):
-        middle = angle
-        for k in range(-4, 5):
-            trial = min(max(middle + k * width / 4, 0.0), math.pi / 2)
-            c, s = math.cos(trial), math.sin(trial)
-            found = x * c + y * s - ((a * c) ** (4 / 3) + (b * s) ** (4 / 3)) ** 0.75
-            if found > best:
-                best, angle = found, trial
-        width /= 3
-    return best
-
-
-@kernel(SMOOTH_DISTANCE_SIGNATURE)
-def lame_curve_smooth_distance(x, y, scale, values):
-    """Gauge function (u^4 + v^4)^(1/4) - 1, times the smaller half-axis."""
-    a, b = values[2], values[3]
-    u, v, m = (x - values[0]) / a, (y - values[1]) / b, min(a, b)
-    g = (u**4 + v**4 + 1e-6) ** 0.25
-    gu, gv, bend = u**3 / g**3, v**3 / g**3, 3 / g**7
-    guu, guv, gvv = bend * u**2 * (v**4 + 1e-6), -bend * u**3 * v**3, bend * v**2 * (u**4 + 1e-6)
-    return m * (g - 1), m * gu / a, m * gv / b, m * guu / a**2, m * guv / (a * b), m * gvv / b**2
-
-
-class LameCurve(Shape):
-    """A superellipse, ((x - x_0) / a)^4 + ((y - y_0) / b)^4 = 1."""
-
-    kind: ClassVar = "lame_curve"
-    distance: ClassVar = lame_curve_distance
-    smooth_distance: ClassVar = lame_curve_smooth_distance
+    kind: ClassVar = "key"
 
     center: Point
-    half_axes: tuple[Positive, Positive]
+    radius: Positive
 
-    def values(self):
-        return (*self.center, *self.half_axes)
-
-    def outline(self):
-        turn = np.linspace(0, 2 * np.pi, 97)[:-1]
-        unit = np.column_stack([np.cos(turn), np.sin(turn)])
-        return np.array(self.center) + np.array(self.half_axes) * np.sign(unit) * np.sqrt(np.abs(unit))
+    def parts(self):
+        (x, y), r = self.center, self.radius
+        bit = Polygon(vertices=((x + r, y), (x + r, y - 2 * r), (x + 2 * r, y - 2 * r), (x + 2 * r, y)))
+        return bit, Capsule(start=(x, y), end=(x + 2 * r, y), radius=r / 2), Circle(center=(x, y), radius=r)
 
 
 SHAPES = [
     Circle(center=(4.0, 3.0), radius=0.7),
     Polygon(vertices=((3.2, 2.4), (4.9, 2.7), (4.6, 3.6), (3.5, 3.5))),
     Capsule(start=(3.4, 2.5), end=(4.6, 3.4), radius=0.3),
-    LameCurve(center=(4.0, 3.0), half_axes=(0.9, 0.6)),
+    Key(center=(3.6, 3.1), radius=0.5),
 ]
 
 
 @pytest.fixture(autouse=True)
-def _lame_curve():
-    register(LameCurve)  # until the end of each test, see conftest.py
+def _key():
+    register(Key)  # until the end of each test, see conftest.py
 
 
 each_shape = pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
@@ -112,67 +74,62 @@ def points(count, seed=0):
     return np.random.default_rng(seed).uniform((1.5, 0.8), (6.5, 5.2), (count, 2))
 
 
-def outline_distance(shape, x, y):
-    """Signed distance to the polygon of the outline, by brute force."""
-    vertices = shape.outline()
+def distance_to(shape, x, y):
+    """Signed distance (m), negative inside, by brute force over the segments of the parts."""
+    return min(part_distance(part, np.array([x, y])) for part in shape.parts())
+
+
+def part_distance(part, point):
+    vertices, radius = part.rounded_polygon()
     edges = np.roll(vertices, -1, axis=0) - vertices
-    offsets = np.array([x, y]) - vertices
-    part = np.clip(np.sum(offsets * edges, axis=1) / np.maximum(np.sum(edges**2, axis=1), 1e-300), 0, 1)
-    nearest = np.linalg.norm(offsets - part[:, None] * edges, axis=1).min()
-    return -nearest if Outline(vertices).contains_point((x, y)) else nearest
+    offsets = point - vertices
+    fraction = np.clip(np.sum(offsets * edges, axis=1) / np.maximum(np.sum(edges**2, axis=1), 1e-300), 0, 1)
+    nearest = np.linalg.norm(offsets - fraction[:, None] * edges, axis=1).min()
+    return (-nearest if len(vertices) > 2 and Outline(vertices).contains_point(point) else nearest) - radius
 
 
 @each_shape
-def test_the_distance_is_that_to_the_outline(shape):
-    values = np.array(shape.values())
+def test_the_outline_is_on_the_boundary(shape):
+    for part in shape.parts():
+        for point in part.outline():
+            assert part_distance(part, point) == pytest.approx(0, abs=1e-9)
+
+
+@each_shape
+def test_the_clearance_is_the_exact_distance(shape):
+    field = scenario_of(shape).field
     for x, y in points(300):
-        assert type(shape).distance(x, y, values) == pytest.approx(outline_distance(shape, x, y), abs=4e-3)
-    for x, y in shape.outline():
-        assert type(shape).distance(x, y, values) == pytest.approx(0, abs=1e-8)
+        distance, nearest = clearance(x, y, field)
+        wall, expected = min(x, 8 - x, y, 6 - y), distance_to(shape, x, y)
+        assert distance == pytest.approx(min(wall, expected) - ROBOT, abs=1e-12)
+        assert nearest == (0 if expected < wall else -1)
 
 
 @each_shape
-def test_the_derivatives_of_the_smooth_distance_agree_with_finite_differences(shape):
-    values, h = np.array(shape.values()), 1e-5
-    for x, y in points(200):
-        if type(shape).distance(x, y, values) < -0.2:  # nearly singular at the centre
-            continue
-        _, *found = type(shape).smooth_distance(x, y, 0.1, values)
-        right, left = (np.array(type(shape).smooth_distance(x + s, y, 0.1, values)) for s in (h, -h))
-        above, below = (np.array(type(shape).smooth_distance(x, y + s, 0.1, values)) for s in (h, -h))
-        along, up = (right - left) / (2 * h), (above - below) / (2 * h)
-        assert found == pytest.approx([along[0], up[0], along[1], along[2], up[2]], abs=1e-6)
-        assert up[1] == pytest.approx(along[2], abs=1e-6)
-
-
-@each_shape
-def test_the_cost_and_its_derivatives_are_the_sum_over_the_obstacles(shape):
+def test_the_cost_is_the_sum_over_the_parts(shape):
     other = Circle(center=(2.0, 4.5), radius=0.4)
-    both, alone, empty = scenario_of(shape, other), scenario_of(other), scenario_of()
-    cost, values, sigma = both.cost, np.array(shape.values()), both.cost.proximity_scale
+    both, empty = scenario_of(shape, other), scenario_of()
+    sigma, k = both.cost.proximity_scale, both.cost.proximity_weight
     for x, y in points(200):
-        d, dx, dy, dxx, dxy, dyy = type(shape).smooth_distance(x, y, sigma, values)
-        term = cost.proximity_weight * math.exp(-(d - ROBOT) / sigma)
-        slopes = [-term * dx / sigma, -term * dy / sigma]
-        bends = [term * (a * b / sigma - c) / sigma for a, b, c in ((dx, dx, dxx), (dx, dy, dxy), (dy, dy, dyy))]
-        expected = np.array(proximity(x, y, alone.field)) + np.array([term, *slopes, *bends])
-        assert proximity(x, y, both.field) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        distances = [part_distance(part, np.array([x, y])) - ROBOT for part in (*shape.parts(), other)]
+        if min(distances) < 1e-3:
+            continue
+        expected = proximity(x, y, empty.field)[0] + k * sum(1 / math.expm1(d / sigma) for d in distances)
+        assert proximity(x, y, both.field)[0] == pytest.approx(expected, rel=1e-12, abs=1e-12)
         value = proximity_values(x - 0.05, y, x, y, x, y + 0.05, ROBOT, both.field)
-        assert proximity_value(x, y, ROBOT, both.field) == pytest.approx(value[1], rel=1e-9, abs=1e-9)
-        assert value[1] == pytest.approx(expected[0], rel=1e-9, abs=1e-9)
-        assert value[2] == pytest.approx(proximity(x, y + 0.05, both.field)[0], rel=1e-9, abs=1e-9)
-        here = min(type(shape).distance(x, y, values), Circle.distance(x, y, np.array(other.values()))) - ROBOT
-        assert clearance(x, y, both.field)[0] == pytest.approx(min(here, clearance(x, y, empty.field)[0]), abs=1e-9)
+        assert proximity_value(x, y, ROBOT, both.field) == pytest.approx(value[1], rel=1e-8, abs=1e-8)
+        assert value[1] == pytest.approx(expected, rel=1e-8, abs=1e-8)
+        assert value[2] == pytest.approx(proximity(x, y + 0.05, both.field)[0], rel=1e-8, abs=1e-8)
 
 
 @each_shape
 def test_a_term_is_skipped_only_where_it_is_negligible(shape):
     with_shape, empty = scenario_of(shape, arena=[-40, -40, 40, 40]), scenario_of(arena=[-40, -40, 40, 40])
-    values = np.array(shape.values())
     for x, y in np.random.default_rng(1).uniform(-8, 12, (2000, 2)):
-        term = math.exp(-(type(shape).smooth_distance(x, y, 0.1, values)[0] - ROBOT) / 0.1)
-        found = proximity(x, y, with_shape.field)[0] - proximity(x, y, empty.field)[0]
-        assert found == pytest.approx(term, rel=1e-9, abs=1e-12)
+        distances = [part_distance(part, np.array([x, y])) - ROBOT for part in shape.parts()]
+        if min(distances) > 1e-3:
+            found = proximity(x, y, with_shape.field)[0] - proximity(x, y, empty.field)[0]
+            assert found == pytest.approx(sum(1 / math.expm1(d / 0.1) for d in distances), rel=1e-9, abs=1e-12)
 
 
 @each_shape
@@ -181,7 +138,9 @@ def test_cost_and_clearance_on_a_grid_of_points_are_those_of_single_points(shape
     phi, free = sample_grid(field, ROBOT, PointGrid(2.5, 1.5, 0.25, 12, 12), 2.0)
     for i, j in np.ndindex(12, 12):
         x, y = 2.5 + 0.25 * i, 1.5 + 0.25 * j
-        assert phi[i, j] == pytest.approx(proximity(x, y, field)[0], rel=1e-6, abs=1e-6)
+        distances = [part_distance(part, np.array([x, y])) for part in shape.parts()] + [x, 8 - x, y, 6 - y]
+        expected = sum(1 / math.expm1(max(d - ROBOT, 0.125) / 0.1) for d in distances)
+        assert phi[i, j] == pytest.approx(expected, rel=1e-6, abs=1e-6)
         assert free[i, j] == pytest.approx(min(clearance(x, y, field)[0], 2.0), abs=1e-9)
 
 
@@ -195,21 +154,36 @@ def lidar(scenario, x, y, heading, count=64, reach=5.0):
 
 
 @each_shape
-def test_lidar_ranges_end_at_the_boundary(shape):
-    scenario, values = scenario_of(shape), np.array(shape.values())
+@pytest.mark.parametrize("count", [64, 100])
+def test_lidar_ranges_end_at_the_boundary(shape, count):
+    scenario = scenario_of(shape)
     hits = 0
     for pose in ((2.0, 2.0, 0.4), (5.6, 4.0, -2.0), (4.0, 4.4, 0.0)):
-        for angle, found in zip(*lidar(scenario, *pose), strict=True):
+        for angle, found in zip(*lidar(scenario, *pose, count), strict=True):
             ray = [
                 pose[0] + np.linspace(0, found, 200) * np.cos(angle),
                 pose[1] + np.linspace(0, found, 200) * np.sin(angle),
             ]
-            distances = [type(shape).distance(x, y, values) for x, y in zip(*ray, strict=True)]
+            distances = [distance_to(shape, x, y) for x, y in zip(*ray, strict=True)]
             x, y = ray[0][-1], ray[1][-1]
             assert min(distances) > -1e-9
             assert found == 5.0 or min(abs(distances[-1]), abs(min(x, 8 - x, y, 6 - y))) < 1e-9
             hits += abs(distances[-1]) < 1e-9
     assert hits > 20
+
+
+@each_shape
+def test_a_lidar_inside_an_obstacle_measures_zero(shape):
+    vertices, _ = shape.parts()[0].rounded_polygon()
+    assert (lidar(scenario_of(shape), *vertices.mean(axis=0), 0.3)[1] == 0).all()
+
+
+def test_no_ray_passes_between_two_edges_of_a_polygon():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        x, y = rng.uniform((3.5, 1.0), (4.5, 5.0))
+        diamond = Polygon(vertices=((x - 0.4, y), (x, y - 0.3), (x + 0.4, y), (x, y + 0.3)))
+        assert lidar(scenario_of(diamond), x - 1.5, y, 0.0, 4)[1][0] == pytest.approx(1.1)
 
 
 def drive(scenario, **settings):
@@ -229,7 +203,7 @@ def test_an_episode_ends_at_the_contact(shape):
     lowest, terminated, (x, y, _) = drive(scenario_of(shape))
     assert terminated
     assert lowest == pytest.approx(0, abs=1e-3)
-    assert type(shape).distance(x, y, np.array(shape.values())) == pytest.approx(ROBOT, abs=1e-3)
+    assert distance_to(shape, x, y) == pytest.approx(ROBOT, abs=1e-3)
 
 
 @each_shape
@@ -244,10 +218,11 @@ def test_the_optimum_is_certified_and_free(shape):
     assert optimum.success
     times = np.linspace(0, 8, 400)
     path = optimum.interpolate(times)
-    distances = [outline_distance(shape, x, y) for x, y in path[:, :2]]
+    distances = [distance_to(shape, x, y) for x, y in path[:, :2]]
     assert min(distances) > ROBOT
-    sides = path_sides(path[:, :2], optimum.problem.field)
-    above = path[np.argmin(abs(path[:, 0] - shape.centre()[0])), 1] > shape.centre()[1]
+    field = optimum.problem.field
+    (x, y), sides = obstacle_centres(field)[0], path_sides(path[:, :2], field)
+    above = path[np.argmin(abs(path[:, 0] - x)), 1] > y
     assert sides == ("right" if above else "left",)
 
 
@@ -261,7 +236,8 @@ def test_scenarios_are_read_as_written(shape):
     assert np.array_equal(pickle.loads(pickle.dumps(scenario)).field, scenario.field)
     assert scenario.obstacles[0].shape == shape
     assert (scenario.obstacles[0].circle is None) == (shape.kind != "circle")
-    assert obstacle_centres(scenario.field)[0] == pytest.approx(shape.centre())
+    ((x, y),) = obstacle_centres(scenario.field)
+    assert distance_to(shape, x, y) < 0
 
 
 @each_shape
@@ -269,15 +245,16 @@ def test_frames_and_plots_show_it(shape):
     color = pygame.Color(OBSTACLE)
     with_shape, empty = (draw_scene(Scene(s, s.start)) for s in (scenario_of(shape), scenario_of()))
     found = np.all(with_shape == (color.r, color.g, color.b), axis=2).sum()
-    (x, y), (next_x, next_y) = shape.outline().T, np.roll(shape.outline(), -1, axis=0).T
-    area = abs(np.sum(x * next_y - y * next_x)) / 2
-    assert found == pytest.approx(area * (600 / (8 * 1.04)) ** 2, rel=0.15)  # without the edge
+    inside = np.mean([distance_to(shape, x, y) < 0 for x, y in points(4000)])
+    area = inside * 5.0 * 4.4
+    assert found == pytest.approx(area * (600 / (8 * 1.04)) ** 2, rel=0.25)  # without the edges of the parts
     assert not np.all(empty == (color.r, color.g, color.b), axis=2).any()
     axes = Figure().add_subplot()
     draw_scenario(axes, scenario_of(shape))
-    x_min, y_min, x_max, y_max = shape.bounds()
     boxes = [patch.get_path().get_extents(patch.get_patch_transform()).extents for patch in axes.patches]
-    assert any(box == pytest.approx((x_min, y_min, x_max, y_max), abs=5e-3) for box in boxes)
+    for part in shape.parts():
+        expected = [*part.outline().min(axis=0), *part.outline().max(axis=0)]
+        assert any(box == pytest.approx(expected, abs=5e-3) for box in boxes)
 
 
 @each_shape
@@ -298,21 +275,28 @@ def test_more_obstacles_than_without_a_grid_change_nothing(shape):
         assert (nearest == 10) == (distance == clearance(x, y, parts[0].field)[0] < clearance(x, y, walls.field)[0])
 
 
-def test_the_map_contains_a_capsule_exactly_and_the_outline_of_others():
-    capsule = SHAPES[2]
-    env = NavigateEnv(scenario=scenario_of(capsule, start=[1, 3, 0]), observation="map", map_vertices=4)
+def test_the_map_contains_each_part_in_order_of_distance():
+    key = SHAPES[3]
+    env = NavigateEnv(scenario=scenario_of(key, start=[1, 3, 0]), observation="map", map_vertices=4)
     observation, _ = env.reset(seed=0)
     # The robot is at (1, 3) with the heading 0, so that its frame is parallel to the arena's.
-    found = observation[-80:-70]  # the first of 8 rows of 10
-    expected = [1, 0.3, *(v - o for end in (capsule.start, capsule.end) * 2 for v, o in zip(end, (1, 3), strict=True))]
-    assert found == pytest.approx(expected, abs=1e-6)
-    with pytest.raises(ValueError, match="map_vertices: expected at least 96"):
-        NavigateEnv(scenario=scenario_of(SHAPES[3]), observation="map").reset()
+    bit, shank, bow = key.parts()
+    rows = observation[-80:].reshape(8, 10)  # 1, the radius and the vertices
+    for row, part in zip(rows, (bow, shank, bit), strict=False):
+        vertices, radius = part.rounded_polygon()
+        found = row[2:].reshape(4, 2)
+        assert row[:2] == pytest.approx([1, radius], abs=1e-6)
+        assert np.unique(found.round(5), axis=0) == pytest.approx(np.unique(vertices - (1, 3), axis=0), abs=1e-5)
+    assert (rows[3:] == 0).all()
+    turn = np.linspace(0, 2 * np.pi, 10)[:-1]
+    nonagon = Polygon(vertices=tuple(zip(4 + np.cos(turn), 3 + np.sin(turn), strict=True)))
+    with pytest.raises(ValueError, match="map_vertices: expected at least 9"):
+        NavigateEnv(scenario=scenario_of(nonagon), observation="map").reset()
 
 
 def test_a_short_capsule_is_a_circle():
     circle = Circle(center=(4.0, 3.0), radius=0.5)
-    for length in (0.0, 1e-11):
+    for length in (0.0, 1e-14, 1e-11):
         capsule = Capsule(start=(4.0, 3.0), end=(4.0 + length, 3.0), radius=0.5)
         a, b = scenario_of(capsule), scenario_of(circle)
         for x, y in points(300):
@@ -320,6 +304,44 @@ def test_a_short_capsule_is_a_circle():
             assert proximity(x, y, a.field) == pytest.approx(proximity(x, y, b.field), rel=1e-7, abs=1e-7)
         assert lidar(a, 2.0, 2.0, 0.4)[1] == pytest.approx(lidar(b, 2.0, 2.0, 0.4)[1], abs=1e-9)
     assert find_optimum(a).cost == pytest.approx(find_optimum(b).cost, rel=1e-7)
+
+
+def test_the_length_of_a_capsule_may_underflow():
+    """The squares of the differences of its coordinates are zero."""
+    fields = {"arena": [-4, -3, 4, 3], "start": [-3, 0, 0], "goal": [3, 0, 0]}
+    tiny = scenario_of(Capsule(start=(0.0, 0.0), end=(1e-200, 0.0), radius=0.5), **fields)
+    circle = scenario_of(Circle(center=(0.0, 0.0), radius=0.5), **fields)
+    for x, y in points(100) - (4, 3):
+        assert clearance(x, y, tiny.field)[0] == pytest.approx(clearance(x, y, circle.field)[0], abs=1e-12)
+
+
+def test_points_on_the_line_of_a_capsule_are_not_inside():
+    """There, its two edges have the same distance, and rounding may give both the wrong sign."""
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        (a, b), beyond = rng.uniform((3, 2), (5, 4), (2, 2)), rng.uniform(0, 2)
+        capsule = Capsule(start=tuple(a), end=tuple(b), radius=0.1)
+        x, y = b + beyond * (b - a) / np.linalg.norm(b - a)
+        assert clearance(x, y, scenario_of(capsule).field)[0] == pytest.approx(
+            min(beyond - 0.1, x, 8 - x, y, 6 - y) - ROBOT, abs=1e-9
+        )
+        x, y = a + rng.uniform() * (b - a)
+        assert clearance(x, y, scenario_of(capsule).field)[0] == pytest.approx(-0.1 - ROBOT, abs=1e-9)
+
+
+def test_normals_on_edges_and_vertices_are_unit_vectors_outwards():
+    polygon = SHAPES[1]
+    field, vertices = scenario_of(polygon).field, np.array(polygon.vertices)
+    centre = vertices.mean(axis=0)
+    for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
+        for point in ((a + b) / 2, a + (a - centre) * 1e-2):
+            distance, nx, ny, curvature = polygon_geometry(*point, field, FIRST)
+            assert math.hypot(nx, ny) == pytest.approx(1)
+            assert (point - centre) @ (nx, ny) > 0
+            assert curvature == pytest.approx(0 if distance < 1e-9 else 1 / distance, rel=1e-6)
+        distance, nx, ny, curvature = polygon_geometry(*a, field, FIRST)
+        assert distance == pytest.approx(0, abs=1e-12)
+        assert np.isfinite([nx, ny, curvature]).all()
 
 
 def test_a_capsule_is_its_mirror_image():
@@ -353,10 +375,48 @@ def test_a_shape_is_checked_when_it_is_registered():
         register(type("Other", (Circle,), {}))
     with pytest.raises(TypeError, match="kind: expected a name for Nameless, got None"):
         register(type("Nameless", (Shape,), {"__annotations__": {}}))
-    with pytest.raises(TypeError, match="distance: expected a kernel of DISTANCE_SIGNATURE for 'plain'"):
+    with pytest.raises(TypeError, match="parts: expected a method of Plain that returns the parts of 'plain'"):
         register(type("Plain", (Shape,), {"kind": "plain", "__annotations__": {"kind": ClassVar}}))
-    assert set(KINDS) == {"circle", "polygon", "capsule", "lame_curve"}
-    assert kind_number("capsule") == 3063  # stored in banks
+    assert set(KINDS) == {"circle", "polygon", "capsule", "key"}
+
+
+class Heap(Shape):
+    """Discs around points."""
+
+    kind: ClassVar = "heap"
+
+    centers: tuple[Point, ...]
+
+    def parts(self):
+        return tuple(Circle(center=center, radius=0.3) for center in self.centers)
+
+
+class Nested(Shape):
+    """Not a union of discs, capsules and polygons, but of a shape that is one."""
+
+    kind: ClassVar = "nested"
+
+    def parts(self):
+        return (Heap(centers=((1.0, 1.0),)),)
+
+
+def test_the_parts_of_a_shape_are_checked():
+    register(Heap)
+    register(Nested)
+    for obstacle in ({"heap": {"centers": []}}, {"nested": {}}):
+        with pytest.raises(ScenarioError, match=r"obstacles\[0\].*parts\(\): expected a tuple of Circle, Capsule and"):
+            Scenario.from_dict(scenario_fields(obstacles=[obstacle]))
+    thin = scenario_fields(obstacles=[{"key": {"center": [5, 5], "radius": 1e-300}}])
+    with pytest.raises(ScenarioError, match=r"obstacles\[0\].*strictly convex"):
+        Scenario.from_dict(thin)
+
+
+def test_paths_between_the_parts_of_a_shape_pass_it_on_the_side_of_its_first_part():
+    register(Heap)
+    field = scenario_of(Heap(centers=((4.0, 4.0), (4.0, 1.0)))).field
+    ends = np.linspace(1, 7, 50)
+    assert path_sides(np.column_stack([ends, np.full(50, 3.0)]), field) == ("left",)
+    assert path_sides(np.column_stack([ends, np.full(50, 5.0)]), field) == ("right",)
 
 
 def test_unknown_shapes_are_refused():
@@ -366,83 +426,3 @@ def test_unknown_shapes_are_refused():
     fields = scenario_fields(obstacles=[{"capsule": {"start": [1, 1], "end": [2, 2], "radius": -1}}])
     with pytest.raises(ScenarioError, match=r"obstacles\[0\]\.capsule\.radius: expected a number > 0, got -1"):
         Scenario.from_dict(fields)
-    field = scenario_of(SHAPES[3]).field.copy()
-    check_field(field)
-    field[field == -kind_number("lame_curve")] = -kind_number("unknown")
-    with pytest.raises(ValueError, match=r"not registered in this process.*Import the file"):
-        check_field(field)
-    assert math.isnan(proximity(4.0, 3.0, field)[0])  # not a wrong value
-
-
-PROCESS = """
-import sys
-import numpy as np
-from leapnav.envs.shapes.proximity import proximity
-from leapnav.envs.shapes.records import record_distance
-{imports}
-field = np.load(sys.argv[1])
-found = proximity(float(sys.argv[2]), float(sys.argv[3]), field)
-print(*map(repr, found), sum(record_distance.stats.cache_hits.values()), sep="\\n")
-"""
-
-
-@pytest.mark.parametrize("shape", SHAPES[2:], ids=lambda shape: shape.kind)
-def test_cached_kernels_call_the_shape_in_another_process(shape, tmp_path):
-    field = scenario_of(shape).field
-    np.save(tmp_path / "field.npy", field)
-    imports = "" if shape.kind == "capsule" else "import test_shapes; test_shapes.register(test_shapes.LameCurve)"
-    code = PROCESS.format(imports=imports)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    expected = proximity(4.1, 3.9, field)  # compiles what is missing
-    command = [sys.executable, "-c", code, tmp_path / "field.npy", "4.1", "3.9"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    *found, hits = map(eval, done.stdout.split())
-    assert found == pytest.approx(expected, rel=1e-12)
-    assert hits == 0  # called by others, whose code contains it
-
-
-SCRIPT = """
-import math
-import sys
-from typing import ClassVar
-import numpy as np
-from leapnav.envs import Circle, Obstacle, Scenario
-from leapnav.envs.kernels import kernel
-from leapnav.envs.shapes import register
-from leapnav.envs.shapes.base import DISTANCE_SIGNATURE, SMOOTH_DISTANCE_SIGNATURE
-from leapnav.envs.shapes.clearance import clearance
-from beside import SCALE
-
-@kernel(DISTANCE_SIGNATURE)
-def distance(x, y, values):
-    return SCALE * (math.hypot(x - values[0], y - values[1]) - values[2])
-
-@register
-class Disc(Circle):
-    kind: ClassVar = "disc"
-    distance: ClassVar = distance
-
-obstacle = Obstacle(disc=Disc(center=(4.0, 3.0), radius=0.5))
-scenario = Scenario(arena=(0.0, 0.0, 8.0, 6.0), start=(1.0, 3.0, 0.0), goal=(7.0, 3.0, 0.0), horizon=8.0,
-                    obstacles=(obstacle,))
-print(clearance(4.0, 4.0, scenario.field)[0], sum(distance.stats.cache_hits.values()))
-"""
-
-
-def test_kernels_of_a_script_are_cached_until_it_or_a_module_beside_it_changes(tmp_path):
-    (tmp_path / "script.py").write_text(f"# {tmp_path}{SCRIPT}")  # not in the cache from an earlier test
-
-    def result(*command, scale, **options):
-        (tmp_path / "beside.py").write_text(f"SCALE = {scale}\n")
-        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [sys.executable, *command]
-        done = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, **options
-        )
-        return done.stdout.split()
-
-    name = str(tmp_path / "script.py")
-    assert result(name, scale=1.0) == ["0.25", "0"]
-    assert result(name, scale=1.0) == ["0.25", "1"]
-    assert result(name, scale=2.0) == ["0.75", "0"]
-    assert result("-", scale=1.0, input=SCRIPT) == ["0.25", "0"]  # without a source file

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import float64, int64, types
 from numba.core import cgutils
 from numba.core.boxing import unbox_tuple
@@ -27,7 +26,6 @@ from numba.np.numpy_support import carray
 
 __all__ = [
     "FunctionPointer",
-    "FunctionTable",
     "Kernel",
     "carray",
     "matrix_of",
@@ -191,86 +189,6 @@ class FunctionPointer:
     def __call__(self, *arguments: Any) -> Any:
         """Calls the function from Python."""
         return self._dispatcher(*arguments)
-
-
-class FunctionTable:
-    """Functions that kernels call by a number: a table of addresses, which belongs to the process.
-
-    The machine code of a kernel refers to the table by name. A kernel from the cache can therefore call a function that
-    was declared later, in a module that the kernel does not import. An entry is filled at its first call.
-
-    Args:
-        name: a name that is unique in leapnav.
-        size: number of entries.
-        find: returns the kernel of an entry, or None; called once for each entry, while a kernel runs.
-
-    """
-
-    def __init__(self, name: str, size: int, find: Callable[[int], Kernel | None]) -> None:
-        self.name, self.size = f"leapnav_{name}", size
-        self._find = find
-        self._addresses = (ctypes.c_void_p * size)()
-        self._filled: dict[int, Kernel] = {}  # keeps the code alive
-        self._fill = ctypes.CFUNCTYPE(None, ctypes.c_int64)(self.fill)
-        binding.add_symbol(self.name, ctypes.addressof(self._addresses))
-        address = ctypes.cast(self._fill, ctypes.c_void_p).value
-        assert address is not None
-        binding.add_symbol(f"{self.name}_fill", address)
-
-    def fill(self, index: int) -> None:
-        """Enter the address of a function; a missing function remains missing."""
-        found = self._find(index)
-        if found is not None:
-            result = found.get_compile_result(found.declared_signature)
-            self._addresses[index] = types.CompileResultWAP(result).__wrapper_address__()
-            self._filled[index] = found
-
-    def clear(self, index: int) -> None:
-        """Remove a function; its code stays in memory, since a kernel may be running it."""
-        self._addresses[index] = None
-
-    def caller(self, signature: Any) -> Any:
-        """Return a function for kernels: (number, arguments) -> result, NaN if the entry is missing.
-
-        Args:
-            signature: the signature of the functions; the result is a float or a tuple of floats.
-
-        """
-        name, size = self.name, self.size
-
-        def typed(context: Any, index: Any, *arguments: Any) -> Any:
-            def generate(context: Any, builder: Any, called: Any, values: Any) -> Any:
-                return _generate_call(context, builder, (name, size), signature, values)
-
-            return signature.return_type(int64, *signature.args), generate
-
-        # Numba reads the number of arguments from the function.
-        names = ", ".join(f"a{i}" for i in range(len(signature.args)))
-        scope: dict[str, Any] = {"typed": typed}
-        exec(f"def call(context, index, {names}):\n    return typed(context, index, {names})", scope)
-        return intrinsic(scope["call"])
-
-
-def _generate_call(context: Any, builder: Any, table: tuple[str, int], signature: Any, values: Any) -> Any:
-    """Generate the call of an entry of a `FunctionTable`; `values` are the number and the arguments."""
-    name, size = table
-    address = ir.IntType(8).as_pointer()
-    addresses = builder.module.globals.get(name)
-    if addresses is None:
-        addresses = ir.GlobalVariable(builder.module, ir.ArrayType(address, size), name)
-    entry = builder.gep(addresses, [ir.Constant(ir.IntType(64), 0), values[0]])
-    with builder.if_then(cgutils.is_null(builder, builder.load(entry)), likely=False):
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)])
-        builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}_fill"), [values[0]])
-    found = builder.load(entry)
-    returned = context.get_value_type(signature.return_type)
-    nan = ir.Constant(ir.DoubleType(), float("nan"))
-    missing = nan if returned == nan.type else ir.Constant(returned, [nan] * returned.count)
-    result = cgutils.alloca_once_value(builder, missing)
-    with builder.if_then(cgutils.is_not_null(builder, found), likely=True):
-        kind = ir.FunctionType(returned, [context.get_value_type(argument) for argument in signature.args])
-        builder.store(builder.call(builder.bitcast(found, kind.as_pointer()), values[1:]), result)
-    return builder.load(result)
 
 
 def _view(context: Any, builder: Any, array: Any, data: Any, shape: list[Any]) -> Any:

@@ -9,25 +9,23 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.field import CIRCLES, GRID, RECORDS, SHAPES
-from leapnav.envs.shapes.half_plane import wall_distance
-from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance
-from leapnav.envs.shapes.records import first_polygon, nearest_record
+from leapnav.envs.shapes.distance import polygon_geometry, wall_distance
+from leapnav.envs.shapes.field import CENTRE, CIRCLES, COLUMNS, GRID, POLYGON_HEAD, POLYGONS, RIM, SHAPES
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
 def obstacle_distance(x, y, field):
     """Signed distance (m) from a point to the nearest obstacle or wall, and the index of that obstacle.
 
-    Negative inside. The wall has the index after the last obstacle.
+    Negative inside. The wall has the index -1.
     """
-    circles, records = int(field[CIRCLES]), int(field[RECORDS])
-    indices = int(field[GRID]) - circles - records
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    indices = int(field[GRID]) - circles - polygons
     best = min(
         min(wall_distance(x, y, field, 0), wall_distance(x, y, field, 2)),
         min(wall_distance(x, y, field, 1), wall_distance(x, y, field, 3)),
     )
-    nearest = circles + records
+    nearest = -1
     at = SHAPES
     for i in range(circles):
         dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2]
@@ -36,20 +34,13 @@ def obstacle_distance(x, y, field):
             distance = math.sqrt(dx * dx + dy * dy) - rim
             if distance < best:
                 best, nearest = distance, int(field[indices + i])
-    others = 0
-    if field[RECORDS] > 0.0 and field[at] < 0.0:
-        at, others = first_polygon(field)
-        best, found = nearest_record(x, y, field, others, best)
-        if found >= 0:
-            nearest = int(field[indices + circles + found])
-    for i in range(others, records):
-        edges = int(field[at])
-        rows = at + 1
-        at = rows + 5 * edges
-        if half_plane_distance(x, y, field, rows, edges) < best:
-            distance = polygon_distance(x, y, field, rows, edges)
+    for i in range(polygons):
+        dx, dy, rim = x - field[at + CENTRE], y - field[at + CENTRE + 1], field[at + RIM]
+        if dx * dx + dy * dy < max(best + rim, 0.0) ** 2:
+            distance = polygon_geometry(x, y, field, at)[0]
             if distance < best:
                 best, nearest = distance, int(field[indices + circles + i])
+        at += POLYGON_HEAD + COLUMNS * int(field[at])
     return best, nearest
 
 

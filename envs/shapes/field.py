@@ -3,25 +3,21 @@
 The entries of the array are, by index:
 
     [0] proximity weight k   [1] proximity scale sigma   [2] largest radius of a disc of the robot's footprint
-    [3] circles   [4] records after the circles
+    [3] circles   [4] polygons
     [5:9] arena (x_min, y_min, x_max, y_max)   [9] index at which the grid begins
+    [10] distance (scales) below which the barrier is a quadratic polynomial
     then per circle:   x, y, r
-    then per obstacle of another shape: minus the number of its kind, length of the rest, centre x, y, radius of a
-                       circle around the centre that contains it, radius of a circle beyond which its proximity cost is
-                       negligible, radius and number v of vertices of its rounded polygon, v vertices x, y, then the
-                       numbers of its kernels
-    then per polygon:  number of edges m, then m rows (n_x, n_y, c, x, y): outward normal, offset, first vertex
-    then the obstacles' indices in the scenario, since they are packed in this order
+    then per rounded convex polygon: number of edges m, radius by which the polygon is enlarged, x, y, r of a circle
+                       that contains it, then m rows (n_x, n_y, c, x, y, l): outward normal, offset, first vertex and
+                       length. A capsule has two edges.
+    then the index in the scenario of the obstacle to which each circle and polygon belongs
     then the grid:     x, y, cell size, columns, lines, then the offset of each cell in the grid, then the
-                       cells: number of circles n, of polygons p, maximum number of edges m; then x, y, r of the n
-                       circles, column by column, and (n_x, n_y, c) of the p polygons for each of the m edges, also
-                       column by column
+                       cells: number of circles n, of polygons p; then x, y, r of the n circles, column by column, and
+                       the indices of the p polygons in the field
 
 A cell lists the obstacles that contribute to the proximity cost somewhere in it, so that the work at a point does not
-depend on the number of distant obstacles. n and p are multiples of LANES; the remaining entries are obstacles without
-any contribution. Polygons with fewer than m edges are padded with edges without any contribution. With at most
-MAX_OBSTACLES_WITHOUT_GRID circles and polygons there is no grid, and columns and lines are 0, or a grid of one cell if
-there are other shapes. These are not in the grid: a comparison with the circle of their proximity cost skips them.
+depend on the number of distant obstacles. n is a multiple of LANES; the remaining entries are circles without any
+contribution. With at most MAX_OBSTACLES_WITHOUT_GRID obstacles there is no grid, and columns and lines are 0.
 """
 
 from __future__ import annotations
@@ -32,30 +28,22 @@ from typing import NamedTuple, cast
 from weakref import WeakValueDictionary
 
 import numpy as np
-from numba import float64
 
-from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT
-from leapnav.envs.shapes.base import Shape, call_smooth_distance, compile_shape, kind_number, shape_class
+from leapnav.envs.shapes.barrier import CONTACT
+from leapnav.envs.shapes.base import Shape
 from leapnav.envs.shapes.polygon import edge_rows
 
 # Terms of obstacles farther away than 30 sigma are skipped: they are below 1e-13 k, 1/10 of the integrator's tolerance.
 CUTOFF = 30.0
-CIRCLES, RECORDS, ARENA, GRID, SHAPES = 3, 4, 5, 9, 10  # indices into the packed field
-# Indices into the record of a shape other than circle and polygon.
-KIND, LENGTH, CENTRE, RIM, REACH, ROUNDING, N_VERTICES, VERTICES = 0, 1, 2, 4, 5, 6, 7, 8
+CIRCLES, POLYGONS, ARENA, GRID, LEAST_DISTANCE, SHAPES = 3, 4, 5, 9, 10, 11  # indices into the packed field
+# Indices into a polygon, number of entries before its edges, and of an edge.
+ROUNDING, CENTRE, RIM, POLYGON_HEAD, COLUMNS = 1, 2, 4, 5, 6
 MAX_OBSTACLES_WITHOUT_GRID = 16  # fewer obstacles are evaluated faster one by one
 # Smallest and largest number of cells per axis. Between them, a cell is as large as this multiple of the reach of an
 # obstacle.
 MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
 LANES = 8  # doubles in a vector register of 512 bits
 FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
-OUTLINE_MARGIN = 1.02  # factor of the circle through the outline, between whose points a shape may be larger
-N_DIRECTIONS, REACH_STEP, REACH_MARGIN = (
-    64,
-    1.2,
-    1.1,
-)  # for the circle of the proximity cost; both factors of its radius
 
 
 class FieldParts(NamedTuple):
@@ -63,14 +51,14 @@ class FieldParts(NamedTuple):
 
     Attributes:
         circles (count, 3): x, y and radius (m).
-        records: the record of each obstacle of another shape.
-        polygons: the rows (m, 5) of each polygon.
+        polygons: vertices (m, 2) and radius (m) of each rounded polygon.
+        indices (count,): index in the scenario of the obstacle to which each circle and then each polygon belongs.
 
     """
 
     circles: np.ndarray
-    records: list[np.ndarray]
-    polygons: list[np.ndarray]
+    polygons: list[tuple[np.ndarray, float]]
+    indices: np.ndarray
 
 
 def pack_field(
@@ -92,54 +80,37 @@ def pack_field(
         grid: whether to compute the grid, which takes most of the time; clearances do not need it.
 
     """
-    header = [weight, scale, radius, 0.0, 0.0, *arena]
-    parts = FieldParts(np.empty((0, 3)), [], [])
-    circles: list[tuple[float, ...]] = []
-    indices: tuple[list[float], list[float], list[float]] = [], [], []
+    circles: list[tuple[float, float, float]] = []
+    polygons: list[tuple[np.ndarray, float]] = []
+    owners: tuple[list[int], list[int]] = [], []
     for index, shape in enumerate(shapes):
-        if shape.kind == "circle":
-            circles.append(shape.values())
-            indices[0].append(float(index))
-        elif shape.kind == "polygon":
-            parts.polygons.append(np.reshape(shape.values(), (-1, 5)))
-            indices[2].append(float(index))
-        else:
-            parts.records.append(_pack_record(shape, header))
-            indices[1].append(float(index))
-    parts = parts._replace(circles=np.reshape(circles, (-1, 3)))
-    packed = _assemble(header, parts, [*indices[0], *indices[1], *indices[2]])
-    return with_grid(packed) if grid else packed
+        for part in shape.parts():
+            vertices, rounding = part.rounded_polygon()
+            if (vertices[1:] == vertices[:1]).all():  # a disc, or a capsule of length zero
+                circles.append((*vertices[0].tolist(), rounding))
+                owners[0].append(index)
+            else:
+                polygons.append((vertices, rounding))
+                owners[1].append(index)
+    parts = FieldParts(np.reshape(circles, (-1, 3)), polygons, np.array([*owners[0], *owners[1]], dtype=float))
+    packed = _assemble((weight, scale, radius), arena, parts)
+    return _with_grid(packed) if grid else packed
 
 
-def _pack_record(shape: Shape, header: Sequence[float]) -> np.ndarray:
-    """Return the record of a shape other than circle and polygon."""
-    compile_shape(type(shape))
-    vertices, rounding = shape.rounded_polygon()
-    centre = np.array(shape.centre())
-    rim = OUTLINE_MARGIN * float(np.hypot(*(vertices - centre).T).max()) + rounding
-    number = float(kind_number(shape.kind))
-    rest = [*centre.tolist(), rim, 0.0, rounding, float(len(vertices)), *np.ravel(vertices).tolist(), *shape.values()]
-    record = np.array([-number, len(rest), *rest])
-    if not np.isfinite(record).all():
-        raise ValueError(f"{shape.kind}: values() and rounded_polygon(): expected finite numbers, got {rest}")
-    record[REACH] = _proximity_reach(record, header[2] + CUTOFF * header[1], header[1])
-    return record
+def _assemble(header: Sequence[float], arena: Sequence[float], parts: FieldParts) -> np.ndarray:
+    """Return the packed field without its grid."""
+    polygons = [_pack_polygon(vertices, rounding) for vertices, rounding in parts.polygons]
+    obstacles = np.concatenate([np.ravel(parts.circles), *polygons, parts.indices])
+    counts = float(len(parts.circles)), float(len(polygons))
+    return np.concatenate([[*header, *counts, *arena, float(SHAPES + len(obstacles)), CONTACT], obstacles])
 
 
-@kernel(float64(CONSTANT, float64, float64))
-def _proximity_reach(record, distance, scale):
-    """Radius (m) of a circle around the centre of a record outside of which its smooth distance exceeds `distance`."""
-    values = record[VERTICES + 2 * int(record[N_VERTICES]) :]
-    reach = record[RIM] + distance
-    k = 0
-    while k < N_DIRECTIONS and reach < FAR_AWAY:
-        angle = 2 * math.pi * k / N_DIRECTIONS
-        x, y = record[CENTRE] + reach * math.cos(angle), record[CENTRE + 1] + reach * math.sin(angle)
-        k += 1
-        if not call_smooth_distance(2 * int(-record[KIND]) + 1, x, y, scale, values)[0] >= distance:
-            reach *= REACH_STEP
-            k = 0
-    return REACH_MARGIN * reach
+def _pack_polygon(vertices: np.ndarray, rounding: float) -> np.ndarray:
+    """Return the entries of a rounded polygon."""
+    rows = edge_rows(vertices)
+    x, y = centre = vertices.mean(axis=0)
+    rim = float(np.hypot(*(vertices - centre).T).max()) + rounding
+    return np.concatenate([[len(rows), rounding, x, y, rim], rows.ravel()])
 
 
 def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.ndarray:
@@ -154,48 +125,37 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
 
     """
     a, b = unpack_field(first), unpack_field(second)
-    if (
-        len(a.circles) != len(b.circles)
-        or [len(polygon) for polygon in a.polygons] != [len(polygon) for polygon in b.polygons]
-        or [(len(r), r[KIND], r[N_VERTICES]) for r in a.records]
-        != [(len(r), r[KIND], r[N_VERTICES]) for r in b.records]
-    ):
+    if len(a.circles) != len(b.circles) or [len(one) for one, _ in a.polygons] != [len(one) for one, _ in b.polygons]:
         raise ValueError("obstacles: two fields can be blended only if they contain the same kinds of obstacles")
-    header = ((1.0 - fraction) * first[:GRID] + fraction * second[:GRID]).tolist()
-    blended = FieldParts((1.0 - fraction) * a.circles + fraction * b.circles, [], [])
-    for record, other in zip(a.records, b.records, strict=True):
-        between = (1.0 - fraction) * record + fraction * other
-        between[KIND] = record[KIND]
-        between[REACH] = _proximity_reach(between, header[2] + CUTOFF * header[1], header[1])
-        blended.records.append(between)
-    for polygon, other in zip(a.polygons, b.polygons, strict=True):
-        blended.polygons.append(edge_rows((1.0 - fraction) * polygon[:, 3:] + fraction * other[:, 3:]))
-    return with_grid(_assemble(header, blended, first[int(first[GRID]) - _count(a) : int(first[GRID])].tolist()))
+    header = (1.0 - fraction) * first[:GRID] + fraction * second[:GRID]
+    polygons = [
+        ((1.0 - fraction) * one + fraction * other, (1.0 - fraction) * radius + fraction * rounding)
+        for (one, radius), (other, rounding) in zip(a.polygons, b.polygons, strict=True)
+    ]
+    circles = (1.0 - fraction) * a.circles + fraction * b.circles
+    blended = FieldParts(circles, polygons, a.indices)
+    return _with_grid(_assemble(header[:CIRCLES].tolist(), header[ARENA:].tolist(), blended))
 
 
-def _count(parts: FieldParts) -> int:
-    return sum(map(len, parts))
+def with_weight(packed: np.ndarray, weight: float, least_distance: float = CONTACT) -> np.ndarray:
+    """Return a packed field with a given proximity weight.
 
+    Args:
+        packed: the field.
+        weight: proximity weight.
+        least_distance: distance (proximity scales) below which the barrier is a quadratic polynomial.
 
-def _assemble(header: Sequence[float], parts: FieldParts, indices: Sequence[float]) -> np.ndarray:
-    """Return the packed field without its grid; its counts and the index of the grid are not in `header`."""
-    polygons = [value for rows in parts.polygons for value in (float(len(rows)), *rows.ravel().tolist())]
-    obstacles = [*parts.circles.ravel().tolist(), *(x for record in parts.records for x in record.tolist()), *polygons]
-    counts = float(len(parts.circles)), float(len(parts.records) + len(parts.polygons))
-    grid_index = float(SHAPES + len(obstacles) + len(indices))
-    return np.array([*header[:CIRCLES], *counts, *header[ARENA:], grid_index, *obstacles, *indices], dtype=np.float64)
-
-
-def without_grid(packed: np.ndarray) -> np.ndarray:
-    """Return a packed field without its grid, most of its size, if that has several cells; see `with_grid`."""
-    at = int(packed[GRID])
-    return packed[:at] if packed[at + 3] * packed[at + 4] > 1 else packed
-
-
-def with_grid(packed: np.ndarray) -> np.ndarray:
-    """Return a packed field with its grid, computed if it is missing."""
-    if len(packed) > packed[GRID]:
+    """
+    if packed[0] == weight and packed[LEAST_DISTANCE] == least_distance:
         return packed
+    field = packed.copy()
+    field[0], field[LEAST_DISTANCE] = weight, least_distance
+    field.flags.writeable = False
+    return field
+
+
+def _with_grid(packed: np.ndarray) -> np.ndarray:
+    """Return a packed field with its grid."""
     field = np.concatenate([packed, _pack_grid(packed)])
     field.flags.writeable = False
     return field
@@ -204,22 +164,13 @@ def with_grid(packed: np.ndarray) -> np.ndarray:
 def unpack_field(packed: np.ndarray) -> FieldParts:
     """Return the obstacles of a packed field."""
     at = SHAPES + 3 * int(packed[CIRCLES])
-    parts = FieldParts(packed[SHAPES:at].reshape(-1, 3), [], [])
-    for _ in range(int(packed[RECORDS])):
-        if packed[at] < 0:
-            parts.records.append(packed[at : at + 2 + int(packed[at + LENGTH])])
-            at += len(parts.records[-1])
-        else:
-            edges = int(packed[at])
-            parts.polygons.append(packed[at + 1 : at + 1 + 5 * edges].reshape(edges, 5))
-            at += 1 + 5 * edges
-    return parts
-
-
-def record_outline(record: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the vertices (v, 2) and the radius (m) of the rounded polygon of a record, see `Shape`."""
-    end = VERTICES + 2 * int(record[N_VERTICES])
-    return record[VERTICES:end].reshape(-1, 2), float(record[ROUNDING])
+    circles, polygons = packed[SHAPES:at].reshape(-1, 3), []
+    for _ in range(int(packed[POLYGONS])):
+        end = at + POLYGON_HEAD + COLUMNS * int(packed[at])
+        rows = packed[at + POLYGON_HEAD : end].reshape(-1, COLUMNS)
+        polygons.append((rows[:, 3:5], float(packed[at + ROUNDING])))
+        at = end
+    return FieldParts(circles, polygons, packed[at : at + len(circles) + len(polygons)])
 
 
 # Fields that `check_field` has accepted, by their identity; the check takes as long as a short search.
@@ -229,109 +180,82 @@ _checked: WeakValueDictionary[int, np.ndarray] = WeakValueDictionary()
 def check_field(packed: np.ndarray) -> np.ndarray:
     """Check that kernels can read a packed field, and return it, read-only and with its grid.
 
+    The field is unpacked and packed again, which must not change it.
+
     Raises:
-        ValueError: it is not a packed field, or one of its shapes is not known in this process.
+        ValueError: it is not a packed field.
 
     """
     if _checked.get(id(packed)) is packed:
         return packed
     if not isinstance(cast(object, packed), np.ndarray) or packed.dtype != np.float64 or packed.ndim != 1:
         raise ValueError(f"field: expected a vector of float64 (Scenario.field), got {packed!r}")
-    if packed.flags.writeable or not packed.flags.c_contiguous:
-        packed = packed.copy()
-        packed.flags.writeable = False
     try:
-        end = _check_obstacles(packed)
-        packed = with_grid(packed)
-        _check_grid(packed[end:])
-    except (IndexError, OverflowError) as error:
+        with np.errstate(all="ignore"):
+            _check_counts(packed)
+            field = _with_grid(_assemble(packed[:CIRCLES].tolist(), packed[ARENA:GRID].tolist(), unpack_field(packed)))
+    except (IndexError, OverflowError, ValueError) as error:
         raise ValueError(f"field: not a packed field (Scenario.field): {error}") from None
-    _checked[id(packed)] = packed
-    return packed
+    # Another processor may round the edges of polygons differently.
+    is_whole = len(packed) in (int(packed[GRID]), len(field))  # without a grid, or with all of it
+    if not is_whole or not np.allclose(field[: len(packed)], packed, rtol=1e-9, atol=1e-9):
+        raise ValueError("field: not a packed field (Scenario.field): its entries contradict each other")
+    _checked[id(field)] = field
+    return field
 
 
-def _check_obstacles(packed: np.ndarray) -> int:
-    """Check all of a field but its grid; return the index at which the grid begins."""
+def _check_counts(packed: np.ndarray) -> None:
+    """Raise IndexError unless the counts of a field agree with its length, and its first entries are valid."""
     weight, scale, radius = packed[:CIRCLES].tolist()
-    end = _count_at(packed, GRID)
-    if not (np.isfinite(packed).all() and weight >= 0 and scale > 0 and radius > 0 and end <= len(packed)):
-        raise IndexError("its first entries or its length are invalid")
-    at = SHAPES + 3 * _count_at(packed, CIRCLES)
-    count, is_polygon = _count_at(packed, CIRCLES), False
-    for _ in range(_count_at(packed, RECORDS)):
-        if packed[at] < 0 and not is_polygon:
-            length, kind = 2 + _count_at(packed, at + LENGTH), shape_class(-int(packed[at + KIND]))
-            if length < VERTICES or length < VERTICES + 2 * _count_at(packed, at + N_VERTICES):
-                raise IndexError(f"the record of a {kind.kind} is too short")
-            compile_shape(kind)
-            at += length
-        else:
-            is_polygon = True
-            if _count_at(packed, at) < 3:
-                raise IndexError("a polygon has fewer than 3 edges")
-            at += 1 + 5 * int(packed[at])
-        count += 1
-        if at > end:
-            break
-    if at + count != end or sorted(packed[at:end].tolist()) != list(range(count)):
-        raise IndexError("the obstacles do not end where the grid begins")
-    return end
+    if not (np.isfinite(packed).all() and weight >= 0 and scale > 0 and radius > 0):
+        raise IndexError("its first entries are invalid")
+    count, polygons, end = (_count_at(packed, index) for index in (CIRCLES, POLYGONS, GRID))
+    at = SHAPES + 3 * count
+    for _ in range(polygons):
+        if _count_at(packed, at) < 2:
+            raise IndexError("a polygon has fewer than 2 edges")
+        at += POLYGON_HEAD + COLUMNS * int(packed[at])
+    if at + count + polygons != end or end > len(packed):
+        raise IndexError("its length is invalid")
+    if not (packed[at:end] % 1 == 0).all() or (packed[at:end] < 0).any() or (packed[at:end] > end).any():
+        raise IndexError("an index of an obstacle is invalid")
 
 
 def _count_at(packed: np.ndarray, index: int) -> int:
-    """Return an entry that is a number of entries."""
+    """Return a count of a packed field.
+
+    Raises:
+        IndexError: it is not one.
+
+    """
     value = float(packed[index])
     if not (value.is_integer() and 0 <= value <= len(packed)):
         raise IndexError(f"entry {index}: expected a count, got {value!r}")
     return int(value)
 
 
-def _check_grid(grid: np.ndarray) -> None:
-    """Check that the offsets and the counts of the cells of a grid lie within it."""
-    columns, lines = _count_at(grid, 3), _count_at(grid, 4)
-    if columns * lines == 0:
-        return
-    offsets = grid[5 : 5 + columns * lines]
-    if len(offsets) < columns * lines or not grid[2] > 0:
-        raise IndexError("the grid is incomplete")
-    if not ((offsets >= 5 + columns * lines) & (offsets <= len(grid) - 3) & (offsets % 1 == 0)).all():
-        raise IndexError("a cell begins outside of the grid")
-    n, p, m = (grid[offsets.astype(int) + k] for k in range(3))
-    counts = np.array([n, p, m])
-    if (counts < 0).any() or (counts % 1 != 0).any() or (counts[:2] % LANES != 0).any():
-        raise IndexError("a cell has invalid counts")
-    if (offsets + 3 + 3 * n + 3 * p * m > len(grid)).any():
-        raise IndexError("a cell ends outside of the grid")
-
-
 def obstacle_centres(packed: np.ndarray) -> np.ndarray:
-    """Return the centres (n, 2) of the obstacles in the scenario's order; for a polygon, the mean of its vertices."""
-    circles, records, polygons = unpack_field(packed)
-    centres = [*circles[:, :2], *(record[CENTRE : CENTRE + 2] for record in records)]
-    centres += [polygon[:, 3:].mean(axis=0) for polygon in polygons]
-    indices = packed[int(packed[GRID]) - len(centres) : int(packed[GRID])].astype(int)
-    ordered = np.empty((len(centres), 2))
-    for index, centre in zip(indices, centres, strict=True):
-        ordered[index] = centre
-    return ordered
+    """Return a point inside each obstacle in the scenario's order, (n, 2): the centre of its first part."""
+    circles, polygons, indices = unpack_field(packed)
+    centres = np.array([*circles[:, :2], *(vertices.mean(axis=0) for vertices, _ in polygons)]).reshape(-1, 2)
+    return centres[np.unique(indices, return_index=True)[1]]
 
 
 def _pack_grid(packed: np.ndarray) -> np.ndarray:
     """Return the grid of a field. Obstacles contribute up to CUTOFF proximity scales from the robot's rim."""
-    circles, records, polygons = unpack_field(packed)
-    are_few = len(circles) + len(polygons) <= MAX_OBSTACLES_WITHOUT_GRID
-    if are_few and not records:
+    circles, polygons, indices = unpack_field(packed)
+    if len(indices) <= MAX_OBSTACLES_WITHOUT_GRID:
         return np.zeros(5)
     reach = packed[2] + CUTOFF * packed[1]
     # Obstacles may extend beyond the arena. A point outside the grid uses the nearest cell, which lists all obstacles
     # that contribute at the point: its projection onto the convex grid is not farther from any obstacle in the grid.
     corners = [packed[ARENA : ARENA + 4].reshape(2, 2)]
     corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
-    corners += [polygon[:, 3:] for polygon in polygons]
+    corners += [vertices + side * rounding for vertices, rounding in polygons for side in (-1.0, 1.0)]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
     side = float(np.max(high - low))
     count = min(max(math.ceil(side / (REACHES_PER_CELL * reach)), MIN_GRID_CELLS), MAX_GRID_CELLS)
-    size = side / (1 if are_few else count)
+    size = side / count
     shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
     near_circles: list[list[int]] = [[] for _ in first]
@@ -342,24 +266,20 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
         nearest = np.clip((x, y), first[cells], first[cells] + size)
         for cell in cells[np.linalg.norm(nearest - (x, y), axis=1) - radius < reach].tolist():
             near_circles[cell].append(k)
-    for k, polygon in enumerate(polygons):
-        cells = _cells_in(_offset(polygon, reach), low, size, shape)
+    at = SHAPES + circles.size
+    for vertices, rounding in polygons:
+        rows = edge_rows(vertices)
+        distance = reach + rounding
+        cells = _cells_in(np.concatenate([vertices - distance, vertices + distance]), low, size, shape)
         # The minimum over the cell of the distance to each half-plane; the maximum of these is a lower bound for the
         # distance to the polygon.
-        lowest = np.minimum(polygon[:, :2] * size, 0.0).sum(axis=1) - polygon[:, 2]
-        for cell in cells[(first[cells] @ polygon[:, :2].T + lowest).max(axis=1) < reach].tolist():
-            near_polygons[cell].append(k)
-    edges = np.array([len(polygon) for polygon in polygons], dtype=int)
-    rows = np.zeros((len(polygons), max(edges, default=0), 3))
-    rows[:, :, 2] = FAR_AWAY  # padding edges: the robot is this deep inside the half-plane
-    for k, polygon in enumerate(polygons):
-        rows[k, : len(polygon)] = polygon[:, :3]
-    packed_cells = [
-        _pack_cell(circles[a], rows[b, : edges[b].max(initial=0)])
-        for a, b in zip(near_circles, near_polygons, strict=True)
-    ]
-    offsets = 5 + len(first) + np.cumsum([0, *map(len, packed_cells[:-1])])
-    return np.concatenate([low, [size], shape, offsets, *packed_cells])
+        lowest = np.minimum(rows[:, :2] * size, 0.0).sum(axis=1) - rows[:, 2]
+        for cell in cells[(first[cells] @ rows[:, :2].T + lowest).max(axis=1) < distance].tolist():
+            near_polygons[cell].append(at)
+        at += POLYGON_HEAD + rows.size
+    cells = [_pack_cell(circles[a], b) for a, b in zip(near_circles, near_polygons, strict=True)]
+    offsets = 5 + len(first) + np.cumsum([0, *map(len, cells[:-1])])
+    return np.concatenate([low, [size], shape, offsets, *cells])
 
 
 def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarray) -> np.ndarray:
@@ -370,19 +290,10 @@ def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarra
     return (columns[:, None] * shape[1] + lines).ravel()
 
 
-def _offset(polygon: np.ndarray, distance: float) -> np.ndarray:
-    """Return the vertices (m, 2) of a polygon whose edges are moved outwards by a distance (m)."""
-    normals, before = polygon[:, :2], np.roll(polygon[:, :2], 1, axis=0)
-    return polygon[:, 3:] + distance * (normals + before) / (1.0 + (normals * before).sum(axis=1, keepdims=True))
-
-
-def _pack_cell(circles: np.ndarray, polygons: np.ndarray) -> np.ndarray:
-    """Return the entries of a cell with circles (n, 3) and the padded rows of polygons (p, m, 3)."""
-    n, p = (-(-len(obstacles) // LANES) * LANES for obstacles in (circles, polygons))
+def _pack_cell(circles: np.ndarray, polygons: Sequence[int]) -> np.ndarray:
+    """Return the entries of a cell with circles (n, 3) and polygons at the given indices of the field."""
+    n = -(-len(circles) // LANES) * LANES
     columns = np.zeros((3, n))
     columns[0] = FAR_AWAY
     columns[:, : len(circles)] = circles.T
-    rows = np.zeros((polygons.shape[1], 3, p))
-    rows[:, 2] = -FAR_AWAY  # padding polygons: every half-plane is at this distance
-    rows[:, :, : len(polygons)] = polygons.transpose(1, 2, 0)
-    return np.concatenate([[n, p, len(rows)], columns.ravel(), rows.ravel()])
+    return np.concatenate([[n, len(polygons)], columns.ravel(), polygons])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +9,9 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, tuple_of
-from leapnav.envs.shapes.circle import softened_distance
-from leapnav.envs.shapes.field import CENTRE, CIRCLES, LENGTH, RECORDS, RIM, SHAPES
-from leapnav.envs.shapes.half_plane import wall_distance
-from leapnav.envs.shapes.polygon import half_plane_distance, polygon_distance, polygon_term
-from leapnav.envs.shapes.records import first_polygon, record_distance, record_smooth_distance
+from leapnav.envs.shapes.barrier import CONTACT, barrier
+from leapnav.envs.shapes.distance import circle_geometry, polygon_geometry, wall_distance
+from leapnav.envs.shapes.field import CENTRE, CIRCLES, COLUMNS, POLYGON_HEAD, POLYGONS, RIM, SHAPES
 
 
 class PointGrid(NamedTuple):
@@ -41,7 +38,8 @@ def sample_grid(field, radius, grid, band):
     """Phi and clearance (m) of a disc of a radius (m), both (columns, lines), at the points of a grid.
 
     Obstacles farther away than `band` (m) do not contribute to Phi, and the clearance is at most `band`, so that each
-    obstacle is evaluated at the points around it only.
+    obstacle is evaluated at the points around it only. A path between the points can have a distance that is larger by
+    half the spacing, so Phi is computed with at least this distance.
     """
     weight, steepness = field[0], 1.0 / field[1]
     x0, y0, spacing, columns, lines = grid.x0, grid.y0, grid.spacing, grid.columns, grid.lines
@@ -54,7 +52,7 @@ def sample_grid(field, radius, grid, band):
             for side in range(4):
                 distance = wall_distance(x, y, field, side) - radius
                 if distance < band:
-                    phi[i, j] += weight * math.exp(-distance * steepness)
+                    phi[i, j] += weight * barrier(max(distance, spacing / 2) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
     reach = band + radius
     at = SHAPES
@@ -65,40 +63,19 @@ def sample_grid(field, radius, grid, band):
         bottom, top = _index_range(cy - r - reach, cy + r + reach, y0, spacing, lines)
         for i in range(first, last):
             for j in range(bottom, top):
-                dx, dy = x0 + i * spacing - cx, y0 + j * spacing - cy
-                distance = math.hypot(dx, dy) - r - radius
+                distance = circle_geometry(x0 + i * spacing - cx, y0 + j * spacing - cy, r + radius)[0]
                 if distance < band:
-                    phi[i, j] += weight * math.exp((r + radius - softened_distance(dx, dy)) * steepness)
+                    phi[i, j] += weight * barrier(max(distance, spacing / 2) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
-    others = first_polygon(field)[1]
-    for _ in range(others):
+    for _ in range(int(field[POLYGONS])):
         cx, cy, r = field[at + CENTRE], field[at + CENTRE + 1], field[at + RIM]
         first, last = _index_range(cx - r - reach, cx + r + reach, x0, spacing, columns)
         bottom, top = _index_range(cy - r - reach, cy + r + reach, y0, spacing, lines)
         for i in range(first, last):
             for j in range(bottom, top):
-                x, y = x0 + i * spacing, y0 + j * spacing
-                distance = record_distance(x, y, field, at) - radius
+                distance = polygon_geometry(x0 + i * spacing, y0 + j * spacing, field, at)[0] - radius
                 if distance < band:
-                    smooth = record_smooth_distance(x, y, field, at)[0]
-                    phi[i, j] += weight * math.exp((radius - smooth) * steepness)
+                    phi[i, j] += weight * barrier(max(distance, spacing / 2) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
-        at += 2 + int(field[at + LENGTH])
-    for _ in range(int(field[RECORDS]) - others):
-        edges = int(field[at])
-        rows = at + 1
-        at = rows + 5 * edges
-        low_x = low_y = np.inf
-        high_x = high_y = -np.inf
-        for k in range(edges):
-            low_x, high_x = min(low_x, field[rows + 5 * k + 3]), max(high_x, field[rows + 5 * k + 3])
-            low_y, high_y = min(low_y, field[rows + 5 * k + 4]), max(high_y, field[rows + 5 * k + 4])
-        first, last = _index_range(low_x - reach, high_x + reach, x0, spacing, columns)
-        bottom, top = _index_range(low_y - reach, high_y + reach, y0, spacing, lines)
-        for i in range(first, last):
-            for j in range(bottom, top):
-                x, y = x0 + i * spacing, y0 + j * spacing
-                if half_plane_distance(x, y, field, rows, edges) - radius < band:
-                    phi[i, j] += weight * polygon_term(x, y, field, rows, edges, radius, steepness)
-                    closest[i, j] = min(closest[i, j], polygon_distance(x, y, field, rows, edges) - radius)
+        at += POLYGON_HEAD + COLUMNS * int(field[at])
     return phi, closest

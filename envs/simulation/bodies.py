@@ -20,7 +20,7 @@ from numba import float64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
 from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import ARENA, CENTRE, record_outline, unpack_field
+from leapnav.envs.shapes.field import ARENA, unpack_field
 from leapnav.envs.shapes.proximity import proximity_value
 
 WALL_THICKNESS = 1.0  # m, outside the arena
@@ -105,11 +105,14 @@ class ContactWorld:
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
-        circles, records, polygons = unpack_field(field)
+        circles, polygons, _ = unpack_field(field)
         shapes: list[pymunk.Shape] = [pymunk.Circle(static, r, (x, y)) for x, y, r in circles.tolist()]
-        for record in records:
-            shapes += _rounded_polygon(static, *record_outline(record), record[CENTRE : CENTRE + 2])
-        shapes += [pymunk.Poly(static, polygon[:, 3:].tolist()) for polygon in polygons]
+        for vertices, radius in polygons:
+            points = vertices.tolist()
+            if len(points) == 2:
+                shapes.append(pymunk.Segment(static, points[0], points[1], radius))
+            else:
+                shapes.append(pymunk.Poly(static, points, radius=radius))
         x_min, y_min, x_max, y_max = field[ARENA : ARENA + 4].tolist()
         t = WALL_THICKNESS
         for left, below, right, above in (
@@ -185,30 +188,12 @@ class ContactWorld:
         return lowest, speed_integral, turn_integral, (phi_sum - phi / 2) * step
 
     def _proximity(self, x: float, y: float, heading: float) -> float:
-        """Return the proximity cost at a pose."""
-        cos, sin = math.cos(heading), math.sin(heading)
-        return sum(proximity_value(x + a * cos, y + a * sin, r, self._field) for a, r in self._discs.tolist())
+        """Return the proximity cost at a pose, with clearances larger by CONTACT_MARGIN.
 
-
-def _rounded_polygon(body: pymunk.Body, vertices: np.ndarray, radius: float, centre: np.ndarray) -> list[pymunk.Shape]:
-    """Return the shapes of a polygon rounded by a radius (m); a polygon that is not convex is divided into triangles.
-
-    The triangles from the centre to the sides cover a polygon that is star-shaped about it.
-    """
-    points = vertices.tolist()
-    if len(points) == 1:
-        return [pymunk.Circle(body, radius, points[0])]
-    if len(points) == 2:
-        return [pymunk.Segment(body, points[0], points[1], radius)]
-    edges = np.roll(vertices, -1, axis=0) - vertices
-    following = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    if np.all(turns >= 0) or np.all(turns <= 0):
-        return [pymunk.Poly(body, points, radius=radius)]
-    middle = centre.tolist()
-    return [
-        pymunk.Poly(body, [middle, a, b], radius=radius) for a, b in zip(points, points[1:] + points[:1], strict=True)
-    ]
+        Chipmunk does not resolve the position of a robot in contact more finely, and Phi varies by a multiple there.
+        """
+        cos, sin, discs = math.cos(heading), math.sin(heading), self._discs.tolist()
+        return sum(proximity_value(x + a * cos, y + a * sin, r - CONTACT_MARGIN, self._field) for a, r in discs)
 
 
 def _pose(body: pymunk.Body) -> tuple[float, float, float]:

@@ -16,6 +16,7 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
+from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.proximity import proximity_values
 from leapnav.envs.simulation.arcs import (
@@ -23,7 +24,9 @@ from leapnav.envs.simulation.arcs import (
     CONTACT_TOLERANCE,
     MAX_PANELS,
     PANEL_LENGTH,
+    PANEL_TOLERANCE,
     RELATIVE_CLEARANCE_TOLERANCE,
+    ROUNDED_UP,
 )
 
 ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
@@ -167,40 +170,74 @@ def follow_path(path, duration, field, before, total, new):
     return min(lowest, 0.0), fraction, c0
 
 
-@kernel(types.UniTuple(float64, 2)(HELD_PATH, float64, CONSTANT, float64, MATRIX, MATRIX))
-def path_costs(path, duration, field, total, samples, poses):
-    """Return the means of the proximity cost and of the state cost over a path, by three-point Gauss rules.
+@kernel(types.UniTuple(float64, 2)(HELD_PATH, float64, float64, float64, CONSTANT, MATRIX, MATRIX))
+def _panel_costs(path, duration, start, width, field, samples, poses):
+    """Return the integrals of the proximity cost and of the state cost over a panel of a path (Gauss rule).
 
-    The panels are at most 1.5 proximity scales long. The arguments are those of `follow_path`, and `samples` (4, n)
-    from `sample_path`; `samples` and `poses` (3, 4) are overwritten.
+    The panel is from a fraction `start` to `start` + `width`. `samples` and `poses` are overwritten; for the panel of
+    width 1, `samples` are the states at its nodes.
     """
-    panels = min(max(math.ceil(total / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
-    width = 1.0 / panels
     discs, proximity, state_cost = path.discs, 0.0, 0.0
     has_arms = len(discs) > 1 or discs[0, 0] != 0.0
-    poses[:, 2:] = 0.0
-    for panel in range(int(panels)):
-        for k in range(NODES):
-            state = samples[k]
-            if panels > 1.0:
-                state_after(path, duration * (panel + SAMPLED_FRACTIONS[k]) * width, state)
-            state_cost += (8.0 if k == 1 else 5.0) * path.motion.state_cost(state, path.parameters)
-            poses[k, 0], poses[k, 1] = state[0], state[1]
-            if has_arms:
-                poses[k, 2], poses[k, 3] = math.cos(state[2]), math.sin(state[2])
-        for d in range(len(discs)):
-            a, radius = discs[d, 0], discs[d, 1]
-            if radius <= 0.0:
-                continue
-            first, second, third = proximity_values(
-                poses[0, 0] + a * poses[0, 2],
-                poses[0, 1] + a * poses[0, 3],
-                poses[1, 0] + a * poses[1, 2],
-                poses[1, 1] + a * poses[1, 3],
-                poses[2, 0] + a * poses[2, 2],
-                poses[2, 1] + a * poses[2, 3],
-                radius,
-                field,
-            )
-            proximity += 5.0 * first + 8.0 * second + 5.0 * third
+    for k in range(NODES):
+        state = samples[k]
+        if width < 1.0:
+            state_after(path, duration * (start + SAMPLED_FRACTIONS[k] * width), state)
+        state_cost += (8.0 if k == 1 else 5.0) * path.motion.state_cost(state, path.parameters)
+        poses[k, 0], poses[k, 1] = state[0], state[1]
+        if has_arms:
+            poses[k, 2], poses[k, 3] = math.cos(state[2]), math.sin(state[2])
+    for d in range(len(discs)):
+        a, radius = discs[d, 0], discs[d, 1]
+        if radius <= 0.0:
+            continue
+        first, second, third = proximity_values(
+            poses[0, 0] + a * poses[0, 2],
+            poses[0, 1] + a * poses[0, 3],
+            poses[1, 0] + a * poses[1, 2],
+            poses[1, 1] + a * poses[1, 3],
+            poses[2, 0] + a * poses[2, 2],
+            poses[2, 1] + a * poses[2, 3],
+            radius,
+            field,
+        )
+        proximity += 5.0 * first + 8.0 * second + 5.0 * third
     return proximity / 18.0 * width, state_cost / 18.0 * width
+
+
+@kernel(types.UniTuple(float64, 2)(HELD_PATH, float64, CONSTANT, float64, float64, MATRIX, MATRIX))
+def path_costs(path, duration, field, total, lowest, samples, poses):
+    """Return the means of the proximity cost and of the state cost over a path, with the panels of `arc_proximity`.
+
+    Args:
+        path, duration, field, total: see `follow_path`.
+        lowest: smallest clearance (m) along the path.
+        samples (4, n): from `sample_path`; overwritten.
+        poses (3, 4): overwritten.
+
+    """
+    panels = min(max(math.ceil(total / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
+    largest, proximity, state_cost = 1.0 / panels, 0.0, 0.0
+    poses[:, 2:] = 0.0
+    if lowest >= largest * total:
+        for k in range(int(panels)):
+            phi, cost = _panel_costs(path, duration, k * largest, largest, field, samples, poses)
+            proximity, state_cost = proximity + phi, state_cost + cost
+        return proximity, state_cost
+    shortest = CONTACT * field[1] / total
+    start, width = 0.0, largest
+    whole, _ = _panel_costs(path, duration, start, width, field, samples, poses)
+    while True:
+        half = 0.5 * width
+        first, cost = _panel_costs(path, duration, start, half, field, samples, poses)
+        second, further = _panel_costs(path, duration, start + half, half, field, samples, poses)
+        both = first + second
+        if abs(both - whole) > PANEL_TOLERANCE * both and width > shortest:
+            width, whole = half, first
+            continue
+        proximity, state_cost = proximity + both, state_cost + cost + further
+        start += width
+        if start >= 1.0 - ROUNDED_UP:
+            return proximity, state_cost
+        width = min(2.0 * width, largest, 1.0 - start)
+        whole, _ = _panel_costs(path, duration, start, width, field, samples, poses)

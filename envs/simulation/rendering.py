@@ -13,6 +13,7 @@ import pygame
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
+from leapnav.envs.shapes import Circle
 from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.utils.colors import EDGE, FAILURE, GOAL, OBSTACLE, OPTIMUM, POLICY, WALL
@@ -101,13 +102,13 @@ def draw_scene(scene: Scene) -> np.ndarray:
     beams = _lidar_ends(to_pixels, scene)
     for end, _ in beams:
         pygame.draw.line(canvas, RAY, to_pixels(*scene.pose[:2]), end, max(1, line // 2))
-    for obstacle in scenario.obstacles:
-        if obstacle.circle is not None:
-            center, radius = to_pixels(*obstacle.circle.center), obstacle.circle.radius * scale
+    for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
+        if isinstance(part, Circle):
+            center, radius = to_pixels(*part.center), part.radius * scale
             pygame.draw.circle(canvas, OBSTACLE, center, radius)
             pygame.draw.circle(canvas, EDGE, center, radius, line)
         else:
-            corners = [to_pixels(*vertex) for vertex in obstacle.shape.outline().tolist()]
+            corners = [to_pixels(*vertex) for vertex in part.outline().tolist()]
             pygame.draw.polygon(canvas, OBSTACLE, corners)
             pygame.draw.polygon(canvas, EDGE, corners, line)
     pygame.draw.rect(canvas, WALL, frame, 2 * line)

@@ -10,20 +10,18 @@ from numba import float64, int64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.numba_internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
+from leapnav.envs.shapes.distance import polygon_geometry
 from leapnav.envs.shapes.field import (
     ARENA,
     CENTRE,
     CIRCLES,
-    LENGTH,
-    N_VERTICES,
-    RECORDS,
+    COLUMNS,
+    POLYGON_HEAD,
+    POLYGONS,
     RIM,
     ROUNDING,
     SHAPES,
-    VERTICES,
 )
-from leapnav.envs.shapes.polygon import polygon_distance
-from leapnav.envs.shapes.records import record_distance, trace_rays
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
 # Up to this number of beams it takes less time to intersect a circle with all of them, in vector instructions, than to
@@ -55,35 +53,49 @@ def _beams_towards(ahead, left, radius, count):
     return (count + first, count + last + 1) if first < 0 else (first, last + 1)
 
 
-@kernel(types.UniTuple(float64, 3)(CONSTANT, int64, int64))
-def _circle_around(field, rows, edges):
-    """Return centre and radius (m) of a circle that contains a polygon of the field."""
-    cx = cy = square = 0.0
-    for row in range(rows, rows + 5 * edges, 5):
-        cx += field[row + 3]
-        cy += field[row + 4]
-    cx, cy = cx / edges, cy / edges
-    for row in range(rows, rows + 5 * edges, 5):
-        dx, dy = field[row + 3] - cx, field[row + 4] - cy
-        square = max(square, dx * dx + dy * dy)
-    return cx, cy, math.sqrt(square)
+@kernel(float64(float64, float64, float64, float64, float64))
+def _range_to_circle(dx, dy, cx, cy, r):
+    """Return the distance (m) from the origin in the direction (dx, dy) to a circle, infinite if the ray misses it."""
+    along = cx * dx + cy * dy
+    beside = cx * dy - cy * dx
+    square = r * r - beside * beside
+    return along - math.sqrt(square) if square > 0.0 and along > 0.0 else np.inf
 
 
-@kernel(float64(float64, float64, float64, float64, float64, CONSTANT, int64, int64))
-def _range_to_polygon(x, y, dx, dy, reach, field, rows, edges):
-    """Return the distance (m) from (x, y) in the direction (dx, dy) to a polygon, or `reach` if the ray misses it."""
-    # A point of a ray is inside the polygon if it is inside the half-planes of all edges.
-    enter, leave = -np.inf, np.inf
-    for row in range(rows, rows + 5 * edges, 5):
-        height = field[row] * x + field[row + 1] * y - field[row + 2]
+@kernel(float64(float64, float64, float64, float64, CONSTANT, int64))
+def _range_to_polygon(x, y, dx, dy, field, at):
+    """Return the distance (m) from (x, y) in the direction (dx, dy) to a rounded polygon, infinite if there is no hit.
+
+    If (x, y) is inside a polygon without rounding, the distance is negative; a rounded one must not contain (x, y).
+    """
+    rounding = field[at + ROUNDING]
+    # Between `enter` and `leave`, the ray is inside the half-planes of all edges, moved outwards by the rounding.
+    enter, leave, entered = -np.inf, np.inf, at
+    row = at + POLYGON_HEAD
+    for _ in range(int(field[at])):
+        height = field[row] * x + field[row + 1] * y - field[row + 2] - rounding
         rate = field[row] * dx + field[row + 1] * dy
         if rate < 0.0:
-            enter = max(enter, -height / rate)
+            if -height / rate > enter:
+                enter, entered = -height / rate, row
         elif rate > 0.0:
             leave = min(leave, -height / rate)
         elif height > 0.0:  # a ray parallel to an edge is entirely inside or outside its half-plane
-            return reach
-    return enter if enter <= leave and leave > 0.0 else reach
+            return np.inf
+        row += COLUMNS
+    if enter > leave or leave <= 0.0:
+        return np.inf
+    if rounding == 0.0:
+        return enter
+    if enter >= 0.0:
+        px, py = x + enter * dx - field[entered + 3], y + enter * dy - field[entered + 4]
+        if 0.0 <= field[entered] * py - field[entered + 1] * px <= field[entered + 5]:
+            return enter
+    # The half-planes extend beyond the circles around the vertices, which round the corners.
+    nearest = np.inf
+    for vertex in range(at + POLYGON_HEAD, row, COLUMNS):
+        nearest = min(nearest, _range_to_circle(dx, dy, field[vertex + 3] - x, field[vertex + 4] - y, rounding))
+    return nearest
 
 
 @kernel(NOTHING(float64, float64, float64, float64, VECTOR, VECTOR, VECTOR))
@@ -102,8 +114,8 @@ def _shorten(cx, cy, r, reach, dxs, dys, nearest):
 def scan(x, y, cos, sin, field, reach, beams, scratch):
     """Compute lidar ranges (m).
 
-    Polygons and other shapes are intersected only with the beams that may meet a circle around them, and so are circles
-    if there are many beams.
+    Polygons are intersected only with the beams that may meet a circle around them, and so are circles if there are
+    many beams.
 
     Args:
         x, y: position of the lidar (m).
@@ -127,7 +139,7 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         dxs[k], dys[k] = dx, dy
         nearest[k] = first if first < reach else reach
     # The beams that may meet an obstacle are consecutive, if beam count + k is beam k.
-    selects, at = count > MAX_VECTORISED_BEAMS or field[RECORDS] > 0.0, SHAPES
+    selects, at = count > MAX_VECTORISED_BEAMS or field[POLYGONS] > 0.0, SHAPES
     if selects:
         for k in range(count):
             dxs[count + k], dys[count + k], nearest[count + k] = dxs[k], dys[k], nearest[k]
@@ -141,24 +153,15 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
             first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
         size = last - first
         _shorten(cx, cy, r, reach, part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size))
-    for _ in range(int(field[RECORDS])):
-        if field[at] < 0.0:
-            cx, cy, r = field[at + CENTRE] - x, field[at + CENTRE + 1] - y, field[at + RIM]
-            if cx * cx + cy * cy < (r + reach) ** 2:
-                first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
-                trace_rays(x, y, dxs[first:last], dys[first:last], nearest[first:last], reach, field, at)
-            at += 2 + int(field[at + LENGTH])
-            continue
-        edges, rows = int(field[at]), at + 1
-        at = rows + 5 * edges
-        cx, cy, r = _circle_around(field, rows, edges)
-        cx -= x
-        cy -= y
-        if cx * cx + cy * cy >= (r + reach) ** 2:
-            continue
-        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
-        for k in range(first, last):
-            nearest[k] = min(nearest[k], _range_to_polygon(x, y, dxs[k], dys[k], reach, field, rows, edges))
+    for _ in range(int(field[POLYGONS])):
+        cx, cy, r = field[at + CENTRE] - x, field[at + CENTRE + 1] - y, field[at + RIM]
+        if cx * cx + cy * cy < (r + reach) ** 2:
+            is_inside = field[at + ROUNDING] > 0.0 and polygon_geometry(x, y, field, at)[0] <= 0.0
+            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
+            for k in range(first, last):
+                hit = 0.0 if is_inside else _range_to_polygon(x, y, dxs[k], dys[k], field, at)
+                nearest[k] = min(nearest[k], hit)
+        at += POLYGON_HEAD + COLUMNS * int(field[at])
     for k in range(count):
         hit = min(nearest[k], nearest[count + k]) if selects else nearest[k]
         nearest[k] = hit if hit > 0.0 else 0.0
@@ -169,13 +172,9 @@ def max_vertices(field):
     """Return the maximum number of vertices of an obstacle in the field, 0 if all are circles."""
     at = SHAPES + 3 * int(field[CIRCLES])
     largest = 0
-    for _ in range(int(field[RECORDS])):
-        if field[at] > 0.0:
-            largest = max(largest, int(field[at]))
-            at += 1 + 5 * int(field[at])
-        else:
-            largest = max(largest, int(field[at + N_VERTICES]))
-            at += 2 + int(field[at + LENGTH])
+    for _ in range(int(field[POLYGONS])):
+        largest = max(largest, int(field[at]))
+        at += POLYGON_HEAD + COLUMNS * int(field[at])
     return largest
 
 
@@ -192,10 +191,11 @@ def check_map(field: np.ndarray, map_vertices: int) -> None:
     NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR),
 )
 def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
-    """Describe the walls and the nearest obstacles in the robot's frame, in order of distance.
+    """Describe the walls and the nearest parts of obstacles in the robot's frame, in order of distance.
 
-    An obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the radius 0. Its row
-    contains 1, the radius and the vertices, which are repeated to fill the row. Rows without an obstacle are zeros.
+    Each part of an obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the
+    radius 0. Its row contains 1, the radius and the vertices, which are repeated to fill the row. Rows without a part
+    are zeros.
 
     Args:
         x, y: position of the robot (m).
@@ -211,22 +211,18 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
     width = 2 + 2 * vertices
     for k in range(WALL_ENTRIES, WALL_ENTRIES + obstacles * width):
         out[k] = 0.0
-    circles, records = int(field[CIRCLES]), int(field[RECORDS])
-    # Insertion sort into a list of the nearest obstacles; one that is not a circle has a negative index into the field.
+    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
+    # Insertion sort into a list of the nearest parts; one that is not a circle has a negative index into the field.
     distances = np.full(obstacles, np.inf)
     indices = np.zeros(obstacles, np.int64)
     at = SHAPES
-    for i in range(circles + records):
+    for i in range(circles + polygons):
         if i < circles:
             distance = math.sqrt((field[at] - x) ** 2 + (field[at + 1] - y) ** 2) - field[at + 2]
             size = 3
-        elif field[at] < 0.0:
-            distance = record_distance(x, y, field, at)
-            size = 2 + int(field[at + LENGTH])
         else:
-            edges = int(field[at])
-            distance = polygon_distance(x, y, field, at + 1, edges)
-            size = 1 + 5 * edges
+            distance = polygon_geometry(x, y, field, at)[0]
+            size = POLYGON_HEAD + COLUMNS * int(field[at])
         rank = obstacles
         while rank > 0 and distance < distances[rank - 1]:
             rank -= 1
@@ -244,10 +240,8 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
         out[row] = 1.0
         if disc:
             first, stride, edges, rounding = at, 0, 1, field[at + 2]
-        elif field[at] < 0.0:
-            first, stride, edges, rounding = at + VERTICES, 2, int(field[at + N_VERTICES]), field[at + ROUNDING]
         else:
-            first, stride, edges, rounding = at + 4, 5, int(field[at]), 0.0
+            first, stride, edges, rounding = at + POLYGON_HEAD + 3, COLUMNS, int(field[at]), field[at + ROUNDING]
         out[row + 1] = rounding
         for j in range(vertices):
             vertex = first + stride * (j % edges)

@@ -259,7 +259,7 @@ def drive_paths(packed, motion):
         if driven > 0.0:
             if fraction < 1.0:
                 total = sample_path(path, driven, samples)
-            proximity, state_cost = path_costs(path, driven, field, total, samples, poses)
+            proximity, state_cost = path_costs(path, driven, field, total, lowest, samples, poses)
             state[i, EFFORT] += (control_effort(sim.tasks, u, i) + state_cost) * driven
             state[i, PROXIMITY] += proximity * driven
         for k in range(3):
@@ -306,7 +306,7 @@ def drive_arcs(actions, active, packed):
         else:
             state[i, EFFORT] += effort(sim.tasks, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
         if driven > 0.0:
-            state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, field) * driven
+            state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, lowest, field) * driven
         chord, middle = distance * sinc(turn / 2), heading + turn / 2
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = chord * math.cos(middle), chord * math.sin(middle), turn
     return -1
@@ -364,7 +364,7 @@ def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
         state[i, CLEARANCE], state[i, POSE_CLEARANCE] = min(state[i, CLEARANCE], lowest), after
         speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
         state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
-        state[i, PROXIMITY] += arc_proximity(x, y, course, distance * fraction, 0.0, field) * step * fraction
+        state[i, PROXIMITY] += arc_proximity(x, y, course, distance * fraction, 0.0, lowest, field) * step * fraction
         bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * fraction, dy * fraction, turn * fraction
         if fraction < 1.0:
             state[i, IN_CONTACT] = 1.0

@@ -13,7 +13,6 @@ import numpy as np
 
 from leapnav.envs.robots import DifferentialDrive, Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.utils.files import atomic_path
 
 FORMAT, VERSION = "leapnav-proof", 1
@@ -158,10 +157,4 @@ def find_ends(scenario: Scenario) -> tuple[Pose, Pose]:
     x, y, heading = scenario.goal
     if heading is None:
         raise ValueError("goal: lower bounds need a heading, got None")
-    for index, obstacle in enumerate(scenario.obstacles):
-        if not KINDS[obstacle.shape.kind].is_lipschitz:
-            raise ValueError(
-                f"obstacles[{index}]: lower bounds need a shape with is_lipschitz = True, see "
-                f"leapnav.envs.shapes.Shape, got {obstacle.shape.kind!r}"
-            )
     return scenario.start, (x, y, heading)

@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes import Capsule
+from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.transcription.direct import follow_controls
 
@@ -109,44 +109,32 @@ class Transcription:
 
 def _proximity(scenario: Scenario, x: Any, y: Any, radius: float) -> Any:
     """The proximity cost of a disc divided by its weight, written independently of the kernels."""
-    sigma = scenario.cost.proximity_scale
     x_min, y_min, x_max, y_max = scenario.arena
-    total = 0
-    for distance in (x - x_min, x_max - x, y - y_min, y_max - y):
-        total += casadi.exp(-(distance - radius) / sigma)
-    for obstacle in scenario.obstacles:
-        if obstacle.circle is not None:
-            (cx, cy), r = obstacle.circle.center, obstacle.circle.radius
-            total += casadi.exp(-(casadi.sqrt((x - cx) ** 2 + (y - cy) ** 2 + 1e-6) - r - radius) / sigma)
-        elif isinstance(capsule := obstacle.shape, Capsule):
-            total += casadi.exp(-(_capsule_distance(capsule, sigma, x, y) - radius) / sigma)
-        elif obstacle.polygon is None:
-            raise ValueError(f"obstacles: IPOPT supports circles, polygons and capsules, got {obstacle.shape.kind!r}")
-        else:
-            vertices = np.array(obstacle.polygon.vertices)
-            edges = np.roll(vertices, -1, axis=0) - vertices
-            normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
-            centre = vertices.mean(axis=0)
-            normals *= np.sign(np.sum(normals * (vertices - centre), axis=1))[:, None]
-            offsets = np.sum(normals * vertices, axis=1)
-            distances = [n[0] * x + n[1] * y - offset for n, offset in zip(normals, offsets, strict=True)]
-            maximum = distances[0]
-            for distance in distances[1:]:
-                maximum = casadi.fmax(maximum, distance)
-            normaliser = sum(casadi.exp((distance - maximum) / sigma) for distance in distances)
-            total += casadi.exp((radius - maximum) / sigma) / normaliser
-    return total
+    distances = [x - x_min, x_max - x, y - y_min, y_max - y]
+    for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
+        vertices, rounding = part.rounded_polygon()
+        distances.append(_polygon_distance(vertices, x, y) - rounding)
+    return sum(_barrier((distance - radius) / scenario.cost.proximity_scale) for distance in distances)
 
 
-def _capsule_distance(capsule: Capsule, sigma: float, x: Any, y: Any) -> Any:
-    """The smooth distance to a capsule; the excess beyond its ends is a difference of two softplus functions."""
-    (ax, ay), (bx, by) = capsule.start, capsule.end
-    length = math.dist(capsule.start, capsule.end)
-    ux, uy = ((bx - ax) / length, (by - ay) / length) if length > 0 else (1.0, 0.0)
-    along, across = (x - ax) * ux + (y - ay) * uy, (y - ay) * ux - (x - ax) * uy
+def _barrier(s: Any) -> Any:
+    """The barrier function, and below CONTACT the quadratic polynomial with the same derivatives there."""
+    b = 1 / math.expm1(CONTACT)
+    slope, bend = -b * (1 + b), b * (1 + b) * (1 + 2 * b)
+    beyond = casadi.fmin(s - CONTACT, 0)
+    return 1 / casadi.expm1(casadi.fmax(s, CONTACT)) + beyond * slope + beyond**2 * bend / 2
 
-    def softplus(z: Any) -> Any:
-        return sigma * (casadi.fmax(z / sigma, 0) + casadi.log1p(casadi.exp(-casadi.fabs(z / sigma))))
 
-    excess = softplus(along - length) - softplus(-along)
-    return casadi.sqrt(excess**2 + across**2 + 1e-6) - capsule.radius
+def _polygon_distance(vertices: np.ndarray, x: Any, y: Any) -> Any:
+    """The distance to a point, a segment or a convex polygon; inside, the negative distance to the nearest line."""
+    following = np.roll(vertices, -1, axis=0)
+    orientation = np.sign(np.sum(vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]))
+    outside, inside = math.inf, -math.inf
+    for (ax, ay), (bx, by) in zip(vertices.tolist(), following.tolist(), strict=True):
+        length = math.hypot(bx - ax, by - ay)
+        ux, uy = ((bx - ax) / length, (by - ay) / length) if length > 0 else (1.0, 0.0)
+        along, across = (x - ax) * ux + (y - ay) * uy, (y - ay) * ux - (x - ax) * uy
+        beyond = along - casadi.fmin(casadi.fmax(along, 0), length)
+        outside = casadi.fmin(outside, casadi.sqrt(beyond**2 + across**2))
+        inside = casadi.fmax(inside, -orientation * across)
+    return casadi.if_else(inside < 0, inside, outside) if len(vertices) > 2 else outside
