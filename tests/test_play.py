@@ -2,6 +2,7 @@
 
 import socket
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from play_helpers import SCENARIO, ask_server, fields, served
 
 from leapnav.cli import main
 from leapnav.commands.play import Play
-from leapnav.envs import Scenario
+from leapnav.envs import Capsule, Circle, Scenario, Shape
 from leapnav.envs.scenarios.families import FAMILIES
+from leapnav.envs.shapes import register
 from leapnav.envs.utils import colors
+from leapnav.envs.utils.records import Point
 from leapnav.experts import find_optimum, find_reached_optimum
 from leapnav.play.server import MAX_REQUEST_SIZE, SCRIPTS
 
@@ -60,12 +63,28 @@ def test_the_optimum_and_its_alternatives_are_those_of_find_optimum(ask):
     assert min(found["path"]["clearances"]) == pytest.approx(optimum.certificate.clearance, abs=1e-2)
 
 
-def test_the_outline_of_a_shape_that_the_page_does_not_know_is_sent(ask):
-    capsule = {"start": [1, 1], "end": [2, 1], "radius": 0.5}
-    status, found = ask("/outline", {"obstacle": {"capsule": capsule}})
+class Dumbbell(Shape):
+    """A capsule that connects two discs."""
+
+    kind: ClassVar = "dumbbell"
+
+    ends: tuple[Point, Point]
+
+    def parts(self):
+        a, b = self.ends
+        return Circle(center=a, radius=0.5), Circle(center=b, radius=0.5), Capsule(start=a, end=b, radius=0.2)
+
+
+def test_the_parts_of_a_shape_that_the_page_does_not_know_are_sent(ask):
+    register(Dumbbell)
+    status, found = ask("/parts", {"obstacle": {"dumbbell": {"ends": [[1, 1], [2, 1]]}}})
     assert status == 200
-    assert np.array(found["outline"]).max(axis=0) == pytest.approx([2.5, 1.5], abs=1e-2)
-    assert ask("/outline", {"obstacle": {"moon": {}}})[0] == 400
+    assert found["parts"] == [
+        {"circle": {"center": [1, 1], "radius": 0.5}},
+        {"circle": {"center": [2, 1], "radius": 0.5}},
+        {"capsule": {"start": [1, 1], "end": [2, 1], "radius": 0.2}},
+    ]
+    assert ask("/parts", {"obstacle": {"moon": {}}})[0] == 400
 
 
 def test_alternatives_have_their_controls_and_costates(ask):

@@ -104,13 +104,15 @@ function drawScenario(scenario, selected = null) {
   context.strokeRect(left, top, view.scale * (x1 - x0), view.scale * (y1 - y0));
   (scenario.obstacles || []).forEach((obstacle, i) => {
     const isSelected = i === selected;
-    traceObstacle(obstacle);
     context.fillStyle = colors.obstacle;
-    context.fill();
     context.strokeStyle = isSelected ? colors.wall : colors.edge;
     context.lineWidth = (isSelected ? 3 : 1) * unit;
     context.setLineDash(isSelected ? [6 * unit, 3 * unit] : []);
-    context.stroke();
+    for (const part of partsOf(obstacle)) {
+      tracePart(part);
+      context.fill();
+      context.stroke();
+    }
     context.setLineDash([]);
   });
 }

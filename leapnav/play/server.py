@@ -122,9 +122,9 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
         check_headings(scenario)  # the content of a file or a link
         return {"scenario": scenario.to_dict()}
 
-    def outline(content: dict[str, Any]) -> dict[str, Any]:
+    def parts(content: dict[str, Any]) -> dict[str, Any]:
         obstacle = Obstacle.model_validate(as_tuples(content.get("obstacle")))
-        return {"outline": obstacle.shape.outline().tolist()}
+        return {"parts": [{part.kind: part.model_dump()} for part in obstacle.shape.parts()]}
 
     def follow(content: dict[str, Any]) -> dict[str, Any]:
         previous = content.get("previous")
@@ -134,7 +134,7 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
 
     handlers: dict[str, Handler] = {
         "/check": check,
-        "/outline": outline,
+        "/parts": parts,
         "/follow": follow,
         "/search": lambda content: solver.search(_scenario(content)),
         "/sweeps": lambda content: solver.sweeps(_scenario(content)),

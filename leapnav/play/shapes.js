@@ -1,7 +1,7 @@
 "use strict";
 
 // Geometry of robots, which consist of discs, and of obstacles: discs, convex polygons and capsules. Obstacles of other
-// shapes are drawn by their outline, not edited.
+// shapes are unions of these; they are drawn, not edited.
 
 // The discs of a robot: offsets along its axis, positive ahead, and radii (m).
 const discsOf = (robot) => robot.footprint || [{ offset: 0, radius: robot.radius }];
@@ -27,40 +27,43 @@ function segmentDistance([x, y], [ax, ay], [bx, by]) {
   return Math.hypot(x - ax - t * dx, y - ay - t * dy);
 }
 
-const outlines = new Map(); // of other shapes, by their JSON text; empty until the server has answered
+const unions = new Map(); // parts of other shapes, by their JSON text; empty until the server has answered
 
-// The vertices of a polygon, or points on the outline of another shape.
-function outlineOf(obstacle) {
-  if (obstacle.polygon) return obstacle.polygon.vertices;
+// The discs, polygons and capsules of which an obstacle consists, as obstacles.
+function partsOf(obstacle) {
+  if (obstacle.circle || obstacle.polygon || obstacle.capsule) return [obstacle];
   const key = JSON.stringify(obstacle);
-  if (!outlines.has(key)) {
-    outlines.set(key, []);
-    request("/outline", { obstacle }).then((answer) => {
-      outlines.set(key, answer.outline);
+  if (!unions.has(key)) {
+    unions.set(key, []);
+    request("/parts", { obstacle }).then((answer) => {
+      unions.set(key, answer.parts);
       show();
     }).catch(showError);
   }
-  return outlines.get(key);
+  return unions.get(key);
 }
 
 // Whether a point is inside an obstacle that is enlarged by a margin (m).
-function isInside(obstacle, point, margin = 0) {
-  if (obstacle.circle) {
-    const { center: [cx, cy], radius } = obstacle.circle;
+const isInside = (obstacle, point, margin = 0) => partsOf(obstacle).some((part) => isInsidePart(part, point, margin));
+
+function isInsidePart(part, point, margin) {
+  if (part.circle) {
+    const { center: [cx, cy], radius } = part.circle;
     return Math.hypot(point[0] - cx, point[1] - cy) <= radius + margin;
   }
-  if (obstacle.capsule) {
-    const { start, end, radius } = obstacle.capsule;
+  if (part.capsule) {
+    const { start, end, radius } = part.capsule;
     return segmentDistance(point, start, end) <= radius + margin;
   }
-  const [x, y] = point, vertices = outlineOf(obstacle), sides = vertices.map((a, i) => [a, vertices[(i + 1) % vertices.length]]);
+  const [x, y] = point, { vertices } = part.polygon, sides = vertices.map((a, i) => [a, vertices[(i + 1) % vertices.length]]);
   const crossed = sides.filter(([[ax, ay], [bx, by]]) => ay > y !== by > y && x < ax + ((bx - ax) * (y - ay)) / (by - ay));
   return crossed.length % 2 === 1 || sides.some(([a, b]) => segmentDistance(point, a, b) <= margin);
 }
 
 function centerOf(obstacle) {
   if (obstacle.circle) return obstacle.circle.center;
-  const points = obstacle.capsule ? [obstacle.capsule.start, obstacle.capsule.end] : outlineOf(obstacle);
+  const { capsule, polygon } = obstacle;
+  const points = capsule ? [capsule.start, capsule.end] : polygon ? polygon.vertices : partsOf(obstacle).map(centerOf);
   return [0, 1].map((i) => points.reduce((sum, point) => sum + point[i], 0) / (points.length || 1));
 }
 
@@ -84,20 +87,20 @@ function transformed(obstacle, factor, angle) {
 
 const canRotate = (obstacle) => Boolean(obstacle.polygon || obstacle.capsule);
 
-// Adds the outline to the path of a canvas.
-function traceObstacle(obstacle) {
+// Makes the outline of a part the path of the canvas.
+function tracePart({ circle, capsule, polygon }) {
   context.beginPath();
-  if (obstacle.circle) {
-    context.arc(...toScreen(obstacle.circle.center), Math.max(view.scale * obstacle.circle.radius, 0), 0, 2 * Math.PI);
+  if (circle) {
+    context.arc(...toScreen(circle.center), Math.max(view.scale * circle.radius, 0), 0, 2 * Math.PI);
     return;
   }
-  if (obstacle.capsule) {
-    const { start, end, radius } = obstacle.capsule, pixels = Math.max(view.scale * radius, 0);
+  if (capsule) {
+    const { start, end, radius } = capsule, pixels = Math.max(view.scale * radius, 0);
     const angle = Math.atan2(start[1] - end[1], end[0] - start[0]); // the canvas counts y downwards
     context.arc(...toScreen(end), pixels, angle - Math.PI / 2, angle + Math.PI / 2);
     context.arc(...toScreen(start), pixels, angle + Math.PI / 2, angle + (3 * Math.PI) / 2);
   } else {
-    outlineOf(obstacle).forEach((point, i) => (i ? context.lineTo(...toScreen(point)) : context.moveTo(...toScreen(point))));
+    polygon.vertices.forEach((point, i) => (i ? context.lineTo(...toScreen(point)) : context.moveTo(...toScreen(point))));
   }
   context.closePath();
 }
