@@ -81,12 +81,12 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `walls` (`"map"` only) | 0 to 3 | distances to the left, bottom, right and top wall of the arena | m | -1000 to 1000 |
     | | 4, 5 | cosine and sine of the heading | 1 | -1 to 1 |
     | `obstacles` (`"map"` only) | per obstacle: 0 | 1; in a row without an obstacle, all entries are 0 | 1 | 0 to 1 |
-    | | 1 | radius of a disc, 0 for a polygon | m | 0 to 1000 |
+    | | 1 | radius of a disc or a capsule, 0 for a polygon | m | 0 to 1000 |
     | | 2 ... | vertices in the robot's frame: ahead, to the left; for a disc, its centre; for a capsule, its ends; repeated to fill the row | m | -1000 to 1000 |
 
-    `observation="lidar"` contains `lidar_beams` ranges. `"map"` contains the `map_obstacles` nearest obstacles, in
-    order of distance, with `map_vertices` vertices each. `"state"` contains neither; it suits scenarios without
-    obstacles.
+    `observation="lidar"` contains `lidar_beams` ranges. `"map"` contains the `map_obstacles` nearest discs, capsules
+    and polygons, in order of distance, with `map_vertices` vertices each. `"state"` contains neither; it suits
+    scenarios without obstacles.
 
     `"geodesic"` contains, in addition to the ranges, what a global planner on the complete map provides: the distance to
     the goal among the obstacles, and the detour in the direction of each beam. Both are lengths in a metric that
@@ -100,7 +100,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | Part | Value | When |
     |---|---|---|
     | `effort` | minus the integral of the running cost without the proximity cost over the step, for the unicycle 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
-    | `proximity` | minus the integral of the proximity cost Phi over the step | always |
+    | `proximity` | minus the integral of the proximity cost Phi over the step, with a relative error of at most 1e-4 (1e-3 in rare steps that end in a collision) | always |
     | `time` | minus the time weight times the duration of the step | free horizon |
     | `collision` | `-collision_penalty` | at the first collision of the episode |
     | `miss` | `-miss_penalty` | if the episode terminates without reaching the goal, at the horizon or by a collision |
@@ -126,9 +126,10 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     ## Episode end
     The episode is `terminated` at the horizon, which is part of the task (the time left is observed), or at a
     collision. It is never `truncated`. With `terminate_on_collision=False`, the robot continues in contact with the
-    obstacle, as simulated by pymunk, until the horizon. The episode is a success if, at the horizon, the robot is
-    within `position_tolerance` and `heading_tolerance` of the goal and has not collided. Further states of the robot
-    with a goal, such as the speed of the dynamic unicycle, must be within `motion_tolerance` of it.
+    obstacle, as simulated by pymunk, until the horizon; Phi is large there, 100 k with the default scale. The episode
+    is a success if, at the horizon, the robot is within `position_tolerance` and `heading_tolerance` of the goal and
+    has not collided. Further states of the robot with a goal, such as the speed of the dynamic unicycle, must be within
+    `motion_tolerance` of it.
 
     With `horizon="free"`, the episode is `terminated` at the end of the first step after which the robot is within the
     tolerances of the goal, or at a collision. It is `truncated` at the time limit of the scenario, which is not
@@ -174,7 +175,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
     | `terminate_on_collision` | True | whether a collision ends the episode |
     | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and maximum range (m) |
-    | `map_obstacles`, `map_vertices` | 8, 8 | number of obstacles in the map, and of vertices of each; an obstacle with more vertices is an error |
+    | `map_obstacles`, `map_vertices` | 8, 8 | number of discs, capsules and polygons in the map, and of vertices of each; more vertices are an error |
     | `render_mode` | None | `"rgb_array"` or `"human"` |
 
     ## Errors
