@@ -97,10 +97,14 @@ def _continue(
 def _unwind(target: OptimalControlProblem, start: Extremal) -> OptimalControlProblem:
     """The target with the angles of its start and goal at the windings closest to those of an extremal."""
     target_start = list(target.start)
-    for symbol in target.system.angles:
-        i = target.system.state.index(symbol)
+    for i in target.winding_states:
         target_start[i] -= 2 * math.pi * round((target_start[i] - float(start.states[0, i])) / (2 * math.pi))
     return replace(target, start=tuple(target_start)).with_winding_of(start.states)
+
+
+def _sides(problem: OptimalControlProblem) -> list[tuple[int, bool]]:
+    """The states with finite bounds, each with whether it is the lower one."""
+    return [(limit.state, limit.slope > 0) for limit in problem.state_limits]
 
 
 def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction: float) -> OptimalControlProblem:
@@ -125,6 +129,11 @@ def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction:
         raise ValueError(
             f"problems: two successive problems differ in the free goal components: {first.goal!r}, {second.goal!r}"
         )
+    if _sides(first) != _sides(second):
+        raise ValueError(
+            f"problems: two successive problems differ in which states have finite bounds: {first.state_bounds!r}, "
+            f"{second.state_bounds!r}"
+        )
     if (first.control_bounds is None) != (second.control_bounds is None) or (first.field is None) != (
         second.field is None
     ):
@@ -133,10 +142,15 @@ def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction:
     def between(a: float, b: float) -> float:
         return a if a == b else (1.0 - fraction) * a + fraction * b  # equal bounds may be infinite
 
-    bounds = None
+    def between_pairs(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
+        return between(a[0], b[0]), between(a[1], b[1])
+
+    bounds, state_bounds = None, None
     if first.control_bounds is not None and second.control_bounds is not None:
-        pairs = zip(first.control_bounds, second.control_bounds, strict=True)
-        bounds = tuple((between(a[0], b[0]), between(a[1], b[1])) for a, b in pairs)
+        bounds = tuple(map(between_pairs, first.control_bounds, second.control_bounds))
+    if first.state_bounds is not None and second.state_bounds is not None:
+        pairs = zip(first.state_bounds, second.state_bounds, strict=True)
+        state_bounds = tuple(None if a is None or b is None else between_pairs(a, b) for a, b in pairs)
     goal = tuple(
         None if a is None or b is None else between(a, b) for a, b in zip(first.goal, second.goal, strict=True)
     )
@@ -151,6 +165,8 @@ def blend(first: OptimalControlProblem, second: OptimalControlProblem, fraction:
         time_weight=between(first.time_weight, second.time_weight),
         control_weight=tuple(map(between, first.control_weight, second.control_weight)),
         control_bounds=bounds,
+        state_bounds=state_bounds,
+        barrier_weight=between(first.barrier_weight, second.barrier_weight),
         field=field,
         parameters=tuple(map(between, first.parameters, second.parameters)),
     )

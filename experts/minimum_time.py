@@ -40,8 +40,8 @@ class MinimumTime:
         horizon: its duration (s), an upper bound of the minimum time.
         tolerance: the duration exceeds the minimum by at most this fraction, if the extremal is the global optimum for
             its control weights. It is larger than the requested one if no method solved a problem with smaller weights.
-        lower_bound: a lower bound of the minimum time (s) under the same condition; NaN with a state cost or obstacles,
-            for which no such bound is known.
+        lower_bound: a lower bound of the minimum time (s) under the same condition; NaN with a state cost, state bounds
+            or obstacles, for which no such bound is known.
         switching_times: (S,), times (s) at which a control changes between its lower bound, 0 and its upper bound.
         levels: (S + 1, m), the controls between these times: the bound that is closest, or 0.
 
@@ -88,7 +88,7 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
     ends = [end for end in followed if end.solved]
     if not ends:
         raise SolveError(followed[0].extremal, task.name if isinstance(task, Scenario) else "")
-    has_state_cost = problem.field is not None or problem.state_cost != 0
+    has_state_cost = problem.field is not None or problem.state_cost != 0 or problem.has_hard_limits
     if has_state_cost:  # the durations alone do not rank the paths, and the control costs have different weights
         best = min(ends, key=lambda end: _cost_without_controls(end.extremal))
     else:

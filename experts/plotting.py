@@ -160,8 +160,12 @@ def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> N
         for k, (column, symbol) in enumerate(zip(values.T, labels, strict=True)):
             axes.plot(times, column, color=CURVES[k % len(CURVES)], linewidth=1.5, label=symbol)
         axes.set_ylabel(name)
-    if problem.control_bounds is not None:
-        _draw_bounds(panels[1], controls, problem.control_bounds)
+    for axes, values, bounds in (
+        (panels[0], states, problem.state_bounds),
+        (panels[1], controls, problem.control_bounds),
+    ):
+        if bounds is not None:
+            _draw_bounds(axes, values, bounds)
     _draw_hamiltonian(panels[3], extremal)
     last = panels[-1].get_subplotspec()
     for axes in panels:
@@ -176,12 +180,12 @@ def _draw_over_time(panels: Sequence[Axes], extremal: Extremal, label: str) -> N
             axes.tick_params(labelbottom=False)
 
 
-def _draw_bounds(axes: Axes, controls: np.ndarray, bounds: Sequence[tuple[float, float]]) -> None:
-    """Draw control bounds as faint lines; those far from the controls are outside the axes, to keep the scale."""
+def _draw_bounds(axes: Axes, values: np.ndarray, bounds: Sequence[tuple[float, float] | None]) -> None:
+    """Draw bounds as faint lines; those far from the values are outside the axes, to keep the scale."""
     low, high = axes.get_ylim()
-    limit = MAX_BOUND * float(np.abs(controls).max())
+    limit = MAX_BOUND * float(np.abs(values).max())
     for k, pair in enumerate(bounds):
-        for bound in pair:
+        for bound in pair or ():
             if np.isfinite(bound):
                 color = CURVES[k % len(CURVES)]
                 axes.axhline(bound, color=color, linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.5, zorder=1)

@@ -25,8 +25,9 @@ class ExtremalFlow(NamedTuple):
 
     Attributes:
         function: the compiled flow, of type FLOW_SIGNATURE.
-        data: control weights (m,), lower and upper control bounds (2m,), parameters of the system, offsets and
-            radii of the discs of a footprint.
+        data: control weights (m,), lower and upper control bounds (2m,), parameters of the system, three numbers for
+            each limit of a state (`leapnav.experts.numerics.state_bounds`), offsets and radii of the discs of a
+            footprint.
         field: packed obstacle field; empty without obstacles.
 
     """

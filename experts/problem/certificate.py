@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.integrator import DENSE_TERMS
+from leapnav.experts.numerics.state_bounds import state_margin
 from leapnav.experts.problem.conjugate_points import conjugate_time, first_even_conjugate_time, first_focal_time
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, Status
 from leapnav.experts.problem.frames import MIN_DETERMINANT
@@ -22,6 +23,7 @@ ACCURACY = 1e-12
 UNCONVERGED_ACCURACY = 1e-9
 # Initial size of the table of integration steps; it grows by a factor of 4 when it is full.
 MIN_ROWS, ROWS_PER_SEGMENT = 512, 24
+POINTS_PER_STEP = 8  # at which limits of states are checked; the barrier makes steps short close to them
 MAX_ROWS = 100_000  # integration steps; an extremal that needs more has diverged
 
 
@@ -103,6 +105,7 @@ def certify(
         heading = -1 if system.heading is None else system.state.index(system.heading)
         places = np.array([*map(system.state.index, problem.system.position), heading])
         clearance = float(dense_clearance(problem.field, problem.discs, places, extremal.times, z, terms))
+    margin = state_margin(problem.state_limits, _dense_states(extremal)) if problem.state_limits else None
     residual = float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max()))
     curvature, horizon_error = None, None
     if problem.horizon is None:
@@ -118,9 +121,17 @@ def certify(
         clearance=clearance,
         time_curvature=curvature,
         horizon_error=horizon_error,
+        state_margin=margin,
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     return replace(extremal, certificate=certificate, status=status)
+
+
+def _dense_states(extremal: Extremal) -> np.ndarray:
+    """Return the states (K, n) at the steps of the integrator and between them."""
+    fractions = np.arange(POINTS_PER_STEP) / POINTS_PER_STEP
+    times = extremal.times[:-1, None] + np.diff(extremal.times)[:, None] * fractions
+    return extremal.interpolate(np.append(times.ravel(), extremal.times[-1]))[:, : extremal.problem.system.n]
 
 
 def _time_curvature(frame: np.ndarray, rates: np.ndarray, free: np.ndarray) -> float:

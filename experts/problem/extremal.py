@@ -32,6 +32,7 @@ class Status(Enum):
     MAX_ITERATIONS = "the iteration limit was reached. Try increasing max_iterations, or method='leapfrog'."
     NOT_CERTIFIED = "the solver converged but re-integration did not confirm it. Try a smaller tol."
     COLLISION = "the extremal passes through an obstacle. Try find_optimum, or another guess."
+    BEYOND_LIMITS = "a state of the extremal is beyond its bounds. Try wider state_bounds, or another guess or horizon."
     CONJUGATE_POINT = "the extremal is no local minimum (conjugate point before the horizon). Try another guess."
     TIME_NOT_MINIMAL = "the extremal is no local minimum over the free horizon. Try a guess with another duration."
     SUBPROBLEM = "a Leapfrog sub-problem did not converge, so the sweeps stopped. Try more segments or polish=True."
@@ -76,6 +77,8 @@ class Certificate:
             None with a fixed horizon.
         horizon_error: with a free horizon, |H| / (T d2J/dT2), the relative error of the horizon to first order; None
             with a fixed horizon.
+        state_margin: smallest distance of a state from its bounds along the interpolated path, as a fraction of the
+            width of the interval, or of the largest distance of start and goal from a single bound; None without them.
         TOLERANCE: largest residual and defect of a certified extremal.
         HORIZON_TOLERANCE: largest horizon error of a certified extremal; it is larger if the cost hardly depends on T.
 
@@ -88,6 +91,7 @@ class Certificate:
     clearance: float | None
     time_curvature: float | None = None
     horizon_error: float | None = None
+    state_margin: float | None = None
 
     # Rounding errors leave about this much of a Newton solution at tolerance 1e-9 over a long horizon.
     TOLERANCE: ClassVar[float] = 1e-8
@@ -99,6 +103,8 @@ class Certificate:
             return Status.NOT_CERTIFIED
         if self.clearance is not None and not self.clearance > 0:
             return Status.COLLISION
+        if self.state_margin is not None and not self.state_margin > 0:
+            return Status.BEYOND_LIMITS
         if self.conjugate_point is not None:
             return Status.NOT_CERTIFIED if math.isnan(self.conjugate_point) else Status.CONJUGATE_POINT
         if self.time_curvature is None or self.horizon_error is None:
@@ -167,6 +173,8 @@ class Extremal:
         certificate: evidence from re-integration; None without a path.
         n_nodes: number of nodes of the solver.
         n_evaluations: number of evaluations of the extremal flow by the solver.
+        barrier: integral of the barrier that approximates hard limits, as a fraction of `cost`, which excludes it; 0
+            without hard limits. The cost of the optimum with the hard limits is lower by about this fraction.
 
     """
 
@@ -184,6 +192,7 @@ class Extremal:
     certificate: Certificate | None = None
     n_nodes: int = 0
     n_evaluations: int = 0
+    barrier: float = 0.0
 
     def __repr__(self) -> str:
         return f"Extremal({self.status.name}, cost={self.cost:.9g}, {len(self.times)} points, {self.certificate})"

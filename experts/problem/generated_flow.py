@@ -17,11 +17,13 @@ import sympy as sp
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION
+from leapnav.experts.numerics.state_bounds import ENTRIES
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
 
 # The modules that the generated module imports.
 IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.numerics.flow"
+LIMITS_IMPORTED = ("leapnav.experts.numerics.state_bounds",)  # with limits of states
 
 
 # What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or
@@ -31,7 +33,7 @@ Obstacles = Literal["none", "disc", "footprint"]
 
 @computed_once(maxsize=64)
 def compile_flow(
-    system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles
+    system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...] = ()
 ) -> tuple[FunctionPointer, FunctionPointer]:
     """Compile the extremal flow and the control law of a system.
 
@@ -39,6 +41,7 @@ def compile_flow(
         system: the system.
         state_cost: SymPy expression in the state and the parameters.
         obstacles: see `Obstacles`.
+        limited: for each limit of a state the index of the state.
 
     Returns:
         `flow(z, data, field, S, dz, dS) -> running cost` and `control(z, data, u)`, see
@@ -49,14 +52,15 @@ def compile_flow(
 
     """
     check_obstacles(system, obstacles)
-    declaration = declare(system, state_cost, obstacles)
-    module = load("flow", __name__, declaration, IMPORTED, lambda: _generate(system, state_cost, obstacles))
+    declaration = declare(system, state_cost, obstacles, limited)
+    imported = (*IMPORTED, *LIMITS_IMPORTED) if limited else IMPORTED
+    module = load("flow", __name__, declaration, imported, lambda: _generate(system, state_cost, obstacles, limited))
     return FunctionPointer(module.flow, FLOW_FUNCTION), FunctionPointer(module.control, CONTROL_FUNCTION)
 
 
-def declare(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles) -> str:
+def declare(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...]) -> str:
     """Return a text that identifies a system with its cost."""
-    places = system.position, system.heading, obstacles
+    places = system.position, system.heading, obstacles, *limited
     return sp.srepr((system.state, system.parameters, system.drift, system.fields, state_cost, str(places)))
 
 
@@ -68,7 +72,7 @@ def check_obstacles(system: ControlAffineSystem, obstacles: Obstacles) -> None:
         raise ValueError("heading: expected a state symbol for a problem with a footprint, got None")
 
 
-def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles) -> str:
+def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...]) -> str:
     """Return the source of the generated module."""
     n, m = system.n, system.m
     # The user's symbols are renamed, because their names need not be valid or distinct identifiers.
@@ -106,6 +110,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             hessian[row, column] += phi[1 + len(at) + k]
             if row != column:
                 hessian[column, row] += phi[1 + len(at) + k]
+    for i, (limit, first, second) in zip(limited, limit_symbols(limited), strict=True):
+        value, gradient[i], hessian[i, i] = value + limit, gradient[i] + first, hessian[i, i] + second
 
     rate = [*gradient[n:], *(-g for g in gradient[:n])]
     jacobian = {}
@@ -114,7 +120,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             entry = hessian[a + n, b] if a < n else -hessian[a - n, b]
             if entry != 0:
                 jacobian[a, b] = entry
-    return _render(n, m, len(parameters), switching, value, rate, jacobian, at)
+    costs = call_costs(at, limited, 3 * m + len(parameters))
+    return _render(n, len(parameters), switching, value, rate, jacobian, costs, import_costs(limited))
 
 
 # Names of the value, gradient and Hessian (upper triangle, by rows) of the proximity cost, by the number of states on
@@ -137,32 +144,51 @@ def obstacle_states(system: ControlAffineSystem, obstacles: Obstacles) -> list[i
     return [system.state.index(symbol) for symbol in (*system.position, *heading)]
 
 
-def call_proximity(at: Sequence[int], first: int) -> list[str]:
-    """Return the line that computes the proximity cost.
+def limit_symbols(limited: Sequence[int]) -> list[tuple[sp.Symbol, sp.Symbol, sp.Symbol]]:
+    """Return the symbols of the cost and its derivatives for each limit of a state."""
+    return [sp.symbols(f"limit{k} limit{k}_d limit{k}_dd", real=True) for k in range(len(limited))]
+
+
+def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[str]:
+    """Return the lines that compute the costs of the limits of states and the proximity cost.
 
     Args:
-        at: indices of the states on which it depends.
-        first: index of the first disc of a footprint in the data.
+        at: indices of the states on which the proximity cost depends.
+        limited: for each limit the index of the state.
+        first: index of the limits in the data, after which those of a footprint's discs follow.
 
     """
-    if not at:
-        return []
-    states = ", ".join(f"q{i}" for i in at)
-    call = f"proximity({states}, field)" if len(at) == 2 else f"footprint_proximity({states}, data, {first}, field)"
-    return [f"    {', '.join(PHI[len(at)])} = {call}"]
+    lines: list[str] = []
+    for k, (i, symbols) in enumerate(zip(limited, limit_symbols(limited), strict=True)):
+        lines.append(f"    {', '.join(map(str, symbols))} = limit_cost(q{i}, data, {first + ENTRIES * k})")
+    if at:
+        states, discs = ", ".join(f"q{i}" for i in at), first + ENTRIES * len(limited)
+        call = f"proximity({states}, field)" if len(at) == 2 else f"footprint_proximity({states}, data, {discs}, field)"
+        lines.append(f"    {', '.join(PHI[len(at)])} = {call}")
+    return lines
+
+
+def import_costs(limited: Sequence[int]) -> list[str]:
+    """Return the lines that import what the lines of `call_costs` call."""
+    limits = ["from leapnav.experts.numerics.state_bounds import limit_cost"] if limited else []
+    return ["from leapnav.envs.shapes.proximity import footprint_proximity, proximity", *limits]
 
 
 def _render(
     n: int,
-    m: int,
     parameters: int,
     switching: Sequence[Any],
     value: Any,
     rate: list[sp.Expr],
     jacobian: dict[tuple[int, int], sp.Expr],
-    position: list[int],
+    costs: list[str],
+    imports: list[str],
 ) -> str:
-    """Return the source of a module that computes the given expressions, with common subexpressions removed."""
+    """Return the source of a module that computes the given expressions, with common subexpressions removed.
+
+    Its flow computes the lines `costs` first, which call functions of the lines `imports`.
+    """
+    m = len(switching)
     expressions = {
         **{f"p{j}": p for j, p in enumerate(switching)},
         "value": value,
@@ -186,8 +212,7 @@ def _render(
         ]
     control_body = [*controls, *(f"    u[{j}] = u{j}" for j in range(m))]
 
-    lines = [*unpack, *controls]
-    lines += call_proximity(position, 3 * m + parameters)
+    lines = [*unpack, *controls, *costs]
     lines += assign("value", "value", "    ")
     for i in range(2 * n):
         lines += assign(f"dz[{i}]", f"rate{i}", "    ")
@@ -206,7 +231,7 @@ def _render(
             '"""Generated by leapnav.experts.problem.generated_flow: extremal flow and sensitivities. Do not edit."""',
             "import math",
             "from leapnav.envs.kernels import kernel",
-            "from leapnav.envs.shapes.proximity import footprint_proximity, proximity",
+            *imports,
             "from leapnav.experts.numerics.flow import CONTROL_SIGNATURE, FLOW_SIGNATURE",
             "",
             "@kernel(FLOW_SIGNATURE)",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, cast
@@ -12,10 +13,12 @@ import numpy as np
 
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import check_field
+from leapnav.envs.shapes.field import check_field, with_weight
+from leapnav.envs.shapes.proximity import footprint_proximities
 from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.numerics.interpolation import interpolate
+from leapnav.experts.numerics.state_bounds import StateLimit, check_state_bounds, limit_costs, state_limits
 from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
 from leapnav.experts.problem.system import (
     ControlAffineSystem,
@@ -82,6 +85,12 @@ class OptimalControlProblem:
         footprint: offset along the heading and radius (m) of each disc of the robot; None for one disc with the radius
             of the field.
         time_weight: c >= 0, cost per second.
+        barrier_weight: weight of the barrier that approximates hard limits: if the proximity weight of the field is
+            smaller, this is used instead. `solve` and `find_optimum` reduce it, see `leapnav.experts.hard_limits`.
+        state_bounds: for each state None or a pair (lowest, highest), of which one may be infinite. Start and goal are
+            inside. They are hard limits, approximated by the barrier (A. E. Bryson, W. F. Denham, S. E. Dreyfus,
+            Optimal programming problems with inequality constraints I, AIAA Journal 1, 1963, treat them exactly). The
+            goal of an angle with bounds is not met modulo 2 pi, but as it is.
 
     Raises:
         ValueError: an argument has a wrong length or an invalid value, or the horizon is free and there is neither a
@@ -100,6 +109,8 @@ class OptimalControlProblem:
     parameters: Sequence[float] = ()
     footprint: tuple[tuple[float, float], ...] | None = None
     time_weight: float = 0.0
+    barrier_weight: float = 0.0
+    state_bounds: Sequence[tuple[float, float] | None] | None = None
 
     def __post_init__(self) -> None:
         n, m = self.system.n, self.system.m
@@ -121,6 +132,8 @@ class OptimalControlProblem:
             raise ValueError(f"horizon: expected a positive number, or None for a free horizon, got {self.horizon!r}")
         if not (_is_finite(self.time_weight) and self.time_weight >= 0):
             raise ValueError(f"time_weight: expected a number of at least 0, got {self.time_weight!r}")
+        if not (_is_finite(self.barrier_weight) and self.barrier_weight >= 0):
+            raise ValueError(f"barrier_weight: expected a number of at least 0, got {self.barrier_weight!r}")
         if self.control_bounds is not None:
             if len(self.control_bounds) != m:
                 raise ValueError(f"control_bounds: expected {m} pairs, got {len(self.control_bounds)}")
@@ -133,9 +146,12 @@ class OptimalControlProblem:
             object.__setattr__(self, name, values)
         object.__setattr__(self, "horizon", None if self.horizon is None else float(self.horizon))
         object.__setattr__(self, "time_weight", float(self.time_weight))
+        object.__setattr__(self, "barrier_weight", float(self.barrier_weight))
         if self.control_bounds is not None:
             bounds = tuple((float(low), float(high)) for low, high in self.control_bounds)
             object.__setattr__(self, "control_bounds", bounds)
+        if self.state_bounds is not None:
+            object.__setattr__(self, "state_bounds", check_state_bounds(self.state_bounds, self.start, self.goal))
         if self.field is not None:
             object.__setattr__(self, "field", check_field(self.field))
         self._check_footprint()
@@ -188,13 +204,18 @@ class OptimalControlProblem:
         if np.ndim(states) != 2 or len(states) == 0:
             raise ValueError(f"states: expected the shape (any, {n}), got {np.shape(states)}")
         last = as_vector("states", states[-1], n)
-        for symbol in self.system.angles:
-            i = self.system.state.index(symbol)
+        for i in self.winding_states:
             value = goal[i]
             if value is not None:
                 # Rounded, because the path need not end exactly at the goal.
                 goal[i] = value + 2 * math.pi * round((float(last[i]) - value) / (2 * math.pi))
         return tuple(goal)
+
+    @property
+    def winding_states(self) -> tuple[int, ...]:
+        """Indices of the angles, whose goal is met modulo 2 pi, without those with state bounds."""
+        at = [self.system.state.index(symbol) for symbol in self.system.angles]
+        return tuple(i for i in at if self.state_bounds is None or self.state_bounds[i] is None)
 
     @property
     def starts_at_goal(self) -> bool:
@@ -205,6 +226,46 @@ class OptimalControlProblem:
     def with_horizon(self, horizon: float) -> OptimalControlProblem:
         """Return the problem with a fixed horizon (s)."""
         return replace(self, horizon=horizon)
+
+    def between(self, start: tuple[float, ...], goal: Sequence[float | None], horizon: float) -> OptimalControlProblem:
+        """Return the problem for a part of a path, whose ends need not satisfy the state bounds, in a time (s)."""
+        part = copy(self)
+        # The ends are not checked, and the barrier has the same scales.
+        part.__dict__.update(start=start, goal=goal, horizon=horizon, state_limits=self.state_limits)
+        return part
+
+    def with_barrier(self, weight: float) -> OptimalControlProblem:
+        """Return the problem with another barrier weight."""
+        return self if weight == self.barrier_weight else replace(self, barrier_weight=weight)
+
+    @property
+    def proximity_weight(self) -> float:
+        """The weight of the proximity cost that the solvers use; 0 without obstacles."""
+        return 0.0 if self.field is None else max(float(self.field[0]), self.barrier_weight)
+
+    @property
+    def has_hard_limits(self) -> bool:
+        """Whether the cost of an optimum excludes the barrier: state bounds, or obstacles with proximity weight 0."""
+        return bool(self.state_limits) or (self.field is not None and float(self.field[0]) == 0.0)
+
+    @cached_property
+    def state_limits(self) -> tuple[StateLimit, ...]:
+        """The finite limits of the states."""
+        return () if self.state_bounds is None else state_limits(self.state_bounds, self.start, self.goal)
+
+    def barrier_cost(self, states: np.ndarray) -> np.ndarray:
+        """Return the running cost (K,) of the barrier at states (K, n): what `barrier_weight` adds to the running cost.
+
+        With a proximity weight below the barrier weight, it is the difference of the two proximity costs.
+        """
+        states = as_matrix("states", states, None, self.system.n)
+        cost = np.zeros(len(states))
+        for state, bound, slope in self.state_limits:
+            cost += limit_costs(states[:, state].copy(), _constant([bound, slope, self.barrier_weight]))
+        if self.field is None or self.proximity_weight == 0.0:
+            return cost
+        added = 1.0 - float(self.field[0]) / self.proximity_weight
+        return cost + added * footprint_proximities(states, self.discs, self.arrays.field)
 
     @property
     def fixed_horizon(self) -> float:
@@ -246,7 +307,7 @@ class OptimalControlProblem:
         """The compiled dynamics with controls as arguments, for direct transcription."""
         from leapnav.experts.problem.generated_dynamics import compile_dynamics
 
-        return compile_dynamics(*self._compiled, self._obstacles)
+        return compile_dynamics(*self._compiled, self._obstacles, tuple(limit.state for limit in self.state_limits))
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions cannot be pickled; the receiving process creates its own.
@@ -257,16 +318,17 @@ class OptimalControlProblem:
         """The problem in the form that the kernels take."""
         from leapnav.experts.problem.generated_flow import compile_flow
 
-        m = self.system.m
-        flow, control = compile_flow(*self._compiled, self._obstacles)
+        m, limits = self.system.m, self.state_limits
+        flow, control = compile_flow(*self._compiled, self._obstacles, tuple(limit.state for limit in limits))
         bounds = np.array(
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
         goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
         discs = () if self._obstacles != "footprint" else self.discs.ravel().tolist()
         parameters = self.parameters if self.time_weight == 0.0 else (*self.parameters, self.time_weight)
-        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *discs])
-        field = _constant([]) if self.field is None else self.field
+        barriers = [number for limit in limits for number in (limit.bound, limit.slope, self.barrier_weight)]
+        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *discs])
+        field = _constant([]) if self.field is None else with_weight(self.field, self.proximity_weight)
         return ProblemArrays(
             flow=ExtremalFlow(flow, data, field),
             control=control,
@@ -345,7 +407,7 @@ class ProblemArrays:
 
     @property
     def data(self) -> np.ndarray:
-        """Control weights (m,), lower and upper control bounds (2m,), parameters, and the discs of a footprint."""
+        """Control weights (m,), control bounds (2m,), parameters, limits of states, and the discs of a footprint."""
         return self.flow.data
 
     @property

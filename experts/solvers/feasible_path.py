@@ -7,7 +7,7 @@ the method.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -105,12 +105,9 @@ class FeasiblePath:
         """
         n = self.problem.system.n
         last = b == self.segments
-        part = replace(
-            self.problem,
-            start=tuple(self.nodes[a, :n]),
-            goal=self.problem.goal if last else tuple(self.nodes[b, :n]),
-            horizon=(duration := float(self.times[b] - self.times[a])),
-        )
+        duration = float(self.times[b] - self.times[a])
+        goal = self.problem.goal if last else tuple(self.nodes[b, :n].tolist())
+        part = self.problem.between(tuple(self.nodes[a, :n].tolist()), goal, duration)
         arrays = part.arrays
         minima = local_minima(part, STEERING_INTERVALS, STEERING_STARTS) if search else [(0.0, None)]
         for _, path in sorted(minima, key=lambda entry: entry[0]):

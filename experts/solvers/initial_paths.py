@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from leapnav.experts.numerics.linear import solve_positive
-from leapnav.experts.numerics.shooting import hamiltonian
+from leapnav.experts.numerics.shooting import hamiltonians
+from leapnav.experts.numerics.state_bounds import state_margin
 from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.condensing import ControlRollout, condense, roll_out
@@ -29,6 +30,8 @@ MAX_ITERATIONS = 40
 HARMONICS = 4  # of random initial controls
 COST_TOLERANCE = 1e-4  # relative; paths whose costs agree to this are one local minimum, or its mirror image
 WINDINGS = (0, -1, 1)
+# First weight of a barrier, as a fraction of the cost per second; smaller costs per unit controls are rounding errors.
+FIRST_BARRIER, NEGLIGIBLE = 0.1, 1e-12
 # Free horizon: first guess (s), smallest factor and largest number of its steps, relative tolerance, and initial
 # controls per step.
 FIRST_HORIZON, MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE, HORIZON_STARTS = 1.0, 0.25, 12, 0.05, 4
@@ -59,8 +62,7 @@ def initial_paths(problem: OptimalControlProblem, seed: int = 0) -> Iterator[tup
     """
     found: list[tuple[float, OptimalControlProblem, Trajectory]] = []
     for variant in _windings(problem):
-        fixed = variant if variant.horizon is not None else variant.with_horizon(estimate_horizon(variant, seed))
-        found += [(cost, variant, path) for cost, path in local_minima(fixed, seed=seed)]
+        found += [(cost, variant, path) for cost, path in local_minima(_with_horizon(variant, seed), seed=seed)]
     found.sort(key=lambda entry: entry[0])
     last: float | None = None
     for cost, variant, path in found:
@@ -69,16 +71,36 @@ def initial_paths(problem: OptimalControlProblem, seed: int = 0) -> Iterator[tup
             yield variant, path
 
 
+def first_barrier_weight(problem: OptimalControlProblem, seed: int = 0) -> float:
+    """Return a barrier weight (cost per second) at which the barrier is a small but not negligible part of the cost.
+
+    It is a fraction of the mean cost per second of a path that ignores limits of states and obstacles without proximity
+    cost, so it is independent of the units of cost, time and states. If there is no such path, or it costs nothing, it
+    is a fraction of the cost of controls of 1.
+    """
+    plain = replace(problem, state_bounds=None, barrier_weight=0.0)
+    fixed = _with_horizon(next(_windings(plain)), seed)
+    cost = min((cost for cost, _ in local_minima(fixed, starts=N_AGREEING, seed=seed)), default=0.0)
+    rate, unit_rate = abs(cost) / fixed.fixed_horizon, 0.5 * sum(problem.control_weight)
+    return FIRST_BARRIER * (rate if rate > NEGLIGIBLE * unit_rate else unit_rate)
+
+
+def _with_horizon(problem: OptimalControlProblem, seed: int) -> OptimalControlProblem:
+    """Return the problem with a fixed horizon, estimated if it is free."""
+    return problem if problem.horizon is not None else problem.with_horizon(estimate_horizon(problem, seed))
+
+
 def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
     """Estimate the optimal horizon (s) of a problem with a free horizon.
 
     The best local minimum in a fixed time gives the derivative of its cost by the horizon, which is the Hamiltonian.
     The next horizon minimises a cost of the form a / T + b T with this value and derivative. If no path to the goal is
-    found, the horizon is too short, because of control bounds.
+    found, or none within the limits of the states, the horizon is too short.
     """
     horizon, too_short, reachable = FIRST_HORIZON, 0.0, math.inf
     for _ in range(MAX_HORIZON_STEPS):
         minima = local_minima(problem.with_horizon(horizon), starts=HORIZON_STARTS, seed=seed)
+        minima = [(cost, path) for cost, path in minima if state_margin(problem.state_limits, path.states) > 0]
         if not minima:
             if horizon < reachable:
                 too_short = horizon
@@ -87,8 +109,9 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
         reachable = horizon
         cost, path = min(minima, key=lambda entry: entry[0])
         assert path.costates is not None  # `local_minima` computes them
-        z = np.concatenate([path.states[0], path.costates[0]])
-        slope = horizon * hamiltonian(problem.arrays.flow, z, np.empty_like(z))
+        # On a coarse path the Hamiltonian varies where Phi does, so its mean is used.
+        values = hamiltonians(problem.arrays.flow, np.concatenate([path.states, path.costates], axis=1))
+        slope = float(np.trapezoid(values, path.times))
         factor = time_factor(cost, slope, MIN_HORIZON_FACTOR)
         horizon = max(factor * horizon, math.sqrt(too_short * reachable))
         if abs(horizon / reachable - 1.0) < HORIZON_TOLERANCE:
@@ -98,8 +121,7 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
 
 def _windings(problem: OptimalControlProblem) -> Iterator[OptimalControlProblem]:
     """Yield the problem with each goal angle at the winding closest to the start, then at the neighbouring windings."""
-    at = [problem.system.state.index(symbol) for symbol in problem.system.angles]
-    at = [i for i in at if problem.goal[i] is not None]
+    at = [i for i in problem.winding_states if problem.goal[i] is not None]
     for windings in itertools.product(WINDINGS, repeat=len(at)):
         goal = list(problem.goal)
         for i, winding in zip(at, windings, strict=True):

@@ -171,7 +171,7 @@ def _on_arcs(problem: OptimalControlProblem) -> tuple[float, float, np.ndarray, 
         turn rate.
 
     """
-    if problem.footprint is not None:
+    if problem.footprint is not None or problem.state_limits:
         return None
     limits = problem.arrays.data[4:6]
     first, second = problem.control_weight[:2]

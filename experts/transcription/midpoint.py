@@ -24,7 +24,7 @@ class DiscreteProblem(NamedTuple):
     Attributes:
         h: (N,), durations of the intervals (s).
         end: conditions at the horizon.
-        data: control weights (m,), lower and upper bounds (2m,), parameters and discs, see `ExtremalFlow`.
+        data: control weights (m,), lower and upper bounds (2m,) and so on, see `ExtremalFlow`.
         field: packed obstacle field.
         unit: factor of all costs.
         rates, derivatives, state_cost: see `leapnav.experts.problem.generated_dynamics`.
