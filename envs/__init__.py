@@ -4,7 +4,8 @@ from leapnav.deprecated import deprecated_names
 from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
-from leapnav.envs.scenarios.bank import BankError, Reference, ScenarioBank
+from leapnav.envs.scenarios.bank import BankError, ScenarioBank
+from leapnav.envs.scenarios.banks.checks import Reference
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.families import FAMILIES, register_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache, partial
-from itertools import islice
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -20,10 +18,17 @@ from leapnav.envs.shapes.proximity import footprint_proximity
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
+from leapnav.experts.hard_limits import BARRIER_TOLERANCE, follow_best
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.search.candidates import LATTICE_ERROR, Candidate, CandidateSearch, shortest_durations
+from leapnav.experts.search.candidates import (
+    LATTICE_ERROR,
+    Candidate,
+    CandidateSearch,
+    first_energy,
+    shortest_durations,
+)
 from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
@@ -40,16 +45,10 @@ N_FIRST = 3  # candidates after which, without alternatives, those that are too 
 # Distance (m) from start to goal above which many candidates are about as long as the shortest.
 PARTIAL_DISTANCE = 20.0
 N_ELSEWHERE = 4  # additional candidates far from the others: inexpensive, and the most distinct alternatives
-# Rounds of candidates of a lattice, and of the first one while nothing is certified: among dense obstacles, most
-# candidates are in collision.
-MAX_ROUNDS, MAX_FIRST_ROUNDS = 4, 12
-# Refinement and margin (m) of the lattices, tried in this order while nothing is certified or a better path may have
-# been missed. All candidates may lead through a passage that is too narrow, or in which the optimum is close to
-# contact; a margin closes it. A passage or a short path may need smaller cells.
-LATTICES: tuple[tuple[int, float | None], ...] = ((1, None), (1, 0.05), (2, None), (2, 0.05))
-# Distance (m) from start to goal above which shortest paths in the plane are the candidates, margins (m) of their
-# lattices, and number of paths of each.
-LONG_DISTANCE, PLANE_MARGINS, N_PLANE_PATHS = 40.0, (None, 0.05), 4
+MAX_ROUNDS = 4  # rounds of candidates of a lattice
+REFINEMENT = 2  # of the second lattice, which is searched while a better path may have been missed
+# Distance (m) from start to goal above which shortest paths in the plane are the candidates, and their number.
+LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
 # Most families need 1/15 of it, slalom occasionally 4/3; among hundreds of obstacles one candidate takes 1/3. With
 # 10,000, one scenario of the included banks would lose its second-best optimum.
@@ -66,11 +65,8 @@ class Optimum(Extremal):
         alternatives: the other distinct local optima that were found and certified, in order of cost; their own
             `alternatives` are empty. If each takes long, on long paths or among hundreds of obstacles, some are
             missing; more `candidates` find more of them.
-        doubts: solutions without a certificate that cost less than this optimum. The status COLLISION marks those that
-            cut into an obstacle by at most 0.4 robot radii: a path in contact with that obstacle may then cost less
-            than this optimum. Any other status is the reason for the missing certificate. Of the paths in collision,
-            the cheapest ones at up to four places are computed. Extremals that cut deeper are omitted: with a realistic
-            proximity cost, no similar path is both collision-free and inexpensive.
+        doubts: solutions without a certificate that cost less than this optimum. The status is the reason for the
+            missing certificate.
 
     """
 
@@ -143,14 +139,6 @@ def _compile_kernels(is_unicycle: bool, has_footprint: bool) -> None:
     prepare(*missing(search_kernels(is_unicycle, has_footprint)))
 
 
-class Grids(NamedTuple):
-    """Sampled data of a scenario, computed at first use: lattices by their arguments, and whether a path exists."""
-
-    lattice: Callable[[int, float | None], Lattice]
-    plane: Callable[[float | None], Lattice]
-    connected: Callable[[], bool]
-
-
 class Effort(NamedTuple):
     """The effort of a search, see `find_optimum`."""
 
@@ -160,7 +148,12 @@ class Effort(NamedTuple):
 
 
 def find_optimum(
-    scenario: Scenario, candidates: int = 12, *, thorough: bool = True, alternatives: bool = True
+    scenario: Scenario,
+    candidates: int = 12,
+    *,
+    thorough: bool = True,
+    alternatives: bool = True,
+    barrier_tolerance: float = BARRIER_TOLERANCE,
 ) -> Optimum:
     """Find the minimum-cost certified extremal of a scenario.
 
@@ -168,6 +161,10 @@ def find_optimum(
     sides of the obstacles, driving modes with cusps, and windings of the heading. Direct transcription improves each
     to a local optimum and identifies duplicates. Multiple-shooting Newton steps turn the local optima into extremals.
     The cheapest one with a valid certificate is returned, with the others as `alternatives`.
+
+    With the proximity weight 0, obstacles cost nothing and must not be touched. The search then uses a small weight,
+    and the best local optima are followed to the weight at which the proximity cost is negligible, see
+    `leapnav.experts.hard_limits`.
 
     Args:
         scenario: the scenario.
@@ -178,6 +175,7 @@ def find_optimum(
             is recognised 50 times faster; but the only path may be missed, and the status of a failure is a guess.
         alternatives: False omits candidates and local optima that cost more than the best one, which takes 0.3 to 0.5
             of the time; `alternatives` then contains only what was found on the way.
+        barrier_tolerance: with the proximity weight 0, largest proximity cost that remains, as a fraction of the cost.
 
     Returns:
         An `Optimum`; if nothing is certified, its status is the reason.
@@ -198,18 +196,11 @@ def find_optimum(
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
-    search = LocalOptima(scenario, problem, ALTERNATIVES_BUDGET * candidates if alternatives else 0.0)
-    grids = Grids(
-        cache(partial(Lattice, scenario)),
-        cache(partial(plane_lattice, scenario)),
-        cache(partial(is_connected, scenario)),
-    )
     effort = Effort(candidates, thorough, alternatives)
-    failed = _search(search, grids, effort)
-    if not search.certified and search.closed_places:  # a closed place may block the only path
-        search.reopen_places()
-        failed = _search(search, grids, effort)
-    return _result(search) if failed is None else as_optimum(failure(problem, failed))
+    optima, failed = _search(scenario, problem, effort)
+    if optima is None or (failed is not None and not optima.certified):
+        return as_optimum(failure(problem, failed or Status.NO_PATH))
+    return _result(optima, barrier_tolerance, alternatives)
 
 
 def find_reached_optimum(
@@ -276,47 +267,61 @@ def shortest_horizon(scenario: Scenario) -> float | None:
     return min(math.ceil(10 * high) / 10, MAX_MAGNITUDE)
 
 
-def _search(search: LocalOptima, grids: Grids, effort: Effort) -> Status | None:
-    """Search the lattices until a better path is unlikely; return the reason of a failure, or None."""
-    scenario, thorough = search.scenario, effort.thorough
-    if math.dist(scenario.start[:2], scenario.goal[:2]) > LONG_DISTANCE:
-        return _search_plane(search, grids, thorough)
-    shortest_time, cropped = np.inf, False
-    for index, (refinement, margin) in enumerate(LATTICES[: None if thorough else 1]):
-        if index > 0 and margin is not None and not search.is_in_time:
-            continue  # a margin helps only against collisions
-        lattice = grids.lattice(refinement, margin).without(search.closed_places)
-        search.reset_failure_budget()
-        found: CandidateSearch | None = None
-        closed = search.closed_places.copy()
-        for number in range(MAX_FIRST_ROUNDS if index == 0 else MAX_ROUNDS):
-            if number >= MAX_ROUNDS and (search.certified or not search.is_in_time):
-                break
-            if found is None:
-                found = CandidateSearch(lattice, partial=_is_partial(lattice, effort))
-            batch, last = _add(search, found, effort)
-            if not batch:
-                break
-            shortest_time = min(shortest_time, *(_shortest_time(c, scenario) for c in batch))
-            if not thorough:
-                break
-            # A lattice with a margin lacks passages that may be better.
-            if search.certified and margin is None and found.suffices(search.best.cost, last):
-                if not _omits(lattice, effort):
-                    search.add(_trajectories(found.take_elsewhere(N_ELSEWHERE)))
-                return None
-            if search.closed_places != closed:  # other candidates would use the same passage
-                closed = search.closed_places.copy()
-                lattice, found = lattice.without(search.closed_places), None
-        cropped = lattice.cropped
-        if cropped and shortest_time == np.inf:
+def _search(
+    scenario: Scenario, problem: OptimalControlProblem, effort: Effort
+) -> tuple[LocalOptima | None, Status | None]:
+    """Search the lattices until a better path is unlikely.
+
+    Returns:
+        The local optima, None if no lattice contains a path; and the reason of a failure, None if there is none.
+
+    """
+    optima, shortest_time = None, np.inf
+    for lattice in _lattices(scenario, effort.thorough):
+        if lattice.is_whole and optima is not None and optima.certified:
             break
+        energy = first_energy(lattice)
+        if energy > 0.0:
+            if optima is None:
+                budget = ALTERNATIVES_BUDGET * effort.candidates if effort.alternatives else 0.0
+                optima = LocalOptima(scenario, problem, energy, budget)
+            optima.reset_failure_budget()
+            found = _candidate_search(lattice.with_weight(optima.problem.proximity_weight), energy, effort)
+            for _ in range(1 if lattice.is_whole or not effort.thorough else MAX_ROUNDS):
+                batch, last = _add(optima, found, effort)
+                if not batch:
+                    break
+                shortest_time = min(shortest_time, *(_shortest_time(c, scenario) for c in batch))
+                if optima.certified and found.suffices(optima.best.cost, last):
+                    if not _omits(lattice, effort) and not lattice.is_whole:
+                        optima.add(_trajectories(found.take_elsewhere(N_ELSEWHERE)))
+                    return optima, None
         # Lattice paths may lead through passages that are slightly too narrow, so this is checked separately.
-        if thorough and not search.certified and not grids.connected():
-            return Status.NO_PATH
-    if cropped and not search.certified:  # the path may leave the surroundings of start and goal
-        return _search_plane(search, grids, thorough)
-    return _reason(search, shortest_time)
+        if effort.thorough and (optima is None or not optima.certified) and not is_connected(scenario):
+            return optima, Status.NO_PATH
+    horizon = math.inf if scenario.horizon is None else scenario.horizon
+    if shortest_time == np.inf:
+        return optima, Status.NO_PATH
+    return optima, Status.HORIZON_TOO_SHORT if shortest_time > horizon else None
+
+
+def _lattices(scenario: Scenario, thorough: bool) -> Iterator[Lattice]:
+    """Yield the lattices to search: of the surroundings of start and goal, and where necessary others."""
+    if math.dist(scenario.start[:2], scenario.goal[:2]) > LONG_DISTANCE:
+        yield plane_lattice(scenario)
+        return
+    first = Lattice(scenario)
+    yield first
+    if first.cropped:  # the path may leave the surroundings of start and goal
+        yield plane_lattice(scenario)
+    elif thorough:  # a passage or a short path may need smaller cells
+        yield Lattice(scenario, REFINEMENT)
+
+
+def _candidate_search(lattice: Lattice, energy: float, effort: Effort) -> CandidateSearch:
+    if lattice.is_whole:
+        return PlaneSearch(lattice, energy=energy)
+    return CandidateSearch(lattice, partial=_is_partial(lattice, effort), energy=energy)
 
 
 def _add(search: LocalOptima, found: CandidateSearch, effort: Effort) -> tuple[list[Candidate], float]:
@@ -327,6 +332,10 @@ def _add(search: LocalOptima, found: CandidateSearch, effort: Effort) -> tuple[l
 
     """
     count = effort.candidates * (1 if found.lattice.moves.rotating else NOT_ROTATING_FACTOR)
+    if found.lattice.is_whole:
+        batch = found.take(N_PLANE_PATHS, LATTICE_ERROR * found.cheapest)
+        search.add(_trajectories(batch))
+        return batch, math.inf
     first = found.take(min(N_FIRST, count), found.limit) if _omits(found.lattice, effort) else []
     if not first:
         batch = found.take(count)
@@ -358,53 +367,20 @@ def _omits(lattice: Lattice, effort: Effort) -> bool:
     return not effort.alternatives and lattice.moves.rotating
 
 
-def _search_plane(search: LocalOptima, grids: Grids, thorough: bool) -> Status | None:
-    """Search a large arena for shortest paths in the plane; return the reason of a failure, or None."""
-    scenario, shortest_time = search.scenario, np.inf
-    for margin in PLANE_MARGINS[: None if thorough else 1]:
-        lattice = grids.plane(margin).without(search.closed_places)
-        for _ in range(MAX_ROUNDS):
-            search.reset_failure_budget()
-            closed, cheapest = search.closed_places.copy(), np.inf
-            for candidate in islice(PlaneSearch(lattice).candidates(), N_PLANE_PATHS):
-                cheapest = min(cheapest, candidate.cost)
-                if search.certified and candidate.cost > LATTICE_ERROR * cheapest:
-                    break
-                shortest_time = min(shortest_time, _shortest_time(candidate, scenario))
-                search.add([Trajectory(candidate.times, candidate.poses)])
-            if search.closed_places == closed or not thorough:
-                break
-            lattice = lattice.without(search.closed_places)
-        if search.certified:
-            return None
-        if thorough and not grids.connected():
-            return Status.NO_PATH
-    return _reason(search, shortest_time)
-
-
 def _shortest_time(candidate: Candidate, scenario: Scenario) -> float:
     """Return the duration (s) of a path at the limits of the robot; 0 with a free horizon, which is never too short."""
     return 0.0 if scenario.horizon is None else float(shortest_durations(candidate.poses, scenario).sum())
 
 
-def _reason(search: LocalOptima, shortest_time: float) -> Status | None:
-    """Return the reason of a failure, or None if there is another one or none."""
-    if search.certified:
-        return None
-    if shortest_time == np.inf:
-        return Status.NO_PATH
-    horizon = search.scenario.horizon
-    return Status.HORIZON_TOO_SHORT if horizon is not None and shortest_time > horizon else None
-
-
-def _result(search: LocalOptima) -> Optimum:
+def _result(optima: LocalOptima, tolerance: float, alternatives: bool) -> Optimum:
     """The best extremal with its alternatives, or the most informative failure."""
-    search.solve_colliding()
-    if not search.certified:
-        return as_optimum(search.best_failure)
-    best, *others = sorted(search.certified, key=lambda extremal: extremal.cost)
-    alternatives = tuple(map(as_optimum, others))
-    return replace(as_optimum(best), alternatives=alternatives, doubts=search.doubts(best.cost))
+    if not optima.certified:
+        worst = optima.best_failure
+        return as_optimum(failure(optima.problem, Status.STALLED) if worst is None else worst)
+    doubts = optima.doubts(optima.best.cost)
+    best, *others = follow_best(optima.certified, optima.scenario.cost.proximity_weight, tolerance, alternatives)
+    found = tuple(map(as_optimum, others)) if best.success else ()
+    return replace(as_optimum(best), alternatives=found, doubts=doubts)
 
 
 def as_optimum(extremal: Extremal) -> Optimum:

@@ -16,17 +16,18 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
+from leapnav.experts.hard_limits import follow_best
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.search.candidates import CandidateSearch
+from leapnav.experts.search.candidates import CandidateSearch, first_energy
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.solvers.initial_paths import local_minima
 
-# Refinement, margin (m), maximum cost relative to the first candidate, and number of candidates of the lattices.
-LATTICES = ((1, None, 1.6, 80), (2, None, 1.4, 80), (1, 0.05, 1.6, 40))
+# Refinement, maximum cost relative to the first candidate, and number of candidates of the lattices.
+LATTICES = ((1, 1.6, 80), (2, 1.4, 80))
 N_VIA_POINTS, VIA_REACH = 100, 4.0  # number of points, maximum cost relative to the first candidate
 N_STEERED = 40  # paths along the positions of others, with random headings: all driving modes
 N_CONTROL_STARTS, CONTROL_INTERVALS = 16, 64
@@ -81,26 +82,31 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
         cost = optimum.cost if optimum.success else math.inf
     problem = OptimalControlProblem.from_scenario(scenario)
     rng = np.random.default_rng(seed)
-    search = LocalOptima(scenario, problem)
     best, source, tried = cost, None, 0
-    paths: list[Trajectory] = []
+    first = Lattice(scenario)
+    search = LocalOptima(scenario, problem, first_energy(first))
 
     def record(source_name: str, count: int) -> None:
         nonlocal best, source, tried
         tried += count
         search.reset_failure_budget()
-        search.solve_colliding()
-        if search.certified and search.best.cost < best:
-            best, source = search.best.cost, source_name
+        if search.certified:
+            found = follow_best(search.certified, scenario.cost.proximity_weight, alternatives=False)[0]
+            if found.success and found.cost < best:
+                best, source = found.cost, source_name
 
-    for refinement, margin, reach, count in LATTICES:
-        found = CandidateSearch(Lattice(scenario, refinement, margin), reach).candidates()
+    paths: list[Trajectory] = []
+    for refinement, reach, count in LATTICES:
+        lattice = first if refinement == 1 else Lattice(scenario, refinement)
+        found = CandidateSearch(lattice.with_weight(search.problem.proximity_weight), reach).candidates()
         paths += [Trajectory(candidate.times, candidate.poses) for candidate in islice(found, count)]
     search.add(paths)
     record("lattice", len(paths))
     if not paths:
         return Opinion(scenario.name, cost, best, None, 0, 0)
-    through = CandidateSearch(Lattice(scenario), VIA_REACH).random_candidates(N_VIA_POINTS, rng)
+    through = CandidateSearch(first.with_weight(search.problem.proximity_weight), VIA_REACH).random_candidates(
+        N_VIA_POINTS, rng
+    )
     via = [Trajectory(candidate.times, candidate.poses) for candidate in through]
     search.add(via)
     record("via points", len(via))
@@ -108,14 +114,15 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     steered = [_steered(tracks[k], rng) for k in rng.integers(len(tracks), size=N_STEERED)]
     search.add(steered)
     record("driving modes", len(steered))
-    timed = problem.with_horizon(problem.horizon_of(paths[0]))
+    timed = search.problem.with_horizon(problem.horizon_of(paths[0]))
     minima = [path for _, path in local_minima(timed, CONTROL_INTERVALS, N_CONTROL_STARTS)]
     search.add(minima)
     record("controls", len(minima))
     if find_spec("casadi") is not None:
         count = _add_ipopt(search, scenario, [*paths[: N_IPOPT_GUESSES // 2], *steered[: N_IPOPT_GUESSES // 2]])
         record("IPOPT", count)
-    return Opinion(scenario.name, cost, best, source, tried, len(search.doubts(best)))
+    doubts = search.doubts(search.best.cost) if search.certified else ()
+    return Opinion(scenario.name, cost, best, source, tried, len(doubts))
 
 
 def verify_bank(
@@ -173,7 +180,7 @@ def _add_ipopt(search: LocalOptima, scenario: Scenario, paths: list[Trajectory])
     from leapnav.experts.search.ipopt import Transcription
 
     transcription = Transcription(scenario, search.problem, IPOPT_INTERVALS)
-    lift = Lifting(scenario, search.problem)
+    lift = Lifting(scenario, search.problem, search.problem.proximity_weight)
     for path in paths:
         lifted = lift(path)
         if lifted is None:

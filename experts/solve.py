@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import islice
 from typing import Any, Literal
 
@@ -18,16 +17,18 @@ from leapnav.envs.utils.validation import (
     check_integer,
     check_positive,
 )
+from leapnav.experts.hard_limits import BARRIER_TOLERANCE, follow_limit, softened
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
 from leapnav.experts.search.initial_guess import initial_guess
 from leapnav.experts.solvers.collocation import collocation
-from leapnav.experts.solvers.initial_paths import initial_paths
+from leapnav.experts.solvers.initial_paths import first_barrier_weight, initial_paths
 from leapnav.experts.solvers.leapfrog import leapfrog
 from leapnav.experts.solvers.multiple_shooting import multiple_shooting
-from leapnav.experts.solvers.nodes import MIN_SEGMENTS, SolverOptions
+from leapnav.experts.solvers.nodes import SolverOptions, path_of
 from leapnav.experts.solvers.single_shooting import single_shooting
+from leapnav.experts.transcription.direct import mean_running_cost
 
 Method = Literal["single_shooting", "multiple_shooting", "leapfrog", "collocation"]
 METHODS: dict[str, Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal]] = {
@@ -38,7 +39,6 @@ METHODS: dict[str, Callable[[OptimalControlProblem, Trajectory, SolverOptions], 
 }
 # Without a guess, at most this number of initial paths is solved, until one costs more than the best by this fraction.
 MAX_INITIAL_PATHS, SIMILAR_COST = 4, 0.05
-POINTS_PER_SEGMENT = 8  # at which an extremal is sampled if it is the initial guess
 
 
 def solve(
@@ -52,11 +52,17 @@ def solve(
     polish: bool = True,
     update: Literal["mean_time", "half_cost"] = "mean_time",
     order: Literal["sequential", "red_black"] = "sequential",
+    barrier_tolerance: float = BARRIER_TOLERANCE,
     raise_on_failure: bool = False,
 ) -> Extremal:
     """Solve the boundary value problem of the minimum principle for one certified extremal.
 
     The result is an extremal close to the guess, not necessarily the global optimum; see `find_optimum`.
+
+    With hard limits (obstacles with the proximity weight 0, state bounds) or a small proximity weight, the method
+    solves the problem with a barrier weight, and its extremal is followed to the limit, see
+    `leapnav.experts.hard_limits`.
+    A problem with a `barrier_weight` of its own is solved as it is.
 
     Args:
         problem: an optimal control problem, or a scenario.
@@ -76,6 +82,7 @@ def solve(
             nodes, or at half the cost.
         order: order of the nodes in a Leapfrog sweep. "red_black" updates the nodes with odd index, which are
             independent of each other, and then those with even index.
+        barrier_tolerance: with hard limits, largest integral of the barrier as a fraction of the cost.
         raise_on_failure: raise an exception instead of returning a failure.
 
     Returns:
@@ -87,23 +94,35 @@ def solve(
 
     """
     options = _options(method, tol, max_iterations, segments, polish, update, order)
+    check_positive("barrier_tolerance", barrier_tolerance)
     ocp = as_problem(problem)
+    solver = METHODS[method]
     if guess is not None:
         ocp, path, options = _from_guess(ocp, guess, options)
-        extremal = METHODS[method](ocp, path, options)
+        extremal = solver(_softened(ocp, guess, path), path, options)
     elif ocp.horizon is None and ocp.starts_at_goal:
         extremal = failure(ocp, Status.ZERO_HORIZON)
     elif isinstance(problem, Scenario):
-        path = initial_guess(problem, ocp)
-        if path is None:
-            extremal = failure(ocp, Status.NO_PATH)
-        else:
-            extremal = METHODS[method](ocp.with_winding_of(path.states), path, options)
+        found = initial_guess(problem, ocp)
+        extremal = failure(ocp, Status.NO_PATH) if found is None else solver(*found, options)
+    elif ocp.has_hard_limits and ocp.barrier_weight == 0.0:
+        extremal = _without_guess(solver, ocp.with_barrier(first_barrier_weight(ocp)), options)
     else:
-        extremal = _without_guess(METHODS[method], ocp, options)
+        extremal = _without_guess(solver, ocp, options)
+    if extremal.success and extremal.problem.barrier_weight > ocp.barrier_weight:
+        extremal = follow_limit(extremal, ocp.proximity_weight, barrier_tolerance)
     if raise_on_failure and not extremal.success:
         raise SolveError(extremal, problem.name if isinstance(problem, Scenario) else "")
     return extremal
+
+
+def _softened(problem: OptimalControlProblem, guess: Trajectory | Extremal, path: Trajectory) -> OptimalControlProblem:
+    """Return the problem with the barrier weight that suits a guess."""
+    if problem.barrier_weight > 0.0:
+        return problem
+    if isinstance(guess, Extremal) and guess.problem.barrier_weight > 0.0:
+        return problem.with_barrier(guess.problem.barrier_weight) if problem.has_hard_limits else problem
+    return softened(problem, mean_running_cost(problem, path))
 
 
 def _without_guess(
@@ -139,18 +158,7 @@ def _from_guess(
 ) -> tuple[OptimalControlProblem, Trajectory, SolverOptions]:
     """Problem with the winding of the guess, initial path, and options."""
     if isinstance(guess, Extremal):
-        if len(guess.times) == 0:
-            raise ValueError(f"guess: the extremal has no path: {guess.status.value}")
-        n, expected = guess.states.shape[1], problem.system.n
-        if n != expected:
-            raise ValueError(f"guess: the extremal has {n} states, the problem {expected}")
-        if options.segments is None and guess.n_nodes > 2:
-            options = replace(options, segments=guess.n_nodes - 1)
-        points = POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1
-        values = guess.interpolate(np.linspace(0.0, guess.times[-1], points))
-        # If the horizons differ, time is scaled.
-        duration = float(guess.times[-1]) if problem.horizon is None else problem.horizon
-        path = Trajectory(np.linspace(0.0, duration, points), values[:, :n], values[:, n:])
+        path, options = path_of(problem, guess, options)
     elif isinstance(guess, Trajectory):
         path = _check_path(guess, problem)
     else:

@@ -53,7 +53,7 @@ def test_every_method_solves_an_easy_scenario_without_a_guess(robot, method, hor
 def test_a_free_final_motion_is_lifted(method):
     scenario = easy("dynamic_unicycle", 2.0, goal_motion=[None, None])
     problem = OptimalControlProblem.from_scenario(scenario)
-    assert initial_guess(scenario, problem).states.shape[1] == 5
+    assert initial_guess(scenario, problem)[1].states.shape[1] == 5
     assert solve(scenario, method).success
 
 
@@ -100,6 +100,6 @@ def test_the_unit_of_the_cost_does_not_matter(robot):
         if hasattr(first.robot, name):
             model[name] = factor * getattr(first.robot, name)
     second = easy(robot, 2.0, robot=model, cost={**weights, "proximity_weight": factor})
-    guesses = [initial_guess(s, OptimalControlProblem.from_scenario(s)) for s in (first, second)]
+    guesses = [initial_guess(s, OptimalControlProblem.from_scenario(s))[1] for s in (first, second)]
     np.testing.assert_allclose(guesses[0].states, guesses[1].states, atol=1e-6)
     np.testing.assert_allclose(factor * guesses[0].costates, guesses[1].costates, atol=1e-5)

@@ -6,7 +6,7 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Obstacle, Polygon, Scenario, Unicycle
-from leapnav.envs.shapes.barrier import CONTACT, MIN_EXPONENT, barrier, barrier_value, exponential
+from leapnav.envs.shapes.barrier import CONTACT, barrier
 from leapnav.envs.shapes.clearance import clearance, clearances
 from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
 from leapnav.envs.simulation.arcs import arc_point, arc_proximity, follow_arc
@@ -77,8 +77,7 @@ def test_the_barrier_function_and_its_derivatives():
     for s in np.geomspace(CONTACT * 1.001, 300.0, 2000):
         b = 1 / math.expm1(s)
         expected = b, -b * (1 + b), b * (1 + b) * (1 + 2 * b)
-        assert barrier(s, CONTACT) == pytest.approx(expected, rel=1e-13)
-        assert barrier_value(s, CONTACT) == pytest.approx(b, rel=1e-12)
+        assert barrier(s, CONTACT) == pytest.approx(expected, rel=2e-12)
     for s in (0.3, 2.0):
         h = 1e-4
         (left, right), (_, slope, bend) = (barrier(s + sign * h, CONTACT) for sign in (-1, 1)), barrier(s, CONTACT)
@@ -94,9 +93,6 @@ def test_the_barrier_continues_below_contact_as_a_polynomial_that_decreases(cont
     assert (inside[:, 1] < 0).all()
     assert (np.diff(inside[:, 0]) < 0).all()
     assert inside[:, 2] == pytest.approx(at[2], rel=1e-7)
-    assert [barrier_value(s, contact) for s in (-3.0, 0.0, contact / 2)] == [
-        barrier(s, contact)[0] for s in (-3.0, 0.0, contact / 2)
-    ]
 
 
 def test_the_cost_inside_an_obstacle_decreases_outwards():
@@ -291,17 +287,6 @@ def test_a_grid_of_obstacles_changes_nothing(count, size):
         # A skipped term is below 1e-13, and its derivatives below 10 times that, for a scale of 0.1 m.
         tolerance = 1e-12 * scale * np.array([1.0, 10.0, 10.0, 100.0, 100.0, 100.0])
         assert (np.abs(np.array(proximity(x, y, scenario.field)) - expected) <= tolerance).all()
-
-
-def test_the_exponential_function():
-    x = np.concatenate([np.linspace(MIN_EXPONENT, 0.0, 20_001), -np.geomspace(1e-9, 1.0, 20_001)])
-    found = np.array([exponential(value) for value in x])
-    np.testing.assert_allclose(found[:, 0], np.exp(x), rtol=2e-15)  # the reference is off by an ulp, too
-    np.testing.assert_allclose(found[:, 1], np.expm1(x), rtol=2e-15)
-    assert exponential(0.0) == (1.0, 0.0)
-    assert exponential(-1e30) == exponential(MIN_EXPONENT)
-    assert exponential(-1e30)[0] < 1e-300
-    assert math.isnan(exponential(math.nan)[0])
 
 
 def test_points_far_away_or_not_numbers_are_survived():

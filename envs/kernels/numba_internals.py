@@ -30,7 +30,6 @@ __all__ = [
     "carray",
     "matrix_of",
     "part_of",
-    "power_of_two",
     "scratch_buffer",
     "vector_at",
 ]
@@ -241,18 +240,6 @@ def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
 
 vector_at: Any = intrinsic(_typed_vector_at)
 """In kernels: the vector of floats at an address, of a given length, which the caller keeps alive."""
-
-
-def _typed_power_of_two(context: Any, shifted: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        bits = builder.bitcast(arguments[0], ir.IntType(64))
-        return builder.bitcast(builder.shl(bits, ir.Constant(ir.IntType(64), 52)), ir.DoubleType())
-
-    return float64(float64), generate
-
-
-power_of_two: Any = intrinsic(_typed_power_of_two)
-"""In kernels: 2^k from the float k + 1023 + 1.5 * 2^52, whose last bits become the exponent."""
 
 
 def _typed_scratch_buffer(context: Any, count: Any) -> Any:

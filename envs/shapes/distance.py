@@ -20,14 +20,14 @@ from leapnav.envs.shapes.field import ARENA, COLUMNS, POLYGON_HEAD, ROUNDING
 MIN_DISTANCE = 1e-3
 
 
-@kernel(float64(float64, float64, CONSTANT, int64))
+@kernel(float64(float64, float64, CONSTANT, int64), inline="always")
 def wall_distance(x, y, field, side):
     """Distance (m) to a wall, positive inside the arena; `side` is 0 to 3 for x_min, y_min, x_max, y_max."""
     sign = 1.0 if side < 2 else -1.0
     return sign * ((x if side % 2 == 0 else y) - field[ARENA + side])
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, float64))
+@kernel(tuple_of(*[float64] * 4)(float64, float64, float64), inline="always")
 def circle_geometry(dx, dy, radius):
     """Signed distance (m), normal (2) and curvature (1/m) for a circle.
 
@@ -41,7 +41,7 @@ def circle_geometry(dx, dy, radius):
     return distance - radius, dx * curvature, dy * curvature, curvature
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, CONSTANT, int64))
+@kernel(tuple_of(*[float64] * 4)(float64, float64, CONSTANT, int64), inline="always")
 def polygon_geometry(x, y, field, at):
     """Signed distance (m), normal (2) and curvature (1/m) for a rounded convex polygon.
 

@@ -12,12 +12,12 @@ The entries of the array are, by index:
                        length. A capsule has two edges.
     then the index in the scenario of the obstacle to which each circle and polygon belongs
     then the grid:     x, y, cell size, columns, lines, then the offset of each cell in the grid, then the
-                       cells: number of circles n, of polygons p; then x, y, r of the n circles, column by column, and
-                       the indices of the p polygons in the field
+                       cells: number of circles n, of polygons p; then the indices of these circles and polygons in
+                       the field
 
 A cell lists the obstacles that contribute to the proximity cost somewhere in it, so that the work at a point does not
-depend on the number of distant obstacles. n is a multiple of LANES; the remaining entries are circles without any
-contribution. With at most MAX_OBSTACLES_WITHOUT_GRID obstacles there is no grid, and columns and lines are 0.
+depend on the number of distant obstacles. With at most MAX_OBSTACLES_WITHOUT_GRID obstacles there is no grid, and
+columns and lines are 0.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ MAX_OBSTACLES_WITHOUT_GRID = 16  # fewer obstacles are evaluated faster one by o
 # Smallest and largest number of cells per axis. Between them, a cell is as large as this multiple of the reach of an
 # obstacle.
 MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
-LANES = 8  # doubles in a vector register of 512 bits
 FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
 
 
@@ -258,14 +257,13 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
     size = side / count
     shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
     first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
-    near_circles: list[list[int]] = [[] for _ in first]
-    near_polygons: list[list[int]] = [[] for _ in first]
+    near: list[tuple[list[int], list[int]]] = [([], []) for _ in first]
     for k, (x, y, radius) in enumerate(circles.tolist()):
         box = np.array([[x, y]]) + (radius + reach) * np.array([[-1.0], [1.0]])
         cells = _cells_in(box, low, size, shape)
         nearest = np.clip((x, y), first[cells], first[cells] + size)
         for cell in cells[np.linalg.norm(nearest - (x, y), axis=1) - radius < reach].tolist():
-            near_circles[cell].append(k)
+            near[cell][0].append(SHAPES + 3 * k)
     at = SHAPES + circles.size
     for vertices, rounding in polygons:
         rows = edge_rows(vertices)
@@ -275,9 +273,9 @@ def _pack_grid(packed: np.ndarray) -> np.ndarray:
         # distance to the polygon.
         lowest = np.minimum(rows[:, :2] * size, 0.0).sum(axis=1) - rows[:, 2]
         for cell in cells[(first[cells] @ rows[:, :2].T + lowest).max(axis=1) < distance].tolist():
-            near_polygons[cell].append(at)
+            near[cell][1].append(at)
         at += POLYGON_HEAD + rows.size
-    cells = [_pack_cell(circles[a], b) for a, b in zip(near_circles, near_polygons, strict=True)]
+    cells = [[len(some), len(others), *some, *others] for some, others in near]
     offsets = 5 + len(first) + np.cumsum([0, *map(len, cells[:-1])])
     return np.concatenate([low, [size], shape, offsets, *cells])
 
@@ -288,12 +286,3 @@ def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarra
     last = np.clip(((points.max(axis=0) - low) / size).astype(int), 0, shape - 1)
     columns, lines = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
     return (columns[:, None] * shape[1] + lines).ravel()
-
-
-def _pack_cell(circles: np.ndarray, polygons: Sequence[int]) -> np.ndarray:
-    """Return the entries of a cell with circles (n, 3) and polygons at the given indices of the field."""
-    n = -(-len(circles) // LANES) * LANES
-    columns = np.zeros((3, n))
-    columns[0] = FAR_AWAY
-    columns[:, : len(circles)] = circles.T
-    return np.concatenate([[n, len(polygons)], columns.ravel(), polygons])

@@ -13,7 +13,7 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.barrier import barrier, barrier_value
+from leapnav.envs.shapes.barrier import barrier
 from leapnav.envs.shapes.distance import circle_geometry, polygon_geometry, wall_distance
 from leapnav.envs.shapes.field import (
     CENTRE,
@@ -31,22 +31,21 @@ from leapnav.envs.shapes.field import (
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 
 
-@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, float64, float64), fastmath={"contract"})
-def barrier_term(distance, nx, ny, curvature, steepness, contact):
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT), inline="always")
+def barrier_term(distance, nx, ny, curvature, field):
     """Barrier of a distance, with gradient and Hessian.
 
     Args:
         distance: from the robot's outline (m).
         nx, ny, curvature: gradient of the distance, and curvature of its level line (1/m).
-        steepness: 1 / proximity scale (1/m).
-        contact: see `barrier`.
+        field: packed obstacle field.
 
     """
-    value, slope, bend = barrier(distance * steepness, contact)
+    steepness = 1.0 / field[1]
+    value, slope, bend = barrier(distance * steepness, field[LEAST_DISTANCE])
     slope *= steepness
-    bend *= steepness * steepness
     curl = slope * curvature
-    bend -= curl
+    bend = bend * steepness * steepness - curl
     return value, slope * nx, slope * ny, bend * nx * nx + curl, bend * nx * ny, bend * ny * ny + curl
 
 
@@ -56,77 +55,77 @@ def proximity(x, y, field):
     return disc_proximity(x, y, field[2], field)
 
 
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT, int64), inline="always")
+def _circle_term(x, y, radius, reach, field, at):
+    """Barrier of the circle at an index of the field, zero beyond `reach` (m), with gradient and Hessian."""
+    dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2] + radius
+    if dx * dx + dy * dy >= (rim + reach) ** 2:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    distance, nx, ny, curvature = circle_geometry(dx, dy, rim)
+    return barrier_term(distance, nx, ny, curvature, field)
+
+
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT, int64), inline="always")
+def _polygon_term(x, y, radius, reach, field, at):
+    """Barrier of the rounded polygon at an index of the field, zero beyond `reach` (m), with gradient and Hessian."""
+    dx, dy, rim = x - field[at + CENTRE], y - field[at + CENTRE + 1], field[at + RIM] + radius
+    if dx * dx + dy * dy < (rim + reach) ** 2:
+        distance, nx, ny, curvature = polygon_geometry(x, y, field, at)
+        if distance - radius < reach:
+            return barrier_term(distance - radius, nx, ny, curvature, field)
+    return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
 def disc_proximity(x, y, radius, field):
     """Proximity cost of a disc: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
-    k = field[0]
     reach = CUTOFF * field[1]
-    steepness, contact = 1.0 / field[1], field[LEAST_DISTANCE]
-    has_grid = field[int(field[GRID]) + 3] > 0.0
     value = gx = gy = hxx = hxy = hyy = 0.0
-    if has_grid:
-        value, gx, gy, hxx, hxy, hyy = _listed_proximity(x, y, radius, field)
     for side in range(4):
         distance = wall_distance(x, y, field, side) - radius
         if distance < reach:
             sign = 1.0 if side < 2 else -1.0
             nx, ny = (sign, 0.0) if side % 2 == 0 else (0.0, sign)
-            b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, 0.0, steepness, contact)
+            b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, 0.0, field)
             value, gx, gy = value + b, gx + bx, gy + by
             hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
-    if not has_grid:
+    cell = cell_of(x, y, field)
+    if cell == 0:
         at = SHAPES
         for _ in range(int(field[CIRCLES])):
-            dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2] + radius
+            b, bx, by, bxx, bxy, byy = _circle_term(x, y, radius, reach, field, at)
+            value, gx, gy = value + b, gx + bx, gy + by
+            hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
             at += 3
-            if dx * dx + dy * dy < (rim + reach) ** 2:
-                distance, nx, ny, curvature = circle_geometry(dx, dy, rim)
-                b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, curvature, steepness, contact)
-                value, gx, gy = value + b, gx + bx, gy + by
-                hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
         for _ in range(int(field[POLYGONS])):
-            dx, dy, rim = x - field[at + CENTRE], y - field[at + CENTRE + 1], field[at + RIM] + radius
-            if dx * dx + dy * dy < (rim + reach) ** 2:
-                distance, nx, ny, curvature = polygon_geometry(x, y, field, at)
-                b, bx, by, bxx, bxy, byy = barrier_term(distance - radius, nx, ny, curvature, steepness, contact)
-                value, gx, gy = value + b, gx + bx, gy + by
-                hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+            b, bx, by, bxx, bxy, byy = _polygon_term(x, y, radius, reach, field, at)
+            value, gx, gy = value + b, gx + bx, gy + by
+            hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
             at += POLYGON_HEAD + COLUMNS * int(field[at])
+    else:
+        first = cell + 2 + int(field[cell])
+        for i in range(cell + 2, first):
+            b, bx, by, bxx, bxy, byy = _circle_term(x, y, radius, reach, field, int(field[i]))
+            value, gx, gy = value + b, gx + bx, gy + by
+            hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+        for i in range(first, first + int(field[cell + 1])):
+            b, bx, by, bxx, bxy, byy = _polygon_term(x, y, radius, reach, field, int(field[i]))
+            value, gx, gy = value + b, gx + bx, gy + by
+            hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+    k = field[0]
     return k * value, k * gx, k * gy, k * hxx, k * hxy, k * hyy
 
 
-# The compiler vectorizes the loop over the circles and chooses the order of its sums, so the last bits depend on the
-# processor.
-@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT), fastmath={"contract", "nsz", "reassoc"})
-def _listed_proximity(x, y, radius, field):
-    """Sums of the barrier terms of the obstacles in the cell of the grid at (x, y)."""
-    steepness, contact = 1.0 / field[1], field[LEAST_DISTANCE]
-    reach = radius + CUTOFF * field[1]
-    grid = np.uint64(field[GRID])
+@kernel(int64(float64, float64, CONSTANT), inline="always")
+def cell_of(x, y, field):
+    """Index in the field of the cell of its grid at (x, y); 0 without a grid."""
+    grid = int(field[GRID])
     columns, lines = int(field[grid + 3]), int(field[grid + 4])
+    if columns == 0:
+        return 0
     column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
     line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
-    # Unsigned, because the check for negative indices, which count from the end, prevents vectorization.
-    at = grid + np.uint64(field[grid + np.uint64(5 + column * lines + line)])
-    circles, polygons = np.uint64(field[at]), np.uint64(field[at + 1])
-    at += np.uint64(2)
-    value = gx = gy = hxx = hxy = hyy = 0.0
-    for i in range(circles):
-        dx, dy = x - field[at + i], y - field[at + circles + i]
-        distance, nx, ny, curvature = circle_geometry(dx, dy, field[at + circles + circles + i] + radius)
-        b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, curvature, steepness, contact)
-        value, gx, gy = value + b, gx + bx, gy + by
-        hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
-    at += np.uint64(3) * circles
-    for i in range(polygons):
-        polygon = int(field[at + i])
-        dx, dy, rim = x - field[polygon + CENTRE], y - field[polygon + CENTRE + 1], field[polygon + RIM] + reach
-        if dx * dx + dy * dy < rim * rim:
-            distance, nx, ny, curvature = polygon_geometry(x, y, field, polygon)
-            b, bx, by, bxx, bxy, byy = barrier_term(distance - radius, nx, ny, curvature, steepness, contact)
-            value, gx, gy = value + b, gx + bx, gy + by
-            hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
-    return value, gx, gy, hxx, hxy, hyy
+    return grid + int(field[grid + 5 + column * lines + line])
 
 
 @kernel(float64(float64, float64, float64, CONSTANT))
@@ -151,23 +150,23 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
     for side in range(4):
         between = wall_distance(xb, yb, field, side) - radius
         if between < reach:
-            first += barrier_value((wall_distance(xa, ya, field, side) - radius) * steepness, contact)
-            second += barrier_value(between * steepness, contact)
-            third += barrier_value((wall_distance(xc, yc, field, side) - radius) * steepness, contact)
+            first += barrier((wall_distance(xa, ya, field, side) - radius) * steepness, contact)[0]
+            second += barrier(between * steepness, contact)[0]
+            third += barrier((wall_distance(xc, yc, field, side) - radius) * steepness, contact)[0]
     at = SHAPES
     for _ in range(int(field[CIRCLES])):
         x, y, rim = field[at], field[at + 1], field[at + 2] + radius
         at += 3
         if (xb - x) ** 2 + (yb - y) ** 2 < (rim + reach) ** 2:
-            first += barrier_value(circle_geometry(xa - x, ya - y, rim)[0] * steepness, contact)
-            second += barrier_value(circle_geometry(xb - x, yb - y, rim)[0] * steepness, contact)
-            third += barrier_value(circle_geometry(xc - x, yc - y, rim)[0] * steepness, contact)
+            first += barrier(circle_geometry(xa - x, ya - y, rim)[0] * steepness, contact)[0]
+            second += barrier(circle_geometry(xb - x, yb - y, rim)[0] * steepness, contact)[0]
+            third += barrier(circle_geometry(xc - x, yc - y, rim)[0] * steepness, contact)[0]
     for _ in range(int(field[POLYGONS])):
         x, y, rim = field[at + CENTRE], field[at + CENTRE + 1], field[at + RIM] + radius
         if (xb - x) ** 2 + (yb - y) ** 2 < (rim + reach) ** 2:
-            first += barrier_value((polygon_geometry(xa, ya, field, at)[0] - radius) * steepness, contact)
-            second += barrier_value((polygon_geometry(xb, yb, field, at)[0] - radius) * steepness, contact)
-            third += barrier_value((polygon_geometry(xc, yc, field, at)[0] - radius) * steepness, contact)
+            first += barrier((polygon_geometry(xa, ya, field, at)[0] - radius) * steepness, contact)[0]
+            second += barrier((polygon_geometry(xb, yb, field, at)[0] - radius) * steepness, contact)[0]
+            third += barrier((polygon_geometry(xc, yc, field, at)[0] - radius) * steepness, contact)[0]
         at += POLYGON_HEAD + COLUMNS * int(field[at])
     weight = field[0]
     return weight * first, weight * second, weight * third

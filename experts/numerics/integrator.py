@@ -30,7 +30,7 @@ EXTRA_A, DENSE = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(DOP8
 EXTRA_STAGES = len(EXTRA_A)
 DENSE_TERMS = 3 + len(DENSE)  # number of terms of the interpolant of order 7
 
-MAX_STEPS = 10_000
+MAX_STEPS = 1_000  # per interval; segments of extremals take 10 to 100
 MAX_VALUE = 1e14  # a state or costate beyond this has diverged
 MIN_STEP = 1e-13  # relative to the interval; smaller steps are at rounding level
 

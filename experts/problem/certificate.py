@@ -124,6 +124,8 @@ def certify(
         state_margin=margin,
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
+    if clearance is not None and clearance <= 0:  # an extremal has positive clearance; the path explains the failure
+        status = Status.COLLISION
     return replace(extremal, certificate=certificate, status=status)
 
 

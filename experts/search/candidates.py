@@ -45,7 +45,6 @@ LIMIT_MARGIN = 1.05  # duration of a step relative to the shortest, at least; th
 # Fraction of the excess cost, see REACH, up to which a partial search looks for candidates first. It contains all
 # candidates that may lead to the optimum of most scenarios (see `suffices`), and takes 2/5 of the time.
 PARTIAL = 0.2
-# Nodes within this distance (cells, heading steps) of a candidate belong to it.
 DUPLICATE_CELLS, DUPLICATE_HEADINGS = 2, 3
 # The same for `take_elsewhere`, whose paths differ by more.
 DISTINCT_CELLS, DISTINCT_HEADINGS = 4, HEADINGS // 2
@@ -88,6 +87,7 @@ class CandidateSearch:
     Args:
         lattice: the lattice.
         reach: largest cost of a candidate relative to the cheapest, see REACH.
+        energy: initial estimate of E; None for that of `first_energy`.
         partial: whether to search first for candidates that cost little more than the cheapest, and for others only
             when they are needed. The candidates are the same.
 
@@ -99,7 +99,12 @@ class CandidateSearch:
 
     """
 
-    def __init__(self, lattice: Lattice, reach: float = REACH, *, partial: bool = False) -> None:
+    # Nodes within this distance (cells, heading steps) of a candidate belong to it.
+    _cells, _headings = DUPLICATE_CELLS, DUPLICATE_HEADINGS
+
+    def __init__(
+        self, lattice: Lattice, reach: float = REACH, *, partial: bool = False, energy: float | None = None
+    ) -> None:
         self.lattice, self._reach = lattice, reach
         self._fraction = PARTIAL if partial else 1.0
         self.limit = math.inf
@@ -107,7 +112,7 @@ class CandidateSearch:
         self._marked: np.ndarray | None = None
         self._from_start = self._to_goal = Tree(np.empty(0), np.empty(0, dtype=np.int32))
         self._meetings = np.empty(0, dtype=np.int64)
-        self.energy = self._first_energy()
+        self.energy: float = first_energy(lattice) if energy is None else energy
         if self.energy == 0.0:
             return
         self._grow()
@@ -120,12 +125,19 @@ class CandidateSearch:
             return
         # Phi is large in a passage that is narrower than the robot, so the horizon alone may give E = 0, for which the
         # metric is degenerate.
-        energy = max(
+        corrected = max(
             energy_of(lengths, phi, horizon), MIN_ENERGY_FRACTION * 0.5 * (float(lengths.sum()) / horizon) ** 2
         )
-        if abs(math.log(energy / self.energy)) > MAX_LOG_ENERGY_ERROR:
-            self.energy = energy
+        if abs(math.log(corrected / self.energy)) > MAX_LOG_ENERGY_ERROR:
+            self.energy = corrected
             self._grow()
+
+    @property
+    def cheapest(self) -> float:
+        """Cost of the shortest path of the lattice; infinite if there is none."""
+        if len(self._meetings) == 0:
+            return math.inf
+        return float(self._from_start.cost[self._meetings[0]] + self._to_goal.cost[self._meetings[0]])
 
     @property
     def slack(self) -> float:
@@ -134,13 +146,13 @@ class CandidateSearch:
 
     def candidates(self) -> Iterator[Candidate]:
         """Yield distinct paths in order of cost; none if the goal cannot be reached."""
-        return self._distinct(self._mark_all(()), DUPLICATE_CELLS, DUPLICATE_HEADINGS)
+        return self._distinct(self._mark_all(()), self._cells, self._headings)
 
     def take(self, count: int, max_cost: float = math.inf) -> list[Candidate]:
         """Return the next distinct paths in order of cost: at most `count`, with at most a given cost."""
         if self._marked is None:
             self._marked = self._mark_all(())
-        following = self._distinct(self._marked, DUPLICATE_CELLS, DUPLICATE_HEADINGS, max_cost)
+        following = self._distinct(self._marked, self._cells, self._headings, max_cost)
         found = list(islice(following, count))
         self.taken += found
         return found
@@ -214,46 +226,9 @@ class CandidateSearch:
             self._mark(marked, candidate.nodes, cells, headings)
         return marked
 
-    def _first_energy(self) -> float:
-        """Estimate E from the shortest path in the plane; 0 if there is none."""
-        scenario = self.lattice.scenario
-        weight, horizon = self.lattice.weights[0], scenario.horizon
-        start, goal = scenario.start, scenario.goal
-        if horizon is None:
-            return scenario.cost.time_weight if math.isfinite(self._plane_distance(scenario.cost.time_weight)) else 0.0
-        energy = max(0.5 * weight * (math.dist(start[:2], goal[:2]) / horizon) ** 2, MIN_ENERGY)
-        for _ in range(3):
-            shortest = self._plane_distance(energy)
-            if not math.isfinite(shortest):
-                return 0.0
-            # Assumes that Phi is small compared with E, which holds once E is larger than that of the straight line.
-            length = TURNING_FACTOR * shortest / math.sqrt(2.0 * energy)
-            before, energy = energy, max(0.5 * (length / horizon) ** 2, MIN_ENERGY)
-            if abs(math.log(energy / before)) < MAX_LOG_ENERGY_ERROR:
-                break
-        return energy
-
-    def _plane_distance(self, energy: float) -> float:
-        """Return the cost of the shortest path if rotation were free; infinite if there is none."""
-        scenario, metric = self.lattice.scenario, self._metric(energy)
-        cost = cell_costs(metric, self.lattice.nodes_around(*scenario.start, metric.plane))
-        targets = self.lattice.nodes_around(*scenario.goal, metric.plane).nodes // HEADINGS
-        return float(cost[targets].min()) if len(targets) else math.inf
-
-    def _metric(self, energy: float) -> Metric:
-        """Return the metric for a given E."""
-        lattice = self.lattice
-        speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
-        fastest = math.sqrt(lattice.weights[0]) * lattice.scenario.robot.speed_limits()[0]
-        if lattice.scenario.horizon is None and fastest < math.inf:
-            # At the speed limit, which is below the optimal speed there, a path costs (c + Phi) / v + r_v v / 2 per m.
-            speed = np.where(speed > fastest, 0.5 * (speed**2 / fastest + fastest), speed)
-        plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
-        return Metric(speed, plane, lattice.cell, *lattice.weights, moves.targets, moves.points, moves.weights)
-
     def _grow(self) -> None:
         """Compute the trees from the start and from the goal, and the nodes at which they meet, in order of cost."""
-        scenario, metric = self.lattice.scenario, self._metric(self.energy)
+        scenario, metric = self.lattice.scenario, metric_of(self.lattice, self.energy)
         seeds = self.lattice.nodes_around(*scenario.start, metric.plane)
         ends = self.lattice.nodes_around(*scenario.goal, metric.plane)
         bound = cell_costs(metric, seeds)
@@ -293,6 +268,45 @@ class CandidateSearch:
         times = np.concatenate([[0.0], np.cumsum(durations)])
         cost = float(self._from_start.cost[node] + self._to_goal.cost[node])
         return Candidate(times if horizon is None else times * (horizon / times[-1]), poses, cost, nodes)
+
+
+def first_energy(lattice: Lattice) -> float:
+    """Estimate E from the shortest path in the plane; 0 if there is none."""
+    scenario = lattice.scenario
+    weight, horizon = lattice.weights[0], scenario.horizon
+    start, goal = scenario.start, scenario.goal
+    if horizon is None:
+        return scenario.cost.time_weight if math.isfinite(_plane_distance(lattice, scenario.cost.time_weight)) else 0.0
+    energy = max(0.5 * weight * (math.dist(start[:2], goal[:2]) / horizon) ** 2, MIN_ENERGY)
+    for _ in range(3):
+        shortest = _plane_distance(lattice, energy)
+        if not math.isfinite(shortest):
+            return 0.0
+        # Assumes that Phi is small compared with E, which holds once E is larger than that of the straight line.
+        length = TURNING_FACTOR * shortest / math.sqrt(2.0 * energy)
+        before, energy = energy, max(0.5 * (length / horizon) ** 2, MIN_ENERGY)
+        if abs(math.log(energy / before)) < MAX_LOG_ENERGY_ERROR:
+            break
+    return energy
+
+
+def _plane_distance(lattice: Lattice, energy: float) -> float:
+    """Return the cost of the shortest path if rotation were free; infinite if there is none."""
+    scenario, metric = lattice.scenario, metric_of(lattice, energy)
+    cost = cell_costs(metric, lattice.nodes_around(*scenario.start, metric.plane))
+    targets = lattice.nodes_around(*scenario.goal, metric.plane).nodes // HEADINGS
+    return float(cost[targets].min()) if len(targets) else math.inf
+
+
+def metric_of(lattice: Lattice, energy: float) -> Metric:
+    """Return the metric of a lattice for a given E."""
+    speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
+    fastest = math.sqrt(lattice.weights[0]) * lattice.scenario.robot.speed_limits()[0]
+    if lattice.scenario.horizon is None and fastest < math.inf:
+        # At the speed limit, which is below the optimal speed there, a path costs (c + Phi) / v + r_v v / 2 per m.
+        speed = np.where(speed > fastest, 0.5 * (speed**2 / fastest + fastest), speed)
+    plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
+    return Metric(speed, plane, lattice.cell, *lattice.weights, moves.targets, moves.points, moves.weights)
 
 
 def shortest_durations(poses: np.ndarray, scenario: Scenario) -> np.ndarray:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.experts.hard_limits import softened
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
@@ -14,7 +16,9 @@ from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 REFINEMENTS = (1, 2)  # of the lattice; smaller cells are needed only where the larger ones contain no path
 
 
-def initial_guess(scenario: Scenario, problem: OptimalControlProblem) -> Trajectory | None:
+def initial_guess(
+    scenario: Scenario, problem: OptimalControlProblem
+) -> tuple[OptimalControlProblem, Trajectory] | None:
     """Return a path in the states of the robot, with costates; None if there is no `best_path`.
 
     It is the local optimum of the direct transcription from which a search begins with multiple shooting. Where the
@@ -25,14 +29,19 @@ def initial_guess(scenario: Scenario, problem: OptimalControlProblem) -> Traject
         scenario: the scenario.
         problem: its optimal control problem.
 
+    Returns:
+        The problem whose optimum the path approximates, and the path. The problem has the winding of the path, and with
+        a small proximity weight a barrier weight, see `leapnav.experts.hard_limits`.
+
     """
-    path = best_path(scenario)
-    if path is None:
+    search = next(_searches(scenario), None)
+    if search is None:
         return None
-    search = LocalOptima(scenario, problem)
-    ((wound, direct),) = search.transcribe([path])
-    direct = search.refine(wound, direct)
-    return Trajectory(direct.times, direct.states, direct.costates)
+    candidate = next(search.candidates())
+    optima = LocalOptima(scenario, softened(problem, search.energy), search.energy)
+    wound, direct = optima.transcribe_one(Trajectory(candidate.times, candidate.poses))
+    direct = optima.refine(wound, direct)
+    return wound, Trajectory(direct.times, direct.states, direct.costates)
 
 
 def best_path(scenario: Scenario) -> Trajectory | None:
@@ -40,20 +49,20 @@ def best_path(scenario: Scenario) -> Trajectory | None:
 
     If the lattice covers only a part of the arena and contains no path, a grid of positions covers all of it.
     """
-    return next(_best_paths(scenario), None)
+    for search in _searches(scenario):
+        candidate = next(search.candidates())
+        return Trajectory(candidate.times, candidate.poses)
+    return None
 
 
-def _best_paths(scenario: Scenario) -> Iterator[Trajectory]:
-    """Yield the best path of each lattice that contains one."""
+def _searches(scenario: Scenario) -> Iterator[CandidateSearch]:
+    """Yield the search of each lattice that contains a path."""
     for refinement in REFINEMENTS:
         lattice = Lattice(scenario, refinement)
-        yield from _first(CandidateSearch(lattice, partial=True))
+        search = CandidateSearch(lattice, partial=True)
+        if search.cheapest < math.inf:
+            yield search
         if lattice.cropped:
-            yield from _first(PlaneSearch(plane_lattice(scenario, None)))
-
-
-def _first(search: CandidateSearch) -> Iterator[Trajectory]:
-    """Yield the best candidate of a search, if it has one."""
-    candidate = next(search.candidates(), None)
-    if candidate is not None:
-        yield Trajectory(candidate.times, candidate.poses)
+            whole = PlaneSearch(plane_lattice(scenario))
+            if whole.cheapest < math.inf:
+                yield whole

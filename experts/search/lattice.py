@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.ndimage import label
 
 from leapnav.envs.robots.moves import ANGLES, HEADINGS, Moves
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.field import with_weight
 from leapnav.envs.shapes.sampling import PointGrid, sample_grid
 from leapnav.experts.search.shortest_paths import Nodes
 
@@ -26,29 +26,9 @@ MIN_CELL, MAX_CELL, CELLS_PER_DISTANCE = 0.05, 0.2, 20
 MIN_SPACING, FIRST_POINTS, MAX_POINTS = 0.02, 150, 5000
 CROSS, SQUARE = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]]), np.ones((3, 3), dtype=int)  # neighbours of a point
 MAX_CELLS = 250  # per side; larger arenas have larger cells
-# Largest depth in an obstacle (robot radii) of a lattice point: a passage that just admits the robot may lie between
-# two points, but no wall is thinner than the robot.
-TOLERATED_DEPTH = 0.4
 RELEVANT_DISTANCE = 12.0  # proximity scales, beyond which the proximity cost of an obstacle is negligible
 MIN_TURN_LENGTH = 0.3  # smallest cost of 1 rad, as a distance in cells
 SEED_ANGLE = math.radians(30)  # largest difference between the heading of a pose and that of a node next to it
-
-
-@dataclass(frozen=True)
-class Place:
-    """A place at which a path was in collision.
-
-    Attributes:
-        x, y: position (m).
-        clearance: clearance (m) of the path there; negative.
-        wide: whether a larger area around the place is to be avoided.
-
-    """
-
-    x: float
-    y: float
-    clearance: float
-    wide: bool = False
 
 
 class Lattice:
@@ -57,7 +37,6 @@ class Lattice:
     Args:
         scenario: the scenario.
         refinement: factor by which the cells are smaller than usual.
-        margin: smallest clearance (m) of a lattice point; None tolerates a small depth, see TOLERATED_DEPTH.
         max_cells: largest number of cells per side.
         whole: whether to cover all obstacles of a large arena, with large cells if necessary.
 
@@ -69,9 +48,11 @@ class Lattice:
         lines: number of cells in y.
         phi: (K, 2 columns - 1, 2 lines - 1), proximity cost on the half-cell grid, infinite where the robot cannot be;
             one layer for all headings, or for a footprint of several discs one for each heading.
+        weight: proximity weight of phi.
         weights: weights of the squared speed and turn rate in the metric.
         moves: motion primitives of the robot.
         cropped: whether the lattice covers only a part of the arena.
+        is_whole: whether it covers all obstacles of a large arena.
 
     """
 
@@ -79,15 +60,12 @@ class Lattice:
         self,
         scenario: Scenario,
         refinement: int = 1,
-        margin: float | None = None,
         *,
         max_cells: int = MAX_CELLS,
         whole: bool = False,
     ) -> None:
-        self.scenario = scenario
+        self.scenario, self.is_whole = scenario, whole
         robot, discs = scenario.robot, scenario.discs
-        self._radius = float(discs[:, 1].min())
-        depth = -TOLERATED_DEPTH * self._radius if margin is None else margin
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
         cell = min(max(distance / CELLS_PER_DISTANCE, MIN_CELL), MAX_CELL, robot.max_lattice_cell()) / refinement
@@ -113,7 +91,11 @@ class Lattice:
         right, above = int((x_max - x) / self.cell) + border, int((y_max - y) / self.cell) + border
         self.origin = (x - left * self.cell, y - below * self.cell)
         self.columns, self.lines = left + right + 1, below + above + 1
-        band = max(RELEVANT_DISTANCE * scenario.cost.proximity_scale, 2.0 * depth, 0.1)
+        band = max(RELEVANT_DISTANCE * scenario.cost.proximity_scale, 0.1)
+        # A passage that just admits the robot may lie between the points, half a diagonal of their squares away.
+        depth = -math.sqrt(0.5) * self.cell / 2
+        self.weight = scenario.cost.proximity_weight
+        field = with_weight(scenario.field, 1.0)
         grid = PointGrid(*self.origin, self.cell / 2, 2 * self.columns - 1, 2 * self.lines - 1)
         outside = np.zeros((grid.columns, grid.lines), dtype=bool)
         for side in (np.s_[: 2 * border], np.s_[-2 * border :]):
@@ -124,33 +106,18 @@ class Lattice:
             for offset, radius in discs.tolist():
                 shift = offset * math.cos(heading), offset * math.sin(heading)
                 moved = grid._replace(x0=grid.x0 + shift[0], y0=grid.y0 + shift[1])
-                phi, clearance = sample_grid(scenario.field, radius, moved, band)
+                phi, clearance = sample_grid(field, radius, moved, band)
                 phi[clearance < depth] = np.inf
                 total += phi
             total[outside] = np.inf
             layers.append(total)
-        self.phi = np.stack(layers)
+        self._unit = np.stack(layers)
+        self.phi = _weighted(self._unit, self.weight)
 
-    def without(self, places: Sequence[Place]) -> Lattice:
-        """Return the lattice with some places closed, in a radius that blocks a passage narrower than the robot."""
-        if not places:
-            return self
+    def with_weight(self, weight: float) -> Lattice:
+        """Return the lattice with another proximity weight."""
         lattice = copy(self)
-        lattice.phi = self.phi.copy()
-        spacing = self.cell / 2
-        ends = np.array([self.scenario.start[:2], self.scenario.goal[:2]])
-        x, y = (self.origin[axis] + spacing * np.arange(count) for axis, count in enumerate(self.phi.shape[1:]))
-        for place in places:
-            radius = TOLERATED_DEPTH * self._radius + spacing
-            if place.wide:  # the centre line of a passage next to it is farther away than this
-                radius = max(radius, 2.0 * self._radius)
-            if np.hypot(*(ends - (place.x, place.y)).T).min() <= radius + 2 * self.cell:
-                continue  # every path passes the start and the goal
-            columns, lines = np.abs(x - place.x) <= radius, np.abs(y - place.y) <= radius
-            is_close = np.hypot(x[columns, None] - place.x, y[lines] - place.y) <= radius
-            closed = np.ix_(columns, lines)
-            for layer in lattice.phi:
-                layer[closed] = np.where(is_close, np.inf, layer[closed])
+        lattice.weight, lattice.phi = weight, _weighted(self._unit, weight)
         return lattice
 
     def metric_lengths(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,6 +171,11 @@ class Lattice:
         if np.abs(poses[1:, 2] - poses[:-1, 2]).max() >= np.pi:
             poses[:, 2] = np.unwrap(poses[:, 2])
         return poses
+
+
+def _weighted(unit: np.ndarray, weight: float) -> np.ndarray:
+    """Return the proximity cost of a weight from that of the weight 1, infinite where the robot cannot be."""
+    return weight * unit if weight > 0.0 else np.where(np.isfinite(unit), 0.0, np.inf)
 
 
 def is_connected(scenario: Scenario) -> bool:
@@ -280,7 +252,7 @@ def _occupied(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
     Outside of it there is nothing to avoid, and no shortest path leaves it.
     """
-    outlines = [obstacle.shape.outline() for obstacle in scenario.obstacles]
+    outlines = [part.outline() for obstacle in scenario.obstacles for part in obstacle.shape.parts()]
     points = np.concatenate([*outlines, [scenario.start[:2], scenario.goal[:2]]])
     margin = RELEVANT_DISTANCE * scenario.cost.proximity_scale + 2.0 * float(np.abs(scenario.discs).sum(axis=1).max())
     x_min, y_min, x_max, y_max = scenario.arena

@@ -26,11 +26,12 @@ class Lifting:
     Args:
         scenario: the scenario.
         problem: its optimal control problem.
+        relaxed_weight: proximity weight of the relaxed barrier, see `optimise`.
 
     """
 
-    def __init__(self, scenario: Scenario, problem: OptimalControlProblem) -> None:
-        self._scenario, self._problem = scenario, problem
+    def __init__(self, scenario: Scenario, problem: OptimalControlProblem, relaxed_weight: float) -> None:
+        self._scenario, self._problem, self._relaxed_weight = scenario, problem, relaxed_weight
         self._companion: OptimalControlProblem | None = None
         self._seen: list[np.ndarray] = []
         robot = scenario.robot
@@ -42,7 +43,8 @@ class Lifting:
             else:
                 unicycle = Unicycle(footprint=robot.footprint, **limits)
             update = {"robot": unicycle, "start_motion": None, "goal_motion": None}
-            self._companion = OptimalControlProblem.from_scenario(scenario.model_copy(update=update))
+            companion = OptimalControlProblem.from_scenario(scenario.model_copy(update=update))
+            self._companion = companion.with_barrier(problem.barrier_weight)
 
     def __call__(self, path: Trajectory) -> Trajectory | None:
         """Return the path in the robot's states, or None for a duplicate of an earlier path."""
@@ -50,7 +52,7 @@ class Lifting:
             return path
         if self._companion is not None:
             companion = self._companion.with_winding_of(path.states)
-            direct = optimise(companion, discretise(companion, path))
+            direct = optimise(companion, discretise(companion, path), relaxed_weight=self._relaxed_weight)
             path = Trajectory(direct.times, direct.states)
             shape = path.resample(COMPARED_FRACTIONS * path.times[-1]).states
             if any(np.abs(shape - other).max() < DUPLICATE_DISTANCE for other in self._seen):

@@ -7,13 +7,11 @@ initial guess, and a grid of positions may have many more cells.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from leapnav.envs.robots.moves import HEADINGS
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.experts.search.candidates import Candidate, CandidateSearch, Tree, cell_costs
+from leapnav.experts.search.candidates import CandidateSearch, Tree, cell_costs, metric_of
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import plane_parents
 
@@ -22,21 +20,21 @@ MAX_CELLS, MAX_CELLS_OF_HEADINGS = 1024, 384
 DISTINCT_DISTANCE = 2.0  # m, by which the paths differ somewhere
 
 
-def plane_lattice(scenario: Scenario, margin: float | None) -> Lattice:
-    """Return the lattice of a whole arena for `PlaneSearch`; see `Lattice` for the margin (m)."""
+def plane_lattice(scenario: Scenario) -> Lattice:
+    """Return the lattice of a whole arena for `PlaneSearch`."""
     cells = MAX_CELLS if scenario.robot.footprint is None else MAX_CELLS_OF_HEADINGS
-    return Lattice(scenario, margin=margin, max_cells=cells, whole=True)
+    return Lattice(scenario, max_cells=cells, whole=True)
 
 
 class PlaneSearch(CandidateSearch):
     """Search of the positions of a lattice for candidate paths, whose nodes are cells without a heading."""
 
-    def candidates(self) -> Iterator[Candidate]:
-        """Yield distinct paths in order of cost; none if the goal cannot be reached."""
-        return self._distinct(self._mark_all(()), max(round(DISTINCT_DISTANCE / self.lattice.cell), 1), 0)
+    def __init__(self, lattice: Lattice, *, energy: float | None = None) -> None:
+        self._cells, self._headings = max(round(DISTINCT_DISTANCE / lattice.cell), 1), 0
+        super().__init__(lattice, energy=energy)
 
     def _grow(self) -> None:
-        scenario, metric = self.lattice.scenario, self._metric(self.energy)
+        scenario, metric = self.lattice.scenario, metric_of(self.lattice, self.energy)
         trees = []
         for pose in (scenario.start, scenario.goal):
             cost = cell_costs(metric, self.lattice.nodes_around(*pose, metric.plane))

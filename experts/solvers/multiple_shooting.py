@@ -12,7 +12,9 @@ from leapnav.experts.solvers.newton import MARGIN, segment_growth, solve_nodes
 from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
 from leapnav.experts.solvers.outcome import KERNEL_STATUS
 
-ACCURACY = 0.1  # tolerance of the integrator relative to the tolerance of Newton's method
+# Tolerance of the integrator relative to the tolerance of Newton's method, and where the certificate does not confirm
+# the result: steps across a discontinuous curvature, at the vertices of polygons, have larger errors than estimated.
+ACCURACY, FINE_ACCURACY = 0.1, 1e-3
 # Largest growth of the sensitivities over a segment; beyond it Newton's method loses half of its digits.
 MAX_GROWTH = 1e4
 MAX_PIECES = 8  # pieces into which a segment is divided
@@ -56,7 +58,7 @@ def confirm(
     extremal = certify(problem, times, nodes, status, history, evaluations)
     if extremal.status is not Status.NOT_CERTIFIED:
         return extremal
-    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations, predict=False)
+    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations, False, FINE_ACCURACY)
     return certify(problem, times, nodes, status, history + rows, evaluations + count)
 
 
@@ -67,6 +69,7 @@ def polish(
     tol: float,
     max_iterations: int,
     predict: bool = True,
+    accuracy: float = ACCURACY,
 ) -> tuple[Status, tuple[Iteration, ...], int]:
     """Apply Newton's method of multiple shooting to nodes, in place.
 
@@ -78,6 +81,7 @@ def polish(
         max_iterations: largest number of Newton steps.
         predict: whether the evaluation of the last iterate may be skipped if quadratic convergence predicts its
             residual.
+        accuracy: tolerance of the integrator relative to `tol`.
 
     Returns:
         Status, one `Iteration` per iterate, and the number of evaluations of the flow.
@@ -86,7 +90,7 @@ def polish(
     arrays = problem.arrays
     costs = np.empty(len(times) - 1)
     log = np.zeros((max_iterations + 1, 3))
-    newton = NewtonOptions(MARGIN * tol, MARGIN * tol * ACCURACY, max_iterations, predict)
+    newton = NewtonOptions(MARGIN * tol, MARGIN * tol * accuracy, max_iterations, predict)
     code, iterations, _, evaluations = solve_nodes(
         arrays.flow, times, nodes, arrays.start, arrays.end, newton, costs, log
     )

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 
 MIN_SEGMENTS, MAX_SEGMENTS = 8, 128  # by default
+POINTS_PER_SEGMENT = 8  # at which an extremal is sampled if it is the initial guess
 
 
 @dataclass(frozen=True)
@@ -67,3 +69,26 @@ def start_nodes(
 def default_segments(path: Trajectory) -> int:
     """Return the larger of one segment per 0.5 s and one per two points of a lattice path (0.4 to 0.7 m)."""
     return int(np.clip(max(len(path.times) / 2, path.times[-1] / 0.5), MIN_SEGMENTS, MAX_SEGMENTS))
+
+
+def path_of(
+    problem: OptimalControlProblem, extremal: Extremal, options: SolverOptions
+) -> tuple[Trajectory, SolverOptions]:
+    """Return an extremal as the initial path of a problem, and options with its number of segments.
+
+    Raises:
+        ValueError: the extremal has no path, or another number of states.
+
+    """
+    if len(extremal.times) == 0:
+        raise ValueError(f"guess: the extremal has no path: {extremal.status.value}")
+    n, expected = extremal.states.shape[1], problem.system.n
+    if n != expected:
+        raise ValueError(f"guess: the extremal has {n} states, the problem {expected}")
+    if options.segments is None and extremal.n_nodes > 2:
+        options = replace(options, segments=extremal.n_nodes - 1)
+    points = POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1
+    values = extremal.interpolate(np.linspace(0.0, extremal.times[-1], points))
+    # If the horizons differ, time is scaled.
+    duration = float(extremal.times[-1]) if problem.horizon is None else problem.horizon
+    return Trajectory(np.linspace(0.0, duration, points), values[:, :n], values[:, n:]), options

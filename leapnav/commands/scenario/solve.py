@@ -107,9 +107,9 @@ def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
     extremals, seconds = {}, {}
     for method in get_args(Method):
         # The first solve loads or compiles the kernels, so that the second one measures the method alone.
-        solve(scenario, method=method, guess=guess)
+        solve(scenario, method=method, guess=guess[1])
         start = perf_counter()
-        extremals[method] = solve(scenario, method=method, guess=guess)
+        extremals[method] = solve(scenario, method=method, guess=guess[1])
         seconds[method] = perf_counter() - start
     print(f"{scenario.name}: every method from the best path of the lattice search, improved by direct transcription")
     _print_comparison(extremals, seconds)
