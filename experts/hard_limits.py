@@ -120,8 +120,8 @@ def follow_best(
 
 
 def _weight(problem: OptimalControlProblem) -> float:
-    """Return the weight of the barrier, or of the proximity cost that is larger."""
-    return max(problem.barrier_weight, problem.proximity_weight)
+    """Return the weight of the barrier; without a barrier, the proximity weight."""
+    return problem.barrier_weight or problem.proximity_weight
 
 
 class _Continuation:
