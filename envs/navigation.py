@@ -160,6 +160,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `split` | `"train"` | the family's included bank, `"train"` (400 scenarios) or `"test"` (200), with known optima; `"fresh"` samples a new scenario for each episode (2 ms); the default is `"fresh"` for the family `"all"` |
     | `bank` | None | a `ScenarioBank` or its file, see `leapnav bank build` |
     | `horizon` | None | `"fixed"` or `"free"`; None for that of the scenario or the bank, otherwise `"fixed"` |
+    | `obstacles` | None | `"cost"` or `"hard"`, for scenarios with the proximity weight 0; None for that of the scenario or the bank, otherwise `"cost"`. Included banks with `"hard"` have the split `"test"` only |
     | `robot` | None | name of the robot's model, a dict of its fields with `model`, or a `RobotModel`; None for that of the scenario or the bank, otherwise the unicycle. Without an included bank for the robot, scenarios are fresh |
     | `observation` | `"lidar"` | `"lidar"`, `"state"`, `"map"` or `"geodesic"` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |
@@ -201,6 +202,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
         robot: RobotModel | Mapping[str, Any] | str | None = None,
         horizon: str | None = None,
+        obstacles: str | None = None,
         observation: str = "lidar",
         reward: str = "cost",
         actuation: str = "velocity",
@@ -221,7 +223,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         map_vertices: int = 8,
         render_mode: str | None = None,
     ) -> None:
-        self._source = ScenarioSource(family, scenario, split, bank, robot, horizon)
+        self._source = ScenarioSource(family, scenario, split, bank, robot, horizon, obstacles)
         self.settings = EnvironmentSettings(
             robot=self._source.robot.model,
             horizon=self._source.horizon,

@@ -25,6 +25,7 @@ from leapnav.envs.utils.validation import (
 OBSERVATIONS = "lidar", "state", "map", "geodesic"
 REWARDS, ACTUATIONS = ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS, HORIZONS = ("sparse", "cost"), ("fixed", "free")
+OBSTACLE_KINDS = "cost", "hard"  # see `Cost.obstacles`
 # Arguments that determine what is observed.
 SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")
 MIN_PERIOD = 1e-4  # s

@@ -55,7 +55,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
 
     Args:
         num_envs: number of robots.
-        family, scenario, split, bank, robot, horizon: see `NavigateEnv`.
+        family, scenario, split, bank, robot, horizon, obstacles: see `NavigateEnv`.
         sampler: chooses the scenario of the bank for each episode, and is told its outcome; needs a bank. The `spec` of
             an environment with a sampler has no form in JSON.
         autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
@@ -83,6 +83,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         bank: Any = None,
         robot: Any = None,
         horizon: Any = None,
+        obstacles: Any = None,
         sampler: LevelSampler | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
@@ -92,7 +93,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         for name in settings:
             if name not in SETTING_NAMES:
                 raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
-        self._source = ScenarioSource(family, scenario, split, bank, robot, horizon)
+        self._source = ScenarioSource(family, scenario, split, bank, robot, horizon, obstacles)
         if sampler is not None and self._source.bank is None:
             raise ValueError("sampler: expected an environment with a bank, got one of fresh or fixed scenarios")
         self._sampler = sampler

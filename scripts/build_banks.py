@@ -27,6 +27,7 @@ BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
 SPLITS = {"train": (400, 0), "test": (200, 1)}
 # Robots besides the unicycle: models, families, and number of scenarios of each split.
 ROBOTS, ROBOT_FAMILIES, ROBOT_COUNT = ("car", "dynamic_unicycle"), ("clutter", "rooms"), 200
+HARD_FAMILIES = "clutter", "polygons", "rooms", "slalom"  # test banks with hard obstacles
 LARGE_FAMILIES, LARGE_COUNT = ("maze", "corridors"), 200  # fixed horizon only
 COST_TOLERANCE = 1e-9  # relative
 PATH_TOLERANCE = 1e-4  # of states, controls and costates, which are stored in single precision
@@ -41,6 +42,10 @@ def build(directory: Path, workers: int) -> None:
     for family in LARGE_FAMILIES:
         for split, (_, seed) in SPLITS.items():
             build_bank(family, LARGE_COUNT, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
+    count, seed = SPLITS["test"]
+    for family in HARD_FAMILIES:
+        path = directory / f"{collection_name(family, obstacles='hard')}-test.bank"
+        build_bank(family, count, path, obstacles="hard", seed=seed, workers=workers)
     for robot in ROBOTS:
         for family in ROBOT_FAMILIES:
             for split, (_, seed) in SPLITS.items():

@@ -25,6 +25,7 @@ _DEFAULTS: dict[str, Any] = tomllib.loads(
 FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors", "all"] | str
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
+ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
 MemoryName = Literal["none", "stack", "lstm"]
@@ -139,6 +140,8 @@ class RunConfig:
     """Model of the robot."""
     horizon: HorizonName = "fixed"
     """Fixed horizon, or free: the episode ends at the goal, and the time is part of the cost."""
+    obstacles: ObstaclesName = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     seed: int = 0
     """Random seed."""
     resume: bool = False

@@ -51,6 +51,7 @@ from leapnav.envs.scenarios.banks.checks import (
     check_values,
 )
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import OBSTACLE_KINDS
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.validation import check_choice, is_integer
 
@@ -104,6 +105,7 @@ class ScenarioBank(Sequence[Scenario]):
         lower_bounds (n,): proved lower bounds of the cost, see `leapnav.experts.prove_bank`; NaN where none is known.
         draws (n,): indices of the random draws that produced the scenarios.
         horizon: kind of the horizon of all scenarios, "fixed" or "free".
+        obstacles: kind of the obstacles of all scenarios, "cost" or "hard", see `Cost.obstacles`.
         horizons (n,): durations of the optima (s).
         checksums: BLAKE2b digests of the datasets, and of the attributes.
 
@@ -127,6 +129,7 @@ class ScenarioBank(Sequence[Scenario]):
     lower_bounds: np.ndarray
     draws: np.ndarray
     horizon: str
+    obstacles: str
     horizons: np.ndarray
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -179,6 +182,7 @@ class ScenarioBank(Sequence[Scenario]):
         self._scenarios: dict[int, Scenario] = {}
         self._checked: set[int] = set()  # scenarios whose optimum is checked
         self.horizon = self[0].horizon_kind if len(self) else "fixed"
+        self.obstacles = self[0].cost.obstacles if len(self) else "cost"
         self._check_widths()
 
     @property
@@ -224,10 +228,12 @@ class ScenarioBank(Sequence[Scenario]):
             self._array(name)
 
     @classmethod
-    def shipped_families(cls, robot: str = "unicycle", horizon: str = "fixed") -> list[str]:
-        """Return the families of which banks for a robot model and a kind of horizon are included in the package."""
-        found = (path.name.removesuffix("-test.bank") for path in BANK_DIRECTORY.glob("*-test.bank"))
-        prefix = collection_name("", robot, horizon)
+    def shipped_families(
+        cls, robot: str = "unicycle", horizon: str = "fixed", obstacles: str = "cost", split: str = "test"
+    ) -> list[str]:
+        """Return the families of which banks for a robot and kinds of horizon and obstacles are in the package."""
+        found = (path.name.removesuffix(f"-{split}.bank") for path in BANK_DIRECTORY.glob(f"*-{split}.bank"))
+        prefix = collection_name("", robot, horizon, obstacles)
         return sorted(
             name.removeprefix(prefix)
             for name in found
@@ -235,7 +241,9 @@ class ScenarioBank(Sequence[Scenario]):
         )
 
     @classmethod
-    def shipped(cls, family: str, split: str, robot: str = "unicycle", horizon: str = "fixed") -> ScenarioBank:
+    def shipped(
+        cls, family: str, split: str, robot: str = "unicycle", horizon: str = "fixed", obstacles: str = "cost"
+    ) -> ScenarioBank:
         """Return a bank included in the package; repeated calls return the same object.
 
         Args:
@@ -243,19 +251,21 @@ class ScenarioBank(Sequence[Scenario]):
             split: "train" or "test".
             robot: model of the robot.
             horizon: "fixed" or "free".
+            obstacles: "cost" or "hard".
 
         Raises:
             ValueError: there is no such bank.
 
         """
-        known = cls.shipped_families(robot, horizon)
+        check_choice("split", split, SPLITS)
+        check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+        known = cls.shipped_families(robot, horizon, obstacles, split)
         if family not in known:
             raise ValueError(
                 f"family: expected one of {', '.join(known)}, of which banks are included, got {family!r}; build a "
                 "bank of another family with leapnav bank build, and pass it as bank"
             )
-        check_choice("split", split, SPLITS)
-        return _shipped(collection_name(family, robot, horizon), split)
+        return _shipped(collection_name(family, robot, horizon, obstacles), split)
 
     def __len__(self) -> int:
         return len(self.costs)
@@ -287,6 +297,7 @@ class ScenarioBank(Sequence[Scenario]):
         for name, found, expected in (
             ("robot.model", scenario.robot.model, first.robot.model),
             ("horizon", scenario.horizon_kind, first.horizon_kind),
+            ("obstacles", scenario.cost.obstacles, first.cost.obstacles),
             ("horizon", scenario.horizon or float(self.horizons[i]), float(self.horizons[i])),
         ):
             if found != expected:
@@ -355,13 +366,15 @@ class ScenarioBank(Sequence[Scenario]):
         self._open()
 
 
-def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
-    """Return the name of the scenarios of a family for a robot model and a kind of horizon, such as "car-clutter".
+def collection_name(family: str, robot: str = "unicycle", horizon: str = "fixed", obstacles: str = "cost") -> str:
+    """Return the name of the scenarios of a family for a robot and kinds of horizon and obstacles, "car-hard-clutter".
 
-    Other characters than letters, digits and underscores in the name of the family become underscores.
+    The unicycle, a fixed horizon and obstacles with a proximity cost are not named. Other characters than letters,
+    digits and underscores in the name of the family become underscores.
     """
     name = re.sub(r"[^A-Za-z0-9_]", "_", family)
-    return "-".join([*([] if robot == "unicycle" else [robot]), *([] if horizon == "fixed" else [horizon]), name])
+    kinds = (robot, "unicycle"), (horizon, "fixed"), (obstacles, "cost")
+    return "-".join([*(kind for kind, default in kinds if kind != default), name])
 
 
 @computed_once()

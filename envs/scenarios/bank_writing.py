@@ -75,19 +75,20 @@ def write_bank(
         family, seed, drawn, rejected, software, given: see `ScenarioBank`.
 
     Raises:
-        ValueError: the scenarios have different robot models or kinds of horizon.
+        ValueError: the scenarios have different robot models, kinds of horizon or kinds of obstacles.
 
     """
     import h5py
 
     texts = [entry.scenario.encode() for entry in entries]
     scenarios = [Scenario.from_json(entry.scenario) for entry in entries]
-    models = sorted({scenario.robot.model for scenario in scenarios})
-    if len(models) > 1:
-        raise ValueError(f"entries: expected one robot model for all scenarios, got {', '.join(models)}")
-    kinds = sorted({scenario.horizon_kind for scenario in scenarios})
-    if len(kinds) > 1:
-        raise ValueError(f"entries: expected one kind of horizon for all scenarios, got {', '.join(kinds)}")
+    for name, values in (
+        ("robot model", {scenario.robot.model for scenario in scenarios}),
+        ("kind of horizon", {scenario.horizon_kind for scenario in scenarios}),
+        ("kind of obstacles", {scenario.cost.obstacles for scenario in scenarios}),
+    ):
+        if len(values) > 1:
+            raise ValueError(f"entries: expected one {name} for all scenarios, got {', '.join(sorted(values))}")
     n, m = type(scenarios[0].robot).sizes() if scenarios else Unicycle.sizes()
     columns: dict[str, Any] = {
         "scenarios": np.frombuffer(b"".join(texts), dtype="u1"),

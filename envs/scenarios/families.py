@@ -24,7 +24,7 @@ from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.files import read_scenarios
 from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Box, ScenarioLayout, rounded
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
-from leapnav.envs.settings import HORIZONS
+from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
 from leapnav.envs.shapes.clearance import clearances, footprint_clearances
 from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.validation import check_choice, suggestion
@@ -210,6 +210,7 @@ def sample_scenario(
     seed: int | np.random.Generator,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     horizon: str = "fixed",
+    obstacles: str = "cost",
 ) -> Scenario:
     """Sample a random scenario; the same family and seed give the same scenario.
 
@@ -227,15 +228,18 @@ def sample_scenario(
         robot: name of a robot model, a dict of its fields with `model`, or a robot. Robots with the same footprint
             get the same obstacles and poses.
         horizon: "fixed" or "free"; both have the same obstacles and poses.
+        obstacles: "cost" for a proximity cost with the weight 1; "hard" for the weight 0, with which the obstacles are
+            hard constraints and cost nothing. Both have the same obstacles, poses and horizon.
 
     Raises:
         TypeError: the function of the family returns something else.
-        ValueError: an argument is invalid, a scenario of the family has another robot or kind of horizon, or none of
-            its layouts connects start and goal.
+        ValueError: an argument is invalid, a scenario of the family has another robot, kind of horizon or kind of
+            obstacles, or none of its layouts connects start and goal.
 
     """
     chosen = family if isinstance(family, CustomFamily) else find_family(family)
     check_choice("horizon", horizon, HORIZONS)
+    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
     body = check_robot(robot)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
     if chosen == ALL:
@@ -245,33 +249,39 @@ def sample_scenario(
     for _ in range(MAX_DRAWS):  # rejection sampling: the draws are independent
         layout = custom.sample(rng)
         if isinstance(layout, Scenario):
-            scenario = _checked(layout, custom.name, body, horizon)
+            scenario = _checked(layout, custom.name, body, horizon, obstacles)
             return scenario if custom.names_scenarios else scenario.model_copy(update={"name": name})
         if not isinstance(layout, ScenarioLayout):
             raise TypeError(
                 f"family: {custom.name!r}: expected a ScenarioLayout or a Scenario, got {type(layout).__name__}"
             )
-        found = _sample_task(layout, rng, body, horizon)
+        found = _sample_task(layout, rng, body, horizon, obstacles)
         if found is not None:
             return Scenario(name=name, arena=layout.arena, robot=body, obstacles=tuple(layout.obstacles), **found)
     raise ValueError(f"family: {custom.name!r}: no layout connects start and goal in {MAX_DRAWS} draws")
 
 
-def _checked(scenario: Scenario, family: str, robot: RobotModel, horizon: str) -> Scenario:
-    """Return a scenario of a family if it has the robot and the kind of horizon."""
+def _checked(scenario: Scenario, family: str, robot: RobotModel, horizon: str, obstacles: str) -> Scenario:
+    """Return a scenario of a family if it has the robot and the kinds of horizon and obstacles."""
     if scenario.robot != robot:
         raise ValueError(f"robot: expected that of the scenarios of {family!r}, {scenario.robot!r}, got {robot!r}")
-    if scenario.horizon_kind != horizon:
-        kind = scenario.horizon_kind
-        raise ValueError(f"horizon: expected that of the scenarios of {family!r}, {kind!r}, got {horizon!r}")
+    for name, kind, wanted in (
+        ("horizon", scenario.horizon_kind, horizon),
+        ("obstacles", scenario.cost.obstacles, obstacles),
+    ):
+        if kind != wanted:
+            raise ValueError(f"{name}: expected that of the scenarios of {family!r}, {kind!r}, got {wanted!r}")
     return scenario
 
 
 def _sample_task(
-    layout: ScenarioLayout, rng: np.random.Generator, body: RobotModel, horizon: str
+    layout: ScenarioLayout, rng: np.random.Generator, body: RobotModel, horizon: str, obstacles: str
 ) -> dict[str, Any] | None:
     """Return random poses, the horizon and the cost; None if the poses are too close or not connected."""
-    discs, cost = body.discs(), Cost() if horizon == "fixed" else Cost(time_weight=TIME_WEIGHT)
+    weights = {"time_weight": TIME_WEIGHT} if horizon == "free" else {}
+    if obstacles == "hard":
+        weights["proximity_weight"] = 0.0
+    discs, cost = body.discs(), Cost(**weights)
     areas = layout.regions
     poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
     x_min, y_min, x_max, y_max = layout.arena

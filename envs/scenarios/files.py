@@ -38,8 +38,8 @@ def check_collection(scenarios: Sequence[Scenario]) -> None:
     """Check that scenarios can be in one bank.
 
     Raises:
-        ScenarioError: there are none, two have the same name, they have different robot models or kinds of horizon, or
-            the cost of one is not that of an environment; the message names the scenario.
+        ScenarioError: there are none, two have the same name, they have different robot models, kinds of horizon or
+            kinds of obstacles, or the cost of one is not that of an environment; the message names the scenario.
 
     """
     if not scenarios:
@@ -50,6 +50,7 @@ def check_collection(scenarios: Sequence[Scenario]) -> None:
         for name, found, expected in (
             ("robot", scenario.robot.model, scenarios[0].robot.model),
             ("horizon", scenario.horizon_kind, scenarios[0].horizon_kind),
+            ("obstacles", scenario.cost.obstacles, scenarios[0].cost.obstacles),
         ):
             if found != expected:
                 raise ScenarioError(

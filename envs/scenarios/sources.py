@@ -16,7 +16,7 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS, Disturbance, Motor
+from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS, Disturbance, Motor
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 if TYPE_CHECKING:
@@ -61,11 +61,11 @@ class ScenarioSource:
     """The source of an environment's scenarios: a fixed scenario, a bank, or a family.
 
     Args:
-        family, scenario, split, bank, robot, horizon: see `NavigateEnv`.
+        family, scenario, split, bank, robot, horizon, obstacles: see `NavigateEnv`.
 
     Attributes:
-        robot, horizon: the robot and the kind of horizon of new scenarios; those of the bank or of the fixed scenario
-            if one is given.
+        robot, horizon, obstacles: the robot and the kinds of horizon and obstacles of new scenarios; those of the bank
+            or of the fixed scenario if one is given.
         family: name of the family; that of the bank if a bank is given. A family that is not built in has fresh
             scenarios only.
         scenario: the fixed scenario, or None.
@@ -78,7 +78,9 @@ class ScenarioSource:
 
     """
 
-    _custom: CustomFamily | None = None  # also of sources in checkpoints of earlier versions
+    # Defaults, also of sources in checkpoints of earlier versions.
+    _custom: CustomFamily | None = None
+    obstacles: str = "cost"
 
     def __init__(
         self,
@@ -88,6 +90,7 @@ class ScenarioSource:
         bank: ScenarioBank | str | os.PathLike[str] | None = None,
         robot: RobotModel | Mapping[str, Any] | str | None = None,
         horizon: str | None = None,
+        obstacles: str | None = None,
     ) -> None:
         known_family = find_family(DEFAULT_FAMILY if family is None else family)
         arguments = (("scenario", scenario), ("bank", bank), ("split", split), ("family", family))
@@ -116,8 +119,10 @@ class ScenarioSource:
         chosen = Unicycle() if robot is None else check_robot(robot)
         if horizon is not None:
             check_choice("horizon", horizon, HORIZONS)
+        if obstacles is not None:
+            check_choice("obstacles", obstacles, OBSTACLE_KINDS)
         if self.bank is None and scenario is None and split != "fresh" and family != ALL and self._custom is None:
-            self.bank = _shipped_bank(family, split, chosen, horizon or "fixed")
+            self.bank = _shipped_bank(family, split, chosen, horizon or "fixed", obstacles or "cost")
         given_by = (
             self.scenario.robot if self.scenario is not None else self.bank.robot if self.bank is not None else None
         )
@@ -127,12 +132,16 @@ class ScenarioSource:
         if robot is not None and not agrees:
             raise ValueError(f"robot: expected that of the {place}, {given_by!r}, got {chosen!r}")
         self.robot: RobotModel = given_by or chosen
-        known = None if self.bank is None else self.bank.horizon
+        kinds: tuple[str, str] | None = None
         if self.scenario is not None:
-            known = self.scenario.horizon_kind
-        if horizon is not None and known not in (None, horizon):
-            raise ValueError(f"horizon: expected that of the {place}, {known!r}, got {horizon!r}")
-        self.horizon: str = known or horizon or "fixed"
+            kinds = self.scenario.horizon_kind, self.scenario.cost.obstacles
+        elif self.bank is not None:
+            kinds = self.bank.horizon, self.bank.obstacles
+        if kinds is not None:
+            for name, kind, known in zip(("horizon", "obstacles"), (horizon, obstacles), kinds, strict=True):
+                if kind not in (None, known):
+                    raise ValueError(f"{name}: expected that of the {place}, {known!r}, got {kind!r}")
+        self.horizon, self.obstacles = kinds or (horizon or "fixed", obstacles or "cost")
 
     def select(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:
         """Return the scenario that the options of a reset select, or its index in the bank; None without a selection.
@@ -159,24 +168,28 @@ class ScenarioSource:
             return int(rng.integers(len(self.bank)))
         if self.scenario is not None:
             return self.scenario
-        return sample_scenario(self._custom or self.family, rng, self.robot, self.horizon)
+        return sample_scenario(self._custom or self.family, rng, self.robot, self.horizon, self.obstacles)
 
 
-def _shipped_bank(family: str, split: str | None, robot: RobotModel, horizon: str) -> ScenarioBank | None:
-    """Return the included bank of a family for a robot and a kind of horizon, or None to sample fresh scenarios.
+def _shipped_bank(
+    family: str, split: str | None, robot: RobotModel, horizon: str, obstacles: str
+) -> ScenarioBank | None:
+    """Return the included bank of a family for a robot and kinds of horizon and obstacles, or None for fresh scenarios.
 
     Raises:
         ValueError: a split is given, and there is no included bank.
 
     """
-    names = ScenarioBank.shipped_families(robot.model, horizon)
+    names = ScenarioBank.shipped_families(robot.model, horizon, obstacles, split or "train")
     if family in names and robot == type(robot)():
-        return ScenarioBank.shipped(family, split or "train", robot.model, horizon)
+        return ScenarioBank.shipped(family, split or "train", robot.model, horizon, obstacles)
     if split is not None:
         reason = f"for {', '.join(names)}" if names else "for no family"
         which = f"{robot.model!r}" if robot == type(robot)() else f"{robot.model!r} with these parameters"
         if horizon != "fixed":
             which += f" with a {horizon} horizon"
+        if obstacles != "cost":
+            which += f" with {obstacles} obstacles"
         if robot != type(robot)():
             reason = "for the default parameters only"
         raise ValueError(f"split: the robot {which} has included banks {reason}, got {split!r} of {family!r}")

@@ -22,7 +22,7 @@ from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_ba
 from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
 from leapnav.envs.scenarios.files import PathLike, check_collection, read_scenarios
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
-from leapnav.envs.settings import HORIZONS
+from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.store import Arrays, Job, ResumableStore, discard
@@ -91,6 +91,7 @@ class RandomDraws:
     seed: int
     robot: RobotModel
     horizon: str
+    obstacles: str = "cost"
     available: int | None = None
 
     @property
@@ -100,11 +101,12 @@ class RandomDraws:
         # Without the defaults, as before there were other robots.
         robot = {} if self.robot == Unicycle() else {"robot": self.robot.model_dump(mode="json", exclude_none=True)}
         horizon = {} if self.horizon == "fixed" else {"horizon": self.horizon}
-        return {"family": name, "seed": self.seed, **robot, **horizon}
+        obstacles = {} if self.obstacles == "cost" else {"obstacles": self.obstacles}
+        return {"family": name, "seed": self.seed, **robot, **horizon, **obstacles}
 
     def job(self, number: int) -> Job:
         """See `ScenarioDraws`."""
-        return partial(draw, number, self.family, self.seed, self.robot, self.horizon)
+        return partial(draw, number, self.family, self.seed, self.robot, self.horizon, self.obstacles)
 
     def describe(self, results: Mapping[int, Result]) -> None:
         """See `ScenarioDraws`."""
@@ -153,6 +155,7 @@ def build_bank(
     *,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     horizon: str = "fixed",
+    obstacles: str = "cost",
     seed: int = 0,
     workers: int = 1,
     dask: str | None = None,
@@ -171,6 +174,7 @@ def build_bank(
         robot: name of a robot model, a dict of its fields with `model`, or a robot.
         horizon: "fixed" or "free", see `sample_scenario`. The time limit of a scenario with a free horizon is 3 times
             the duration of its optimum.
+        obstacles: "cost" or "hard", see `sample_scenario`.
         seed: seed of the bank; draw k uses a generator with the seed (seed, k).
         workers: number of processes.
         dask: address of a Dask scheduler (`tcp://host:8786`) whose workers are used instead of local processes; they
@@ -189,10 +193,12 @@ def build_bank(
     chosen = find_family(family)
     body = check_robot(robot)
     check_choice("horizon", horizon, HORIZONS)
+    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
     check_at_least("count", count, 1)
     check_at_least("seed", seed, 0)
-    draws = RandomDraws(chosen, seed, body, horizon)
-    expected = {"family": family, "seed": seed, "count": count, "robot": body, "horizon": horizon}
+    draws = RandomDraws(chosen, seed, body, horizon, obstacles)
+    task = {"robot": body, "horizon": horizon, "obstacles": obstacles}
+    expected = {"family": family, "seed": seed, "count": count, **task}
     return _build(draws, count, Path(out), expected, workers=workers, dask=dask, progress=progress)
 
 
@@ -214,7 +220,8 @@ def build_bank_of(
     see `build_bank`.
 
     Args:
-        scenarios: scenarios with the same robot model and kind of horizon; or their files, see `read_scenarios`.
+        scenarios: scenarios with the same robot model and kinds of horizon and obstacles; or their files, see
+            `read_scenarios`.
         out: file of the bank. A complete bank of these scenarios is returned unchanged.
         doubtful: also admit scenarios with a certified optimum for which the search found a cheaper solution that
             touches an obstacle or was not certified; the `doubtful` of `bank.given` are their names, with the reasons.
@@ -276,7 +283,12 @@ def _build(
 
 
 def draw(
-    number: int, family: str | CustomFamily, seed: int, robot: RobotModel | None = None, horizon: str = "fixed"
+    number: int,
+    family: str | CustomFamily,
+    seed: int,
+    robot: RobotModel | None = None,
+    horizon: str = "fixed",
+    obstacles: str = "cost",
 ) -> Arrays:
     """One random scenario with its optimum, see `solve_for_bank`.
 
@@ -286,11 +298,12 @@ def draw(
         seed: seed of the bank.
         robot: the robot; None for the unicycle.
         horizon: "fixed" or "free".
+        obstacles: "cost" or "hard".
 
     """
     body = robot or Unicycle()
-    scenario = sample_scenario(family, np.random.default_rng([seed, number]), body, horizon)
-    name = collection_name(family if isinstance(family, str) else family.name, body.model, horizon)
+    scenario = sample_scenario(family, np.random.default_rng([seed, number]), body, horizon, obstacles)
+    name = collection_name(family if isinstance(family, str) else family.name, body.model, horizon, obstacles)
     return solve_for_bank(scenario.model_copy(update={"name": f"{name}-{seed}-{number}", "time_limit": None}))
 
 
@@ -368,6 +381,7 @@ def _complete(target: Path, expected: Mapping[str, Any]) -> ScenarioBank:
         "count": len(bank),
         "robot": bank.robot,
         "horizon": bank.horizon,
+        "obstacles": bank.obstacles,
         "scenarios": (bank.given or {}).get("scenarios"),
         "doubtful": "doubtful" in (bank.given or {}),
         "software": bank.software,

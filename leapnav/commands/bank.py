@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from leapnav.commands.options import Family, Horizon, Robot
+from leapnav.commands.options import Family, Horizon, Obstacles, Robot
 from leapnav.durations import SECONDS_PER_SECOND_OPINION, announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -45,6 +45,8 @@ class Build:
     """Model of the robot."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
@@ -71,7 +73,7 @@ class Build:
                     print(f"{name}: {kind}: {reason}")
         else:
             announce(of_scenarios(self.family, self.count, 1 if self.dask else self.workers), "finding the optima")
-            task = {"robot": self.robot, "horizon": self.horizon, "seed": self.seed}
+            task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles, "seed": self.seed}
             bank = build_bank(self.family, self.count, self.out, **task, workers=self.workers, dask=self.dask)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         kind = "sampled" if bank.given is None else "given"
@@ -274,6 +276,7 @@ def _print_summary(bank: ScenarioBank) -> None:
     residual, defect, drift, _ = bank.certificates.max(axis=0)
     excess = bank.second_costs / bank.costs - 1
     kind = "" if bank.horizon == "fixed" else ", free horizon"
+    kind += "" if bank.obstacles == "cost" else ", hard obstacles"
     source = f"seed {bank.seed}" if bank.given is None else "given"
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, {source}, leapnav {bank.software}")
     print("  checksums, optima  verified")

@@ -6,13 +6,14 @@ import json
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from leapnav.training.config import FamilyName, HorizonName, RobotName
+from leapnav.training.config import FamilyName, HorizonName, ObstaclesName, RobotName
 
 # Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
 Family = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"] | str
 FamilyOrAll = FamilyName
 Robot = RobotName
 Horizon = HorizonName
+Obstacles = ObstaclesName
 PolicyName = (
     Literal[
         "expert",
