@@ -157,6 +157,11 @@ class RunConfig:
     """Scenarios per family of the test split in an evaluation during the run; the final evaluation plays all."""
 
     @property
+    def fresh_scenarios(self) -> dict[str, Any]:
+        """Arguments of the environment that, with `environment`, select new scenarios of the family."""
+        return {"family": self.family, "split": "fresh", "obstacles": self.obstacles}
+
+    @property
     def environment(self) -> dict[str, Any]:
         """Arguments of the environment that determine the observation."""
         robot = {} if self.robot == "unicycle" else {"robot": self.robot}

@@ -261,6 +261,13 @@ def sample_scenario(
     raise ValueError(f"family: {custom.name!r}: no layout connects start and goal in {MAX_DRAWS} draws")
 
 
+def random_cost(horizon: str, obstacles: str) -> Cost:
+    """Return the cost of random scenarios with a kind of horizon and of obstacles."""
+    return Cost(
+        time_weight=TIME_WEIGHT if horizon == "free" else 0.0, proximity_weight=0.0 if obstacles == "hard" else 1.0
+    )
+
+
 def _checked(scenario: Scenario, family: str, robot: RobotModel, horizon: str, obstacles: str) -> Scenario:
     """Return a scenario of a family if it has the robot and the kinds of horizon and obstacles."""
     if scenario.robot != robot:
@@ -278,10 +285,7 @@ def _sample_task(
     layout: ScenarioLayout, rng: np.random.Generator, body: RobotModel, horizon: str, obstacles: str
 ) -> dict[str, Any] | None:
     """Return random poses, the horizon and the cost; None if the poses are too close or not connected."""
-    weights = {"time_weight": TIME_WEIGHT} if horizon == "free" else {}
-    if obstacles == "hard":
-        weights["proximity_weight"] = 0.0
-    discs, cost = body.discs(), Cost(**weights)
+    discs, cost = body.discs(), random_cost(horizon, obstacles)
     areas = layout.regions
     poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
     x_min, y_min, x_max, y_max = layout.arena

@@ -17,10 +17,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
-from leapnav.envs.scenarios.cost import Cost
-from leapnav.envs.scenarios.families import REFERENCE_SPEED, TIME_WEIGHT
+from leapnav.envs.scenarios.families import REFERENCE_SPEED, random_cost
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS
+from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
 from leapnav.envs.utils.validation import check_choice
 
 # Of the challenge: the pose of the robot at the start, and the goal position; the heading at the goal is free.
@@ -36,6 +35,7 @@ def read_barn(
     *,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     horizon: str = "fixed",
+    obstacles: str = "cost",
 ) -> list[Scenario]:
     """Read the worlds of the BARN challenge as scenarios, in the order of their numbers.
 
@@ -45,6 +45,7 @@ def read_barn(
         folder: directory of the files `world_N.world`, or one that contains it as a directory named BARN.
         robot: name of a robot model, a dict of its fields with `model`, or a robot.
         horizon: "fixed" or "free".
+        obstacles: "cost" or "hard", see `sample_scenario`.
 
     Raises:
         FileNotFoundError: there are no such files.
@@ -53,21 +54,22 @@ def read_barn(
     """
     body = check_robot(robot)
     check_choice("horizon", horizon, HORIZONS)
+    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+    cost = random_cost(horizon, obstacles)
     paths = _worlds(Path(folder))
     lengths = path_lengths(folder)
     scenarios = []
     for path in paths:
         name = _name(path)
         length = lengths.get(name, math.dist(START[:2], GOAL))
-        free = horizon == "free"
         scenarios.append(
             Scenario.from_discs(
                 read_cylinders(path),
                 name=name,
                 start=START,
                 goal=(*GOAL, None),
-                horizon=None if free else round(length / REFERENCE_SPEED, 1),
-                cost=Cost(time_weight=TIME_WEIGHT) if free else Cost(),
+                horizon=None if horizon == "free" else round(length / REFERENCE_SPEED, 1),
+                cost=cost,
                 robot=body,
             )
         )

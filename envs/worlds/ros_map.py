@@ -125,6 +125,7 @@ def sample_on_map(
     seed: int = 0,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     horizon: str = "fixed",
+    obstacles: str = "cost",
 ) -> list[Scenario]:
     """Sample scenarios with random poses on a map, see `sample_scenario`; scenario i has the seed `seed + i`.
 
@@ -135,7 +136,7 @@ def sample_on_map(
     check_at_least("count", count, 1)
     layout = ScenarioLayout(grid.obstacles(), arena=grid.arena)
     family = CustomFamily(grid.name, lambda rng: layout)
-    return [sample_scenario(family, seed + i, robot, horizon) for i in range(count)]
+    return [sample_scenario(family, seed + i, robot, horizon, obstacles) for i in range(count)]
 
 
 def _origin(fields: YamlFields) -> tuple[float, float]:

@@ -37,7 +37,7 @@ def _metadata(bank: ScenarioBank, licence: str) -> str:
 
 
 def _sentences(bank: ScenarioBank) -> str:
-    kind = f"a {bank.horizon} horizon"
+    kind = f"a {bank.horizon} horizon" + ("" if bank.obstacles == "cost" else " and hard obstacles")
     return (
         f"{len(bank)} scenarios of a wheeled robot (`{bank.robot.model}`) among obstacles, with {kind}, each with its "
         "certified optimum: cost, states, controls and costates. A scenario bank of leapnav, an HDF5 file."

@@ -217,7 +217,12 @@ def recovery(
 
 
 def write_dataset(
-    demonstrations: Iterable[Demonstration], root: Path, family: str, robot: RobotModel, horizon: str = "fixed"
+    demonstrations: Iterable[Demonstration],
+    root: Path,
+    family: str,
+    robot: RobotModel,
+    horizon: str = "fixed",
+    obstacles: str = "cost",
 ) -> None:
     """Write a Minari dataset with state, costate and cost-to-go of every step.
 
@@ -230,9 +235,12 @@ def write_dataset(
         family: family of the scenarios.
         robot: the robot.
         horizon: "fixed" or "free".
+        obstacles: "cost" or "hard".
 
     """
     arguments: dict[str, Any] = {} if horizon == "fixed" else {"horizon": horizon, "split": "fresh"}
+    if obstacles != "cost":
+        arguments |= {"obstacles": obstacles, "split": "fresh"}
     if robot != Unicycle():
         fields = robot.model_dump(mode="json", exclude_none=True)
         arguments |= {"robot": robot.model if robot == type(robot)() else fields, "split": "fresh"}
@@ -250,7 +258,7 @@ def write_dataset(
 
     with _minari_root(str(root)):
         dataset = minari.create_dataset_from_buffers(
-            dataset_id(family, robot.model, horizon),
+            dataset_id(family, robot.model, horizon, obstacles),
             cast(list[EpisodeBuffer], episodes()),  # Minari declares a list, but any iterable works
             env=env,
             eval_env=env,
@@ -310,9 +318,9 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
     )
 
 
-def dataset_id(family: str, robot: str = "unicycle", horizon: str = "fixed") -> str:
-    """The Minari dataset id of the demonstrations of a family, a robot model and a kind of horizon."""
-    return f"leapnav/{collection_name(family, robot, horizon)}/expert-v0"
+def dataset_id(family: str, robot: str = "unicycle", horizon: str = "fixed", obstacles: str = "cost") -> str:
+    """The Minari dataset id of the demonstrations of a family, for a robot and kinds of horizon and obstacles."""
+    return f"leapnav/{collection_name(family, robot, horizon, obstacles)}/expert-v0"
 
 
 @contextmanager

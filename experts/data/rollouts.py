@@ -19,9 +19,9 @@ import leapnav
 from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import CustomFamily, find_family, sample_scenario
+from leapnav.envs.scenarios.families import find_family, sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS
+from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
@@ -85,6 +85,7 @@ def rollout(
     *,
     robot: RobotModel | Mapping[str, Any] | str = "unicycle",
     horizon: str = "fixed",
+    obstacles: str = "cost",
     seed: int = 1000,
     recoveries: int = 0,
     noise: float = 0.0,
@@ -104,9 +105,11 @@ def rollout(
             replaced by following ones. Seeds 0 and 1 are refused: their scenarios are in the included banks, one of
             them in the test split.
         out: directory, a root of Minari datasets. Read it with `load_demonstrations(out)`; if the environment variable
-            MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family, robot, horizon))`.
+            MINARI_DATASETS_PATH is set to it, also with `minari.load_dataset(dataset_id(family, robot, horizon,
+            obstacles))`.
         robot: name of a robot model, a dict of its fields with `model`, or a robot.
         horizon: "fixed" or "free", see `sample_scenario`.
+        obstacles: "cost" or "hard", see `sample_scenario`.
         recoveries: number of additional demonstrations per scenario that start from perturbed states of the optimum.
         noise: standard deviation of the noise that is added to the executed actions, which are in [-1, 1]. The expert
             then acts in closed loop and the dataset contains its own actions, which show how to recover.
@@ -126,6 +129,7 @@ def rollout(
     """
     chosen = find_family(family)
     check_choice("horizon", horizon, HORIZONS)
+    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
     check_at_least("count", count, 1)
     check_at_least("recoveries", recoveries, 0)
     check_at_least("workers", workers, 1)
@@ -145,18 +149,20 @@ def rollout(
         settings["robot"] = body.model_dump(mode="json", exclude_none=True)
     if horizon != "fixed":
         settings["horizon"] = horizon
+    if obstacles != "cost":
+        settings["obstacles"] = obstacles
     finished = None if force else _finished(directory, {**settings, "count": count})
     if finished is not None:
         return finished
     _prepare(directory, force)
     # The settings of the store exclude `count`: a longer rollout continues a shorter one.
     with ResumableStore(directory / WORK, "rollout", settings) as store:
-        compute = partial(
-            _shard, family=chosen, seed=seed, recoveries=recoveries, noise=float(noise), robot=body, horizon=horizon
-        )
+        sample = partial(sample_scenario, chosen, robot=body, horizon=horizon, obstacles=obstacles)
+        compute = partial(_shard, sample=sample, seed=seed, recoveries=recoveries, noise=float(noise))
         with process_pool(workers, dask) as pool:
             n_shards = _solve(store, pool, compute, family, count, progress)
-        summary = _write(store, n_shards, directory, family, count, body, horizon)
+        write = partial(write_dataset, family=family, robot=body, horizon=horizon, obstacles=obstacles)
+        summary = _write(store, n_shards, directory, count, write)
         record = {**settings, "count": count, "summary": asdict(summary)}
         write_text(directory / RECORD, encode(record, indent=1) + "\n")
     discard(store.directory)
@@ -280,7 +286,7 @@ def _solve(
 
 
 def _write(
-    store: ResumableStore, n_shards: int, directory: Path, family: str, count: int, robot: RobotModel, horizon: str
+    store: ResumableStore, n_shards: int, directory: Path, count: int, write: Callable[..., None]
 ) -> RolloutSummary:
     """Write the dataset of the first `count` solved scenarios in the work directory, then move it to its place."""
     totals = {"demonstrations": 0, "unsolved": 0, "failed": 0, "steps": 0}
@@ -304,7 +310,7 @@ def _write(
 
     root = directory / WORK / "root"
     shutil.rmtree(root, ignore_errors=True)  # left by a run that was interrupted here
-    write_dataset(demonstrations(), root, family, robot, horizon)
+    write(demonstrations(), root)
     shutil.rmtree(directory / "leapnav", ignore_errors=True)  # an earlier copy of the same dataset, see `_prepare`
     (root / "leapnav").replace(directory / "leapnav")
     return RolloutSummary(totals["demonstrations"], totals["unsolved"], totals["failed"], totals["steps"])
@@ -315,11 +321,9 @@ def _shard(number: int, seed: int, **arguments: Any) -> Arrays:
     return _pack([_demonstrations(seed=s, **arguments) for s in range(first, first + SHARD_SIZE)])
 
 
-def _demonstrations(
-    family: str | CustomFamily, seed: int, recoveries: int, noise: float, robot: RobotModel, horizon: str
-) -> list[Demonstration]:
+def _demonstrations(sample: Callable[[int], Scenario], seed: int, recoveries: int, noise: float) -> list[Demonstration]:
     """The demonstrations of one scenario, its optimum first; empty without a certified optimum."""
-    scenario = sample_scenario(family, seed, robot, horizon)
+    scenario = sample(seed)
     optimum = find_optimum(scenario, alternatives=False)
     if not optimum.success:
         return []

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.commands.options import EnvironmentOption, FamilyOrAll, Horizon, Robot, parse_environment
+from leapnav.commands.options import EnvironmentOption, FamilyOrAll, Horizon, Obstacles, Robot, parse_environment
 from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
@@ -35,6 +35,8 @@ class Evaluate:
     """Model of the robot of the included banks; by default that of the policies."""
     horizon: Horizon | None = None
     """Fixed or free horizon of the included banks; by default that of the policies."""
+    obstacles: Obstacles = "cost"
+    """Obstacles of the included banks: with a proximity cost, or hard obstacles, which cost nothing."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None
@@ -118,4 +120,6 @@ class Evaluate:
         if self.bank is not None:
             return [ScenarioBank(self.bank)]
         check_family(self.family)
-        return included_banks(specs, families_of(self.family), self.split, self.robot, self.horizon)
+        return included_banks(
+            specs, families_of(self.family), self.split, self.robot, self.horizon, obstacles=self.obstacles
+        )

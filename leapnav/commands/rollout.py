@@ -6,7 +6,7 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from leapnav.commands.options import FamilyOrAll, Horizon, Robot
+from leapnav.commands.options import FamilyOrAll, Horizon, Obstacles, Robot
 from leapnav.durations import announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -29,6 +29,8 @@ class Rollout:
     """Model of the robot."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000
@@ -69,6 +71,7 @@ class Rollout:
             self.out,
             robot=self.robot,
             horizon=self.horizon,
+            obstacles=self.obstacles,
             seed=self.seed,
             recoveries=self.recoveries,
             noise=self.noise,
@@ -81,7 +84,7 @@ class Rollout:
             f"({summary.unsolved} scenarios without a certified optimum and "
             f"{summary.failed_replays} failed replays left out)"
         )
-        name = dataset_id(self.family, self.robot, self.horizon)
+        name = dataset_id(self.family, self.robot, self.horizon, self.obstacles)
         print(f"load it with minari.load_dataset({name!r}) and MINARI_DATASETS_PATH={self.out}")
         write_json(asdict(summary), self.json)
         return 0

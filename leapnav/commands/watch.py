@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from leapnav.commands.options import Family, Horizon, PolicyName, Robot
+from leapnav.commands.options import Family, Horizon, Obstacles, PolicyName, Robot
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ class Watch:
     """Model of the robot, for the expert and the baselines; a learned policy has its own."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon, for the expert and the baselines; a learned policy has its own."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     split: Literal["train", "test", "fresh"] = "test"
     """Split of the included banks, or "fresh" for newly sampled scenarios."""
     index: int | None = None
@@ -107,9 +109,8 @@ class Watch:
         import gymnasium as gym
 
         arguments = {**self._sensors(), "actuation": self.actuation, "disturbance": self.disturbance}
-        return gym.make(
-            "leapnav/Navigate-v0", family=self.family, split=self.split, render_mode=render_mode, **arguments
-        )
+        scenarios = {"family": self.family, "split": self.split, "obstacles": self.obstacles}
+        return gym.make("leapnav/Navigate-v0", **scenarios, render_mode=render_mode, **arguments)
 
     def _play(self, env: gym.Env[Any, Any]) -> None:
         """Play and report the episodes, until the window is closed."""

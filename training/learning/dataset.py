@@ -24,7 +24,7 @@ from leapnav.experts.data.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Dem
 
 FORMAT = 2  # version of the file format
 # Arguments of the environment that select the scenarios; the meaning of an observation does not depend on them.
-SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario", "robot", "horizon")
+SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario", "robot", "horizon", "obstacles")
 
 
 @dataclass(frozen=True, eq=False)

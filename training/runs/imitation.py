@@ -118,7 +118,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     run = Run("dagger", config)
     dataset = dataset or _demonstrations(run, config.scenarios, workers, progress)
     dataset = dataset.observed(observed_settings(config))  # replaced, to release the memory of the other observations
-    venv = make_vec_env(n_envs=config.n_envs, family=config.family, split="fresh", **config.environment)
+    venv = make_vec_env(n_envs=config.n_envs, **config.fresh_scenarios, **config.environment)
     dagger = DAgger(
         policy,
         ExpertPolicy(venv, quick=True),
@@ -167,14 +167,15 @@ def _demonstrations(run: Run, count: int, workers: int, progress: bool) -> Datas
     if not any(folder.glob("**/metadata.json")):
         # The scenarios depend on the seed of the run.
         seed = environment_seed(run.config.seed, DEMONSTRATION_STREAM)
-        task: dict[str, Any] = {"robot": run.config.robot, "horizon": run.config.horizon}
-        rollout(run.config.family, count, folder, **task, seed=seed, workers=workers, progress=progress)
+        config = run.config
+        task: dict[str, Any] = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
+        rollout(config.family, count, folder, **task, seed=seed, workers=workers, progress=progress)
     return Dataset.of(folder)
 
 
 def make_env(config: RunConfig) -> NavigateEnv:
     """Return an environment with the observations of a run."""
-    return NavigateEnv(config.family, split="fresh", **config.environment)
+    return NavigateEnv(**config.fresh_scenarios, **config.environment)
 
 
 def observed_settings(config: RunConfig) -> EnvironmentSettings:
@@ -199,7 +200,7 @@ def _new_policy(config: BCConfig | DAggerRunConfig) -> ActorCriticPolicy:
 
 def momentum_of(config: RunConfig) -> tuple[float, ...] | None:
     """Return the weights with which policies of a run have momentum, see `effort_weights`."""
-    return effort_weights(sample_scenario(config.family, 0, config.robot, config.horizon))
+    return effort_weights(sample_scenario(config.family, 0, config.robot, config.horizon, config.obstacles))
 
 
 def show_scores(bar: Any, evaluations: Sequence[Evaluation], **more: Any) -> None:

@@ -230,7 +230,7 @@ def _load_start(path: Path, config: Config) -> BasePolicy:
     arguments = config.environment
     if policy_environment(path).get("actuation", "velocity") == "velocity":
         arguments = {name: value for name, value in arguments.items() if name != "actuation"}
-    return load_policy(path, NavigateEnv(config.family, split="fresh", **arguments))
+    return load_policy(path, NavigateEnv(**config.fresh_scenarios, **arguments))
 
 
 def make_training_env(config: Config) -> VecEnv:
@@ -249,9 +249,8 @@ def make_training_env(config: Config) -> VecEnv:
     )
     venv: VecEnv = robots
     if config.jump_start > 0:
-        banks = [
-            ScenarioBank.shipped(family, "train", config.robot, config.horizon) for family in families_of(config.family)
-        ]
+        kinds = config.robot, config.horizon, config.obstacles
+        banks = [ScenarioBank.shipped(family, "train", *kinds) for family in families_of(config.family)]
         venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
     if config.graded_miss:
         venv = GradedMiss(venv)
@@ -261,14 +260,15 @@ def make_training_env(config: Config) -> VecEnv:
 def _scenarios(config: Config) -> dict[str, Any]:
     """Return the arguments of the training environment that choose the scenarios."""
     if not isinstance(config, PPOConfig) or config.levels == "fresh":
-        return {"family": config.family, "split": "fresh"}
+        return config.fresh_scenarios
     if config.level_bank is not None:
         bank = ScenarioBank(config.level_bank)
-        for name, found in (("robot", bank.robot.model), ("horizon", bank.horizon)):
+        kinds = ("robot", bank.robot.model), ("horizon", bank.horizon), ("obstacles", bank.obstacles)
+        for name, found in kinds:
             if found != getattr(config, name):
                 raise ValueError(f"level_bank: {name}: expected {getattr(config, name)!r}, got {found!r}")
     else:
-        bank = ScenarioBank.shipped(config.family, "train", config.robot, config.horizon)
+        bank = ScenarioBank.shipped(config.family, "train", config.robot, config.horizon, config.obstacles)
     sampler = UniformSampler(bank) if config.levels == "uniform" else PrioritizedSampler(bank, config.levels)
     return {"bank": bank, "sampler": sampler}
 

@@ -38,6 +38,7 @@ FREE_SETTINGS = ("out", "resume")
 # Settings that earlier versions did not have, with the values that correspond to them.
 NEW_SETTINGS: dict[str, Any] = {
     "horizon": "fixed",
+    "obstacles": "cost",
     "observation": "lidar",
     "memory": "none",
     "actuation": "velocity",
@@ -156,11 +157,12 @@ class Run:
 
     def _bank(self, family: str) -> ScenarioBank:
         """Return the included test bank of a family, or one that is built in the run directory if there is none."""
-        robot, horizon = self.config.robot, self.config.horizon
-        if family in ScenarioBank.shipped_families(robot, horizon):
-            return ScenarioBank.shipped(family, "test", robot, horizon)
-        task: dict[str, Any] = {"robot": robot, "horizon": horizon, "seed": TEST_SEED}
-        return build_bank(family, TEST_COUNT, own_bank(self.folder, self.config.family, family), **task, progress=False)
+        config = self.config
+        task: dict[str, Any] = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
+        if family in ScenarioBank.shipped_families(**task):
+            return ScenarioBank.shipped(family, "test", **task)
+        path = own_bank(self.folder, config.family, family)
+        return build_bank(family, TEST_COUNT, path, **task, seed=TEST_SEED, progress=False)
 
     def _write_evaluations(self) -> None:
         write_text(self.folder / "evaluations.jsonl", "".join(encode(line) + "\n" for line in self.evaluations))

@@ -166,6 +166,8 @@ def included_banks(
     split: str = "test",
     robot: str | None = None,
     horizon: str | None = None,
+    *,
+    obstacles: str = "cost",
 ) -> list[ScenarioBank]:
     """Return the included banks of families for the robot and the horizon of policies.
 
@@ -175,6 +177,7 @@ def included_banks(
         split: "train" or "test".
         robot: model of the robot; None: that of the policies, or the unicycle if all of them are baselines.
         horizon: "fixed" or "free"; None: that of the policies, or "fixed" if all of them are baselines.
+        obstacles: "cost" or "hard", which a policy does not depend on.
 
     Raises:
         ValueError: there is no such bank, or the policies have different robots or horizons.
@@ -182,7 +185,7 @@ def included_banks(
     """
     model = _common("robot", [spec.robot for spec in specs], robot) or "unicycle"
     kind = _common("horizon", [spec.horizon for spec in specs], horizon) or "fixed"
-    return [ScenarioBank.shipped(family, split, model, kind) for family in families]
+    return [ScenarioBank.shipped(family, split, model, kind, obstacles) for family in families]
 
 
 def _common(name: str, values: Sequence[str | None], given: str | None) -> str | None:

@@ -121,7 +121,8 @@ def regret(
     check_at_least("workers", workers, 1)
     evaluation = evaluate(policy, bank, count=count, environment=environment, seed=seed, timed=False, progress=progress)
     if not isinstance(bank, ScenarioBank):
-        bank = ScenarioBank.shipped(bank, "test", evaluation.settings.robot, evaluation.settings.horizon)
+        kinds = evaluation.settings.horizon, (environment or {}).get("obstacles") or "cost"
+        bank = ScenarioBank.shipped(bank, "test", evaluation.settings.robot, *kinds)
     if not decisions:
         return PolicyRegret(evaluation, level_regrets(evaluation))
     found = decisions_of(evaluation, bank, resolution=resolution, workers=workers, progress=progress)

@@ -16,7 +16,8 @@ from joblib import delayed
 
 from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.scenarios.bank import Reference, ScenarioBank
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.banks.checks import Reference
 from leapnav.envs.scenarios.families import check_family
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import EnvironmentSettings
@@ -117,7 +118,8 @@ def evaluate(
         policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class or a
             function of an environment, with a parameter `env`, that returns one, such as `ExpertPolicy`; or any other
             function, which maps one observation to an action.
-        bank: a bank, or the name of a family for its test split, with the robot and the horizon of `environment`.
+        bank: a bank, or the name of a family for its test split, with the robot, horizon and obstacles of
+            `environment`.
         count: number of scenarios, from the first of the bank; None: all.
         environment: arguments of the environment, such as `observation`.
         seed: random seed of the disturbances.
@@ -145,12 +147,10 @@ def evaluate(
         if not isinstance(bank, str):
             raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
         check_family(bank)
-        given = environment or {}
-        robot = check_robot(given.get("robot") or "unicycle")
-        bank = ScenarioBank.shipped(bank, "test", robot.model, given.get("horizon") or "fixed")
+        bank = _named_bank(bank, environment or {})
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
-    arguments = dict(environment or {})
+    arguments = {name: value for name, value in (environment or {}).items() if name != "obstacles"}
     indices = list(range(len(bank) if count is None else min(count, len(bank))))
     episodes: list[Episode] = []
     with progress_bar(total=len(indices), label=label, unit="episodes", show=progress) as bar:
@@ -167,6 +167,12 @@ def evaluate(
     milliseconds = _median_milliseconds(policy, bank, arguments) if timed else math.nan
     task = {"robot": bank.robot.model, "horizon": bank.horizon}
     return Evaluation(tuple(episodes), milliseconds, EnvironmentSettings(**{**arguments, **task}))
+
+
+def _named_bank(family: str, environment: Mapping[str, Any]) -> ScenarioBank:
+    """Return the included test bank of a family for an environment."""
+    kinds = environment.get("horizon") or "fixed", environment.get("obstacles") or "cost"
+    return ScenarioBank.shipped(family, "test", check_robot(environment.get("robot") or "unicycle").model, *kinds)
 
 
 def _play_batch(

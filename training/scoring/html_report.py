@@ -120,15 +120,17 @@ def write_report(
 def _banks(specs: Sequence[PolicySpec], families: Sequence[str], records: Sequence[_RunRecord]) -> list[ScenarioBank]:
     """Return the test banks of families: the included ones, or those in the directories of the runs."""
     found: dict[str, ScenarioBank] = {}  # by their identity: runs can have the same bank, or different ones of a family
-    own_families = set()
+    own, included = set(), []
     for name in families:
         for record in records:
             config, path = record.config, own_bank(Path(record.spec.name), record.config.family, name)
-            if name not in ScenarioBank.shipped_families(config.robot, config.horizon) and path.exists():
+            shipped = ScenarioBank.shipped_families(config.robot, config.horizon, config.obstacles)
+            if name not in shipped and path.exists():
                 bank = ScenarioBank(path)
                 found.setdefault(bank_identity(bank), bank)
-                own_families.add(name)
-    included = included_banks(specs, [name for name in families if name not in own_families])
+                own.add((name, config.obstacles))
+    for kind in sorted({record.config.obstacles for record in records} or {"cost"}):
+        included += included_banks(specs, [name for name in families if (name, kind) not in own], obstacles=kind)
     return [*included, *found.values()]
 
 

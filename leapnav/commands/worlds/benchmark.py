@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from leapnav.commands.options import Horizon, Robot
+from leapnav.commands.options import Horizon, Obstacles, Robot
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 
@@ -32,6 +32,8 @@ class BenchmarkBarn:
     """Model of the robot."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     count: int | None = None
     """Number of worlds; by default all."""
     workers: int = os.cpu_count() or 1
@@ -55,7 +57,8 @@ class BenchmarkBarn:
         from leapnav.training.scoring.reports import print_barn_scores, print_scores, scores_to_dict
 
         specs = [load_policy_spec(name) for name in self.policy]
-        scenarios = read_barn(self.folder, robot=self.robot, horizon=self.horizon)
+        task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
+        scenarios = read_barn(self.folder, **task)
         bank = build_bank_of(scenarios, self.bank, doubtful=True, origin=ORIGIN, licence=LICENCE, workers=self.workers)
         assert bank.given is not None
         for name, reason in bank.given["rejected"].items():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.commands.options import Horizon, Robot
+from leapnav.commands.options import Horizon, Obstacles, Robot
 
 if TYPE_CHECKING:
     from leapnav.envs.scenarios.scenario import Scenario
@@ -29,12 +29,15 @@ class ImportBarn:
     """Model of the robot."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
 
     def run(self) -> int:
         """Write the scenario files."""
         from leapnav.envs.worlds.barn import read_barn
 
-        return _write(read_barn(self.folder, robot=self.robot, horizon=self.horizon), self.out)
+        task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
+        return _write(read_barn(self.folder, **task), self.out)
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ class ImportRosMap:
     """Model of the robot."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
 
     def run(self) -> int:
         """Write the scenario files."""
@@ -92,7 +97,8 @@ class ImportRosMap:
             grid = read_ros_map(self.file, unknown=self.unknown)
         for warning in caught:
             print(f"leapnav: warning: {warning.message}", file=sys.stderr)
-        return _write(sample_on_map(grid, self.count, seed=self.seed, robot=self.robot, horizon=self.horizon), self.out)
+        task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
+        return _write(sample_on_map(grid, self.count, seed=self.seed, **task), self.out)
 
 
 @dataclass(frozen=True)
