@@ -87,6 +87,27 @@ def footprint_clearances(poses, discs, field):
     return result
 
 
+@kernel(float64(float64[:, :], CONSTANT_MATRIX, CONSTANT))
+def path_clearance(poses, discs, field):
+    """Smallest clearance (m) of the robot's outline along a path of poses (N, >= 3), N >= 2, also between them.
+
+    In the middle between two poses, the chord of a circle of the smallest disc's radius, such as around a vertex of an
+    obstacle, is closer to its centre than the arc, by the sagitta that is added.
+    """
+    radius = discs[0, 1]
+    for k in range(len(discs)):
+        radius = min(radius, discs[k, 1])
+    best = footprint_clearance(poses[0, 0], poses[0, 1], poses[0, 2], discs, field)[0]
+    for i in range(1, len(poses)):
+        x, y, heading = poses[i, 0], poses[i, 1], poses[i, 2]
+        last_x, last_y, last = poses[i - 1, 0], poses[i - 1, 1], poses[i - 1, 2]
+        best = min(best, footprint_clearance(x, y, heading, discs, field)[0])
+        sagitta = ((x - last_x) ** 2 + (y - last_y) ** 2) / (8.0 * radius)
+        x, y, heading = 0.5 * (x + last_x), 0.5 * (y + last_y), 0.5 * (heading + last)
+        best = min(best, footprint_clearance(x, y, heading, discs, field)[0] + sagitta)
+    return best
+
+
 @kernel(VECTOR(float64[:, :], CONSTANT))
 def clearances(points, field):
     """Clearance (m) of many points, shape (N, >= 2) -> (N,)."""

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearances
+from leapnav.envs.shapes.clearance import footprint_clearances, path_clearance
 from leapnav.experts.hard_limits import LARGEST_REDUCTION, SEARCH_WEIGHT, expected_limit, softened, without_barrier
 from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.problem.certificate import certify
@@ -56,6 +56,8 @@ RELAXED_WEIGHT = 2.0  # proximity weight of the relaxed barrier, at least, in un
 # Depth (robot radii) in an obstacle at which a path of the relaxed transcription is given up. The points of a coarse
 # path may be this deep although the extremal is not.
 COLLISION_DEPTH = 0.2
+# Longest step of a refined path relative to clearance + proximity scale, and largest number of parts of an interval.
+RESOLUTION, MAX_PIECES = 0.5, 16
 MAX_FAILED_EVALUATIONS = 1_000_000  # evaluations of the flow in failed Newton iterations per lattice
 MAX_VIOLATION = 1e-3  # sum of the constraint violations of a direct path
 COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 65)  # of the horizon, at which paths are compared
@@ -124,7 +126,7 @@ class LocalOptima:
         self.scenario, self.problem = scenario, softened(problem, energy, SEARCH_WEIGHT)
         self.verdicts: list[Verdict] = []
         self._relaxed_weight, self._budget = RELAXED_WEIGHT * energy, budget
-        self._depth = COLLISION_DEPTH * float(scenario.discs[:, 1].min())
+        self._radius = float(scenario.discs[:, 1].min())
         self._lift = Lifting(scenario, self.problem, self._relaxed_weight)
         self._limits = np.array(scenario.robot.limits())
         self._duplicate_distance = DUPLICATE_DISTANCE * min(
@@ -178,7 +180,7 @@ class LocalOptima:
             lifted = self._lift(path)
             if lifted is not None:
                 problem, relaxed = self._relax(lifted)
-                if self._clearance(relaxed) < -self._depth:
+                if self._clearance(relaxed) < -COLLISION_DEPTH * self._radius:
                     self.verdicts.append(Verdict(Outcome.COLLISION, problem, relaxed))
                 else:
                     found.append((problem, self._tighten(problem, relaxed)))
@@ -217,8 +219,8 @@ class LocalOptima:
         return min(costs, default=math.inf)
 
     def refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
-        """Return the optimum on halved intervals; a free horizon is changed until the cost is almost stationary."""
-        refined = direct.refined()
+        """Return the optimum on shorter intervals; a free horizon is changed until the cost is almost stationary."""
+        refined = direct.refined(self._pieces(direct))
         if problem.horizon is not None or not direct.converged:
             return self._optimise(problem, refined)
         for _ in range(MAX_RESCALED):
@@ -264,7 +266,7 @@ class LocalOptima:
             return Verdict(Outcome.DUPLICATE, problem, refined)
         if self._is_discarded(refined, REFINED_ERROR):
             return Verdict(Outcome.EXPENSIVE, problem, refined)
-        if not refined.converged and self._clearance(refined) <= 0.0:
+        if self._clearance(refined) <= 0.0:
             return Verdict(Outcome.COLLISION, problem, refined)
         return self._solve(problem, refined)
 
@@ -331,9 +333,21 @@ class LocalOptima:
         found = (Outcome.CERTIFIED, Outcome.REFUSED)
         return [v.extremal for v in self.verdicts if v.outcome in found and v.extremal is not None]
 
+    def _pieces(self, path: DirectPath) -> np.ndarray:
+        """Return the numbers of parts (N,), at least 2, into which the intervals of a path are divided.
+
+        In a narrow passage, where the proximity cost is high, a path can be so fast that it crosses the passage within
+        one interval. The intervals there are divided into steps that resolve the proximity cost.
+        """
+        middles = 0.5 * (path.states[1:] + path.states[:-1])
+        clearance = footprint_clearances(middles, self.scenario.discs, self.scenario.field)
+        steps = np.hypot(*np.diff(path.states[:, :2], axis=0).T)
+        resolved = RESOLUTION * (np.maximum(clearance, 0.0) + self.scenario.cost.proximity_scale)
+        return np.ceil(steps / resolved).astype(int).clip(2, MAX_PIECES)
+
     def _clearance(self, path: DirectPath) -> float:
-        """Return the smallest clearance (m) at the points of a path."""
-        return float(footprint_clearances(path.states, self.scenario.discs, self.scenario.field).min())
+        """Return the smallest clearance (m) along a path."""
+        return path_clearance(path.states, self.scenario.discs, self.scenario.field)
 
     def _is_expensive(self, path: DirectPath, error: float) -> bool:
         """Return whether a path costs more than the best extremal, apart from the relative error of its cost.

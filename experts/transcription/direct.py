@@ -65,12 +65,20 @@ class DirectPath:
     violation: float
     converged: bool
 
-    def refined(self) -> DirectPath:
-        """Return the path with every interval halved, as an initial guess of the finer discretisation."""
-        times = np.interp(np.arange(2 * len(self.controls) + 1) / 2, np.arange(len(self.times)), self.times)
+    def refined(self, pieces: np.ndarray | int = 2) -> DirectPath:
+        """Return the path with intervals divided, as an initial guess of the finer discretisation.
+
+        Args:
+            pieces: number of parts of each interval, (N,) or the same for all.
+
+        """
+        pieces = np.broadcast_to(pieces, len(self.controls))
+        index = np.repeat(np.arange(len(pieces)), pieces)
+        first = np.cumsum(pieces) - pieces
+        fractions = (np.arange(len(index)) - first[index]) / pieces[index]
+        times = np.append(self.times[index] + fractions * np.diff(self.times)[index], self.times[-1])
         states, costates = (interpolate(times, self.times, array) for array in (self.states, self.costates))
-        controls = np.repeat(self.controls, 2, axis=0)
-        return DirectPath(times, states, controls, costates, self.cost, self.violation, False)
+        return DirectPath(times, states, self.controls[index], costates, self.cost, self.violation, False)
 
     def scaled(self, factor: float) -> DirectPath:
         """Return the path with all times multiplied by a factor, which keeps the cost of the path."""
