@@ -28,14 +28,12 @@ from leapnav.envs.utils.validation import check_at_least, check_choice
 from leapnav.experts.data.store import Arrays, Job, ResumableStore, discard
 from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.pools import process_pool
-from leapnav.experts.problem.extremal import Status
 
 
 class Rejection(Enum):
     """Why a scenario is not admitted to a bank. The values are part of the bank files."""
 
     NO_OPTIMUM = "no certified optimum"
-    COLLISION = "a cheaper extremal touches"
     UNRESOLVED = "a cheaper solution was not certified"
 
 
@@ -43,13 +41,10 @@ def judge(optimum: Optimum) -> Rejection | None:
     """The reason why an optimum is no safe reference, None if it is safe.
 
     A safe reference is certified, hence without collision and without a conjugate point, and the search found no
-    cheaper solution that lacks a certificate. If a cheaper extremal cuts slightly into an obstacle, the true optimum
-    may be a path in contact with that obstacle.
+    cheaper solution that lacks a certificate.
     """
     if not optimum.success:
         return Rejection.NO_OPTIMUM
-    if any(doubt.status is Status.COLLISION for doubt in optimum.doubts):
-        return Rejection.COLLISION
     return Rejection.UNRESOLVED if optimum.doubts else None
 
 
