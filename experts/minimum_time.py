@@ -18,6 +18,7 @@ import numpy as np
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import check_positive
 from leapnav.experts.continuation import continuation
+from leapnav.experts.hard_limits import follow_limit, without_barrier
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
@@ -59,7 +60,7 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
     """Find a path of minimum time with bounded controls, by continuation to small control weights.
 
     The horizon, the control weights and the time weight of the task are ignored. A state cost and the proximity cost of
-    obstacles are kept: the cost is the time plus their integral.
+    obstacles are kept: the cost is the time plus their integral. With hard limits it is the time.
 
     Args:
         task: a problem with control bounds, or a scenario.
@@ -140,10 +141,14 @@ def _first(task: OptimalControlProblem | Scenario, problem: OptimalControlProble
 
 
 def _follow(start: Extremal, problems: Sequence[OptimalControlProblem]) -> _End:
-    """Solve the problems one after the other, up to the first that no method solves, with the winding of the start."""
+    """Solve the problems one after the other, up to the first that no method solves, with the winding of the start.
+
+    With hard limits, all have the barrier weight of the start.
+    """
     if not start.success:
         return _End(start, 0)
-    remaining = [replace(problem, goal=start.problem.goal) for problem in problems]
+    barrier = start.problem.barrier_weight
+    remaining = [replace(problem, goal=start.problem.goal, barrier_weight=barrier) for problem in problems]
     extremal, failed = start, start
     for method in METHODS:
         # The problem of the guess is the first of the sequence, so that the step control applies to the second.
@@ -154,7 +159,13 @@ def _follow(start: Extremal, problems: Sequence[OptimalControlProblem]) -> _End:
         if not remaining:
             break
     count = len(problems) - len(remaining)
-    return _End(extremal if count else failed, count)
+    return _End(_limit(extremal) if count else failed, count)
+
+
+def _limit(extremal: Extremal) -> Extremal:
+    """Return the extremal close to the limit of hard limits; with the barrier that it has if that is not reached."""
+    limit = follow_limit(extremal)
+    return limit if limit.success else without_barrier(extremal)
 
 
 def switching_structure(extremal: Extremal, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,12 +11,14 @@ from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.utils.validation import as_vector
+from leapnav.experts.acting.barrier import barrier_integral, reference_problem
 from leapnav.experts.acting.gains import Gains
 from leapnav.experts.acting.tracking import FLOW_ACCURACY, advance, control_at, follow, follow_all
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.optimum import find_optimum
+from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, ProblemArrays, Trajectory
 from leapnav.experts.solvers.newton import CONVERGED, MARGIN
 from leapnav.experts.solvers.nodes import start_nodes
@@ -41,14 +43,24 @@ class _Solution(NamedTuple):
         times: (K + 1,), in the episode (s).
         nodes: (K + 1, 2n), states and costates.
         costs: (K,), of the segments.
-        arrays: the problem, whose goal has the winding of the solution.
+        problem: the problem, whose goal has the winding of the solution.
 
     """
 
     times: np.ndarray
     nodes: np.ndarray
     costs: np.ndarray
-    arrays: ProblemArrays
+    problem: OptimalControlProblem
+
+    @property
+    def arrays(self) -> ProblemArrays:
+        """The problem in the form that the kernels take."""
+        return self.problem.arrays
+
+    @property
+    def cost(self) -> float:
+        """The cost-to-go, without the barrier of hard limits."""
+        return float(self.costs.sum()) - barrier_integral(self.problem, self.times, self.nodes)
 
 
 class Feedback:
@@ -58,9 +70,12 @@ class Feedback:
     states and costates at the remaining nodes converge. If they fail, the state is approached in smaller steps; if this
     fails too, or leads through an obstacle, a new search is made.
 
+    With hard obstacles, the solutions have the barrier of the last optimum that was given or found. The cost-to-go
+    excludes it.
+
     Args:
         scenario: the scenario.
-        path: its optimum or an approximation of it, with costates.
+        path: its optimum, or an approximation of it with costates.
         quick: use quick searches, see `find_optimum`.
 
     Attributes:
@@ -71,12 +86,12 @@ class Feedback:
 
     """
 
-    def __init__(self, scenario: Scenario, path: Trajectory, *, quick: bool = False) -> None:
+    def __init__(self, scenario: Scenario, path: Trajectory | Extremal, *, quick: bool = False) -> None:
         self.scenario, self._quick = scenario, quick
         self.searches = 0
         self._next_search = 0.0  # s; earliest time of the next search
         self._n, self._m = scenario.robot.sizes()
-        found = _solve_along(OptimalControlProblem.from_scenario(scenario), path, 0.0)
+        found = _solve_along(reference_problem(OptimalControlProblem.from_scenario(scenario), path), path, 0.0)
         if found is None:
             self.searches += 1
             found = self._search(np.array(scenario.start_state), 0.0)
@@ -120,12 +135,12 @@ class Feedback:
         found, _ = self._resolve(as_vector("state", state, self._n), time, tol)
         if found is None:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
-        return float(found.costs.sum()), found.nodes[0, self._n :].copy()
+        return found.cost, found.nodes[0, self._n :].copy()
 
     @property
     def stored(self) -> tuple[float, np.ndarray]:
         """Cost-to-go and costate (n,) at the state and time of the stored solution."""
-        return float(self._stored.costs.sum()), self._stored.nodes[0, self._n :].copy()
+        return self._stored.cost, self._stored.nodes[0, self._n :].copy()
 
     @property
     def final_costate(self) -> np.ndarray:
@@ -139,7 +154,7 @@ class Feedback:
             FloatingPointError: the solution diverges on the way to this time.
 
         """
-        times, nodes, _, arrays = self._stored
+        times, nodes, arrays = self._stored.times, self._stored.nodes, self._stored.arrays
         control = control_at(arrays.flow, arrays.control, times, nodes, time, self._m)
         if not np.isfinite(control).all():
             raise FloatingPointError(f"the stored solution diverges before {time:g} s")
@@ -152,7 +167,7 @@ class Feedback:
             FloatingPointError: the sensitivities diverge along the solution.
 
         """
-        stored_times, stored_nodes, _, arrays = self._stored
+        stored_times, stored_nodes, arrays = self._stored.times, self._stored.nodes, self._stored.arrays
         start, end = float(stored_times[0]), float(stored_times[-1])
         times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_SAMPLING - 1e-9) + 1))
         extremal = np.array([follow(arrays.flow, stored_times, stored_nodes, time) for time in times])
@@ -208,7 +223,7 @@ class Feedback:
 
     def _clearance(self, solution: _Solution) -> float:
         """Smallest clearance (m) of states of a solution that are evenly spaced in time."""
-        times, nodes, _, arrays = solution
+        times, nodes, arrays = solution.times, solution.nodes, solution.arrays
         count = math.ceil((times[-1] - times[0]) / CLEARANCE_SAMPLING) + 1
         moments = np.linspace(times[0], times[-1], count)
         states = follow_all(arrays.flow, times, nodes, moments)
@@ -229,17 +244,18 @@ class Feedback:
         optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
         if not optimum.success:
             return None
-        path = Trajectory(optimum.times, optimum.states, optimum.costates)
-        return _solve_along(optimum.problem, path, time)
+        return _solve_along(optimum.problem, optimum, time)
 
 
-def _solve_along(problem: OptimalControlProblem, path: Trajectory, start_time: float) -> _Solution | None:
+def _solve_along(problem: OptimalControlProblem, path: Trajectory | Extremal, start_time: float) -> _Solution | None:
     """Return the solution close to a path of a problem that starts at `start_time` (s) in the episode."""
+    if isinstance(path, Extremal):
+        path = Trajectory(path.times, path.states, path.costates)
     problem = problem.with_winding_of(path.states)
     for duration in SEGMENT_DURATIONS:
         segments = max(1, math.ceil(problem.horizon_of(path) / duration - 1e-9))
         times, nodes = start_nodes(problem, path, segments)
-        guess = _Solution(times + start_time, nodes, np.zeros(segments), problem.arrays)
+        guess = _Solution(times + start_time, nodes, np.zeros(segments), problem)
         found, _, _ = _solve_from(guess, problem.arrays.start, start_time, TOLERANCE)
         if found is not None:
             return found
@@ -253,9 +269,10 @@ def _solve_from(
 
     Returns the solution, None without convergence, and the times and values of the remaining nodes.
     """
-    times, nodes, _, arrays = guess
-    code, times, nodes, costs, remaining = advance(arrays.flow, times, nodes, state, time, arrays.end, MARGIN * tol)
-    return (_Solution(times, nodes, costs, arrays) if code == CONVERGED else None), times, remaining
+    times, nodes, _, problem = guess
+    flow, end = problem.arrays.flow, problem.arrays.end
+    code, times, nodes, costs, remaining = advance(flow, times, nodes, state, time, end, MARGIN * tol)
+    return (_Solution(times, nodes, costs, problem) if code == CONVERGED else None), times, remaining
 
 
 def _approach(guess: _Solution, state: np.ndarray, tol: float) -> _Solution | None:

@@ -78,6 +78,7 @@ class _Robot:
     """The solution of one robot's episode.
 
     Attributes:
+        solved: whether the last action is that of a solution from the state at its time.
         progress: time (s) of the point of the extremal to which the gains apply.
 
     """
@@ -87,7 +88,7 @@ class _Robot:
     limits: np.ndarray
     feedback: Feedback
     gains: Gains | None
-    label: tuple[float, np.ndarray]  # cost-to-go and costate of the last action
+    solved: bool = False
     progress: float = 0.0
 
 
@@ -210,12 +211,11 @@ class ExpertPolicy:
         They are accurate to 1e-6, and NaN if the goal could not be reached. All are NaN unless the feedback is
         "resolve".
         """
-        found = [self._no_label if robot is None else robot.label for robot in self._robots]
+        found = [
+            robot.feedback.stored if robot is not None and robot.solved else (math.nan, np.full(self._n, math.nan))
+            for robot in self._robots
+        ]
         return np.array([cost for cost, _ in found]), np.array([costate for _, costate in found])
-
-    @property
-    def _no_label(self) -> tuple[float, np.ndarray]:
-        return math.nan, np.full(self._n, math.nan)
 
     def _ask(self, state: Any, time: Any) -> list[tuple[float, np.ndarray]]:
         situations = self._situations()
@@ -249,8 +249,7 @@ class ExpertPolicy:
             control = robot.gains.control(situation.state, robot.progress, ahead)
         else:
             if self._feedback == "resolve":
-                solved = robot.feedback.update(situation.state, situation.time)
-                robot.label = robot.feedback.stored if solved else self._no_label
+                robot.solved = robot.feedback.update(situation.state, situation.time)
             control = robot.feedback.control(situation.time + ahead)
         return control / robot.limits
 
@@ -270,14 +269,14 @@ class ExpertPolicy:
             if not optimum.success:
                 message = f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}"
                 raise NoOptimumError(message, scenario)
-            path = Trajectory(optimum.times, optimum.states, optimum.costates)
+            path = optimum
         try:
             feedback = Feedback(scenario, path, quick=self._quick)
             gains = feedback.gains() if self._feedback == "gains" else None
         except (ValueError, FloatingPointError) as error:
             raise NoOptimumError(str(error), scenario) from None
         limits = np.array(scenario.robot.limits())
-        robot = _Robot(scenario, situation.time, limits, feedback, gains, self._no_label)
+        robot = _Robot(scenario, situation.time, limits, feedback, gains)
         self._robots[i] = robot
         return robot
 

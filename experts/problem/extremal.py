@@ -297,6 +297,7 @@ class Extremal:
                 "advice": self.status.value,
                 "success": self.success,
                 "cost": self.cost,
+                "barrier": self.barrier,
                 "horizon": self.horizon,
                 "certificate": self.certificate,
                 "times": self.times.tolist(),

@@ -21,6 +21,8 @@ function show() {
   if (needed) setText("use-horizon", `Use ${needed}\u00a0s`);
   setText("notice", play.notice || "");
   setText("cost", path ? format(path.cost, 6) : "–");
+  byId("barrier-term").hidden = byId("barrier").hidden = !(path && path.barrier > 0);
+  if (path) setText("barrier", `${format(100 * path.barrier, 3)}\u00a0% of J`);
   setText("duration", path ? `${format(durationOf(path), 3)}\u00a0s` : "–");
   setText("clearance", path && path.clearance !== null ? `${format(path.clearance, 3)}\u00a0m` : "–");
   setText("residual", path && path.residual !== null ? path.residual.toExponential(0) : "–");

@@ -190,6 +190,7 @@ def _summary(optimum: Optimum, points: int) -> dict[str, Any]:
     certificate = optimum.certificate
     return {
         "cost": optimum.cost,
+        "barrier": optimum.barrier,
         "states": _rows(states),
         "driving": list(optimum.driving_modes),
         "sides": "".join(side[0].upper() for side in optimum.path_class),

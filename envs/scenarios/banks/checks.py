@@ -28,8 +28,10 @@ PRECISION = 4 * float(np.finfo(np.float32).eps)
 # The motion under the mean of the controls at two successive points ends at the second point, except for this fraction
 # of the largest difference of successive states. In the included banks that is at most 0.05.
 MOTION_TOLERANCE = 0.5
-# The trapezoidal rule yields the cost with this relative error. In the included banks that is at most 0.004.
-COST_TOLERANCE = 0.05
+# The trapezoidal rule yields the cost with this relative error: in the included banks at most 0.004, except in one narrow
+# passage, where the proximity cost has peaks between the points. With this number of points per interval, interpolated
+# by splines, the error is 0.009 there.
+COST_TOLERANCE, INTERPOLATED = 0.05, 8
 # Duration (s) of the motion whose difference quotient is the direction in which a control acts. The relative error of
 # its product with the costates is at most 6e-5 in the included banks.
 ACTION_TIME, ACTION_TOLERANCE = 1e-4, 1e-3
@@ -232,17 +234,27 @@ def _check_costates(scenario: Scenario, states: np.ndarray, controls: np.ndarray
 
 
 def _check_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float, cost: float) -> None:
-    """Check that the cost is between the cost of the controls and that of the path."""
+    """Check that the cost is that of the path; with hard obstacles, the one without the barrier."""
+    total = _path_cost(scenario, states, controls, interval)
+    if not abs(cost - total) <= COST_TOLERANCE * total:
+        from scipy.interpolate import CubicSpline  # imported here because that takes time, and it is rarely used
+
+        at = np.arange(len(states)), np.linspace(0, len(states) - 1, INTERPOLATED * (len(states) - 1) + 1)
+        fine = (CubicSpline(at[0], values)(at[1]) for values in (states, controls))
+        total = _path_cost(scenario, *fine, interval / INTERPOLATED)
+    if not abs(cost - total) <= COST_TOLERANCE * total:
+        raise ValueError(f"costs: expected {total:.4g}, the cost of the path, got {cost:.4g}")
+
+
+def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float) -> float:
+    """Return the cost of a path by the trapezoidal rule."""
     robot = scenario.robot
     parameters, discs = np.array(robot.parameters(scenario.cost), dtype=float), scenario.discs.tolist()
     running = np.square(controls) @ np.array(robot.control_weight(scenario.cost)) / 2 + scenario.cost.time_weight
-    least = float(np.trapezoid(running, dx=interval))
     state_cost = type(robot).state_cost
     for k, state in enumerate(states):
         x, y, heading = state[:3].tolist()
         cos, sin = math.cos(heading), math.sin(heading)
         running[k] += sum(proximity_value(x + a * cos, y + a * sin, radius, scenario.field) for a, radius in discs)
         running[k] += 0.0 if state_cost is None else state_cost(state, parameters)
-    total = float(np.trapezoid(running, dx=interval))
-    if not least * (1 - COST_TOLERANCE) <= cost <= total * (1 + COST_TOLERANCE):
-        raise ValueError(f"costs: expected {least:.4g} to {total:.4g}, the costs of controls and path, got {cost:.4g}")
+    return float(np.trapezoid(running, dx=interval))

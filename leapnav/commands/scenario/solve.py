@@ -54,6 +54,8 @@ class Solve:
         if certificate is not None:
             conjugate = certificate.conjugate_point
             print(f"  cost               {extremal.cost:.9f}")
+            if extremal.problem.has_hard_limits:
+                print(f"  barrier            {100 * extremal.barrier:.3f} % of the cost, which excludes it")
             if scenario.horizon is None:
                 print(f"  horizon            {extremal.horizon:.6f} s (free)")
                 print(f"  d2J/dT2            {certificate.time_curvature:.3g}")
@@ -61,7 +63,7 @@ class Solve:
             print(f"  defect             {certificate.defect:.1e}")
             print(f"  drift of H         {certificate.hamiltonian_drift:.1e}")
             print(f"  conjugate point    {_describe_conjugate_point(conjugate)}")
-            print(f"  clearance          {certificate.clearance:.3f} m")
+            print(f"  clearance          {_describe_clearance(certificate.clearance)}")
             scope = " (of the best candidate only)" if self.method == "optimum" else ""
             print(f"  iterations         {len(extremal.history)}{scope}")
             print(f"  evaluations        {extremal.n_evaluations}{scope}")
@@ -84,6 +86,13 @@ class Solve:
         if self.plot is not None and extremal is not None and len(extremal.times):
             plot_extremal(extremal, self.plot, scenario)
             print(f"wrote {self.plot}")
+
+
+def _describe_clearance(clearance: float | None) -> str:
+    """Return a clearance in millimetres, or with two digits below that, as close to hard obstacles."""
+    if clearance is None:
+        return "-"
+    return f"{clearance:.3f} m" if abs(clearance) >= 0.01 else f"{clearance:.2g} m"
 
 
 def _describe_conjugate_point(time: float | None) -> str:
@@ -170,7 +179,7 @@ def _print_alternatives(optimum: Optimum) -> None:
             f"{extremal.cost:.6f}",
             f"{100 * (extremal.cost / optimum.cost - 1):.2f} %" if optimum.cost > 0 else "-",
             f"{extremal.heading_winding:+d}" if extremal.heading_winding else "0",
-            "-" if clearance is None else f"{clearance:.3f} m",
+            _describe_clearance(clearance),
             ", ".join(extremal.driving_modes) or "rotate in place",
             "".join(side[0].upper() for side in extremal.path_class) or "-",
         )
