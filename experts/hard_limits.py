@@ -15,8 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.problem.extremal import Extremal, Status
-from leapnav.experts.problem.problem import OptimalControlProblem
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.nodes import SolverOptions
 
@@ -35,6 +36,7 @@ SEARCH_WEIGHT, SINGLE_WEIGHT = 0.2, 2.0
 # Reduction of the cost, barrier included, on the way to the limit, as a multiple of the integral of the barrier: the
 # expected one, since the cost without the barrier decreases about as much as the barrier, and the largest one.
 EXPECTED_REDUCTION, LARGEST_REDUCTION = 2.0, 3.0
+MAX_FIT_ERROR = 0.1  # largest deviation from a constant Hamiltonian, relative to the variation of the barrier
 MAX_FOLLOWED = 4  # local optima that are followed at most
 GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)  # per step of the integrator
 
@@ -52,6 +54,36 @@ def softened(problem: OptimalControlProblem, energy: float, factor: float = SING
     if problem.barrier_weight > 0.0 or (is_soft and not problem.has_hard_limits):
         return problem
     return problem.with_barrier(factor * energy)
+
+
+def fitted_weight(problem: OptimalControlProblem, path: Trajectory, energy: float) -> float | None:
+    """Return the barrier weight of a path with costates that is close to an extremal of a barrier problem.
+
+    The Hamiltonian of the barrier problem is constant, so that without the barrier it is linear in the barrier, with
+    the weight as the negative slope. In single precision the weight has four correct digits.
+
+    Args:
+        problem: the problem without a barrier weight.
+        path: the path.
+        energy: mean running cost E of the path.
+
+    Returns:
+        The weight; None if the path is not close to such an extremal, or too far from the limits.
+
+    """
+    if path.costates is None:
+        return None
+    states = np.asarray(path.states, dtype=float)
+    barriers = problem.with_barrier(1.0).barrier_cost(states)
+    values = hamiltonians(problem.arrays.flow, np.concatenate([states, path.costates], axis=1))
+    barriers, values = barriers - barriers.mean(), values - values.mean()
+    spread = float(barriers @ barriers)
+    if spread == 0.0:
+        return None
+    weight = -float(barriers @ values) / spread
+    error = float(np.linalg.norm(values + weight * barriers))
+    is_close = error <= MAX_FIT_ERROR * weight * math.sqrt(spread)
+    return weight if is_close and 0.0 < weight <= SINGLE_WEIGHT * energy else None
 
 
 def barrier_integrals(extremal: Extremal) -> np.ndarray:

@@ -17,7 +17,7 @@ from leapnav.envs.utils.validation import (
     check_integer,
     check_positive,
 )
-from leapnav.experts.hard_limits import BARRIER_TOLERANCE, follow_limit, softened
+from leapnav.experts.hard_limits import BARRIER_TOLERANCE, fitted_weight, follow_limit, softened
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
@@ -99,7 +99,7 @@ def solve(
     solver = METHODS[method]
     if guess is not None:
         ocp, path, options = _from_guess(ocp, guess, options)
-        extremal = solver(_softened(ocp, guess, path), path, options)
+        extremal = _solve_softened(solver, ocp, guess, path, options)
     elif ocp.horizon is None and ocp.starts_at_goal:
         extremal = failure(ocp, Status.ZERO_HORIZON)
     elif isinstance(problem, Scenario):
@@ -116,13 +116,26 @@ def solve(
     return extremal
 
 
-def _softened(problem: OptimalControlProblem, guess: Trajectory | Extremal, path: Trajectory) -> OptimalControlProblem:
-    """Return the problem with the barrier weight that suits a guess."""
+def _solve_softened(
+    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    problem: OptimalControlProblem,
+    guess: Trajectory | Extremal,
+    path: Trajectory,
+    options: SolverOptions,
+) -> Extremal:
+    """Solve with the barrier weight that suits a guess: its own if it has one, or that of a first extremal."""
     if problem.barrier_weight > 0.0:
-        return problem
+        return solver(problem, path, options)
     if isinstance(guess, Extremal) and guess.problem.barrier_weight > 0.0:
-        return problem.with_barrier(guess.problem.barrier_weight) if problem.has_hard_limits else problem
-    return softened(problem, mean_running_cost(problem, path))
+        weight = guess.problem.barrier_weight if problem.has_hard_limits else 0.0
+        return solver(problem.with_barrier(weight), path, options)
+    energy = mean_running_cost(problem, path)
+    weight = fitted_weight(problem, path, energy) if problem.has_hard_limits else None
+    if weight is not None:
+        extremal = solver(problem.with_barrier(weight), path, options)
+        if extremal.success:
+            return extremal
+    return solver(softened(problem, energy), path, options)
 
 
 def _without_guess(

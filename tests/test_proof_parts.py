@@ -12,7 +12,6 @@ from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.shapes.proximity import proximity_value
-from leapnav.experts.bounds.lower_bound import first_grid
 from leapnav.experts.proofs.cells import CellSet, Grid
 from leapnav.experts.proofs.checker import check_proof
 from leapnav.experts.proofs.gauge import gauge, gauge_minimum, gradient_bound, make_source
@@ -78,17 +77,97 @@ def test_the_minimum_of_the_gauge_over_a_box_is_a_lower_bound(rng: np.random.Gen
         assert lowest <= gauge(*pose, source)
 
 
-def test_the_running_cost_is_bounded_on_every_square(rng: np.random.Generator):
-    scenario = sample_scenario("polygons", seed=1)
-    grid = first_grid(scenario)
+WALLS_AND_CORNERS = (
+    {"circle": {"center": (2.6, 2.2), "radius": 0.4}},
+    {"polygon": {"vertices": ((1.0, 3.0), (2.0, 3.4), (1.2, 4.2))}},
+    {"polygon": {"vertices": ((3.2, 3.3), (3.8, 3.3), (3.8, 3.9), (3.2, 3.9))}},
+    {"circle": {"center": (3.3, 2.2), "radius": 0.05}},  # a passage between two discs that is narrower than the robot
+)
+
+
+def barrier_sums(points: np.ndarray, scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return the clearance (N,) and the sum of 1 / (exp(d / scale) - 1) over all obstacles, from their geometry."""
+    radius, scale = float(scenario.discs[0, 1]), scenario.cost.proximity_scale
+    x_min, y_min, x_max, y_max = scenario.arena
+    x, y = points.T
+    distances = [x - x_min, x_max - x, y - y_min, y_max - y]
+    for obstacle in scenario.to_dict()["obstacles"]:
+        if "circle" in obstacle:
+            circle = obstacle["circle"]
+            distances.append(np.hypot(*(points - circle["center"]).T) - circle["radius"])
+            continue
+        first = np.array(obstacle["polygon"]["vertices"])
+        edges = np.roll(first, -1, axis=0) - first  # counter-clockwise
+        offsets = points[:, None] - first
+        along = np.clip((offsets * edges).sum(-1) / (edges**2).sum(-1), 0.0, 1.0)
+        apart = np.linalg.norm(offsets - along[..., None] * edges, axis=-1).min(axis=1)
+        inside = (edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] > 0).all(axis=1)
+        distances.append(np.where(inside, -apart, apart))
+    lengths = np.array(distances) - radius
+    with np.errstate(divide="ignore", over="ignore"):
+        return lengths.min(axis=0), (1.0 / np.expm1(lengths / scale)).sum(axis=0)
+
+
+@pytest.mark.parametrize("spacing", [0.2, 0.05, 0.0125])
+@pytest.mark.parametrize("weight", [0.0, 0.03, 1.0])
+def test_the_running_cost_is_bounded_on_every_square(spacing: float, weight: float, rng: np.random.Generator):
+    """At 49 points of each square, with its corners, and close to contact; Phi is computed without the kernels."""
+    scenario = Scenario(
+        arena=(0.0, 0.0, 5.0, 5.0),
+        start=(0.8, 0.8, 0.3),
+        goal=(4.2, 4.0, 1.2),
+        horizon=6.5,
+        obstacles=WALLS_AND_CORNERS,
+        cost={"proximity_weight": weight},
+    )
+    grid = Grid.over(scenario.arena, spacing, 8)
     cost = running_cost(scenario, grid, np.ones((grid.columns, grid.lines), dtype=bool))
-    n, field = cost.squares.shape[2], scenario.field
-    for x, y in rng.uniform(0.0, 10.0, (4000, 2)):
-        u, v = (x - grid.x) / grid.spacing, (y - grid.y) / grid.spacing
-        square = cost.squares[int(u), int(v), int(u % 1 * n), int(v % 1 * n)]
-        if clearance(x, y, field)[0] >= 0:
-            assert square <= proximity_value(x, y, field[2], field)
-            assert cost.lowest[int(u), int(v)] <= min(proximity_value(x, y, field[2], field), square * (1 + 1e-6))
+    n = cost.squares.shape[2]
+    width = spacing / n
+    squares = np.stack(np.meshgrid(np.arange(n * grid.columns), np.arange(n * grid.lines), indexing="ij"), axis=-1)
+    squares = squares.reshape(-1, 2)
+    if len(squares) > 40000:  # those near contact, and some others
+        centres = (grid.x, grid.y) + (squares + 0.5) * width
+        near = np.abs(barrier_sums(centres, scenario)[0]) < 0.75 * width
+        others = rng.permutation(np.flatnonzero(~near))
+        squares = squares[np.concatenate([np.flatnonzero(near)[:15000], others[:15000]])]
+    steps = np.array([0.0, 1e-3, 0.2, 0.5, 0.7, 1.0 - 1e-3, 1.0])
+    checked, tightest = 0, np.inf
+    for u in steps:
+        for v in steps:
+            points = (grid.x, grid.y) + (squares + np.array([u, v])) * width
+            clearances, sums = barrier_sums(points, scenario)
+            free = clearances > 1e-9
+            i, j = squares[free].T // n
+            a, b = squares[free].T % n
+            bounds, phi = cost.squares[i, j, a, b], weight * np.minimum(sums[free], 1e12)
+            assert not np.isnan(bounds).any()  # a collision-free point
+            assert (bounds <= phi * (1 + 1e-9)).all()
+            assert (cost.lowest[i, j] <= bounds * (1 + 1e-6)).all()  # which is in single precision
+            checked += len(phi)
+            if weight > 0.0:
+                tightest = min(tightest, float((phi / bounds)[sums[free] > 1e-3].min()))
+    assert checked > 100_000
+    if weight > 0.0:  # at a corner
+        assert tightest < 1.01
+
+
+def test_the_running_cost_is_bounded_where_squares_are_small_in_proximity_scales(rng: np.random.Generator):
+    """Near contact, the kernels replace the barrier by a polynomial, which the bound must not exceed either."""
+    scenario = Scenario(
+        arena=(0.0, 0.0, 5.0, 5.0),
+        start=(0.8, 0.8, 0.3),
+        goal=(4.2, 4.0, 1.2),
+        horizon=6.5,
+        obstacles=WALLS_AND_CORNERS,
+        cost={"proximity_scale": 1e4},
+    )
+    grid = Grid.over(scenario.arena, 0.1, 8)
+    cost = running_cost(scenario, grid, np.ones((grid.columns, grid.lines), dtype=bool))
+    for x, y in rng.uniform(0.2, 4.8, (4000, 2)):
+        if clearance(x, y, scenario.field)[0] > 0:
+            lowest = cost.lowest[int((x - grid.x) / 0.1), int((y - grid.y) / 0.1)]
+            assert 0.0 < lowest <= proximity_value(x, y, scenario.field[2], scenario.field)
 
 
 def test_control_points_bound_the_gradient(rng: np.random.Generator):

@@ -8,8 +8,7 @@ import math
 import numpy as np
 
 from leapnav.experts.acting.tracking import follow_all
-from leapnav.experts.hard_limits import GAUSS_NODES, GAUSS_WEIGHTS, SEARCH_WEIGHT, SINGLE_WEIGHT
-from leapnav.experts.numerics.shooting import hamiltonians
+from leapnav.experts.hard_limits import GAUSS_NODES, GAUSS_WEIGHTS, SEARCH_WEIGHT, fitted_weight
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.transcription.direct import mean_running_cost
@@ -20,11 +19,7 @@ PANEL = 0.1
 
 
 def reference_problem(problem: OptimalControlProblem, path: Trajectory | Extremal) -> OptimalControlProblem:
-    """Return a problem with the barrier weight of a reference.
-
-    An extremal has it in its problem. For a path with costates it follows from the Hamiltonian, which is constant: that
-    without the barrier is linear in the barrier, with the weight as the negative slope. It is found to four digits in
-    single precision. Far from all obstacles, it is undetermined, and is that of the first extremals of a search.
+    """Return a problem with the barrier weight of a reference; far from all limits, with that of a search.
 
     Args:
         problem: the problem, without a barrier weight.
@@ -36,12 +31,7 @@ def reference_problem(problem: OptimalControlProblem, path: Trajectory | Extrema
     if isinstance(path, Extremal):
         return problem.with_barrier(path.problem.barrier_weight)
     energy = mean_running_cost(problem, path)
-    if path.costates is None:
-        return problem.with_barrier(SINGLE_WEIGHT * energy)
-    barriers = problem.with_barrier(1.0).barrier_cost(path.states)
-    values = hamiltonians(problem.arrays.flow, np.concatenate([path.states, path.costates], axis=1))
-    (_, weight), *_ = np.linalg.lstsq(np.stack([np.ones_like(barriers), -barriers], axis=1), values, rcond=None)
-    return problem.with_barrier(weight if 0.0 < weight <= SINGLE_WEIGHT * energy else SEARCH_WEIGHT * energy)
+    return problem.with_barrier(fitted_weight(problem, path, energy) or SEARCH_WEIGHT * energy)
 
 
 def barrier_integral(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> float:

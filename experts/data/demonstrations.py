@@ -25,8 +25,9 @@ from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions
+from leapnav.experts.hard_limits import without_barrier
 from leapnav.experts.problem.extremal import Extremal
-from leapnav.experts.problem.problem import Trajectory
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solve import solve
 
 ENVIRONMENT = "leapnav/Navigate-v0"
@@ -214,7 +215,9 @@ def recovery(
     states, _, costates = extremal.evaluate(times + time)
     times[-1] = extremal.horizon - time
     states += perturbation * np.exp(-times / PERTURBATION_DECAY)[:, None]
-    solution = solve(rest, "multiple_shooting", guess=Trajectory(times, states, costates))
+    problem = OptimalControlProblem.from_scenario(rest).with_barrier(extremal.problem.barrier_weight)
+    guess = Trajectory(times, states, costates)
+    solution = without_barrier(solve(problem, "multiple_shooting", guess=guess))
     factor, summand = MAX_RECOVERY_COST
     if not solution.success or solution.cost > factor * float(extremal.cost_to_go(time)) + summand:
         return None

@@ -1,9 +1,22 @@
 """Lower bounds of the running cost E + Phi on the cells of a grid (kernel).
 
-Each term of Phi is the proximity weight times exp(-(d - radius) / scale) with a distance d that is Lipschitz continuous
-with constant 1. So log Phi is Lipschitz continuous with constant 1 / scale, and on a square with centre p and half
-diagonal e, Phi >= Phi(p) exp(-e / scale). The clearance is Lipschitz continuous with constant 1, too: a square whose
-centre has a clearance below -e contains no point that a collision-free path can reach.
+Phi is the weight k times a sum of b(d / scale), with b(s) = 1 / (exp(s) - 1) and distances d that are Lipschitz
+continuous with constant 1. On a square with half diagonal e let r = e / scale. A term that is b_i at the centre is at
+least 1 / ((1 + 1 / b_i) exp(r) - 1) = g(b_i), with
+
+    g(B) = B / (exp(r) + (exp(r) - 1) B).
+
+g is concave with g(0) = 0, hence subadditive: all terms together are at least g(B) with their sum B at the centre.
+Below the distance c, `CONTACT`, the kernels replace b by its second-order Taylor polynomial at c. From 0 to c it is at
+most b(s), since the third derivative of b is negative, and wherever s < c it is at least b(c). So
+
+    Phi >= k min(g(B), b(c))
+
+at the collision-free points of a square; min(g, b(c)) is subadditive, too. A term whose obstacle contains the centre is
+covered, since it is at least b(r) > g(B) or at least b(c). With k = 0 the bound is 0.
+
+The clearance is Lipschitz continuous with constant 1, too: a square whose centre has a clearance below -e contains no
+point that a collision-free path can reach.
 
 Squares are smaller than cells where obstacles are near: each cell is divided into n x n of them.
 """
@@ -19,13 +32,15 @@ from numba import boolean, float32, float64, types
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.barrier import CONTACT, barrier
 from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.proximity import disc_proximity
-from leapnav.experts.proofs.cells import Grid
+from leapnav.envs.shapes.field import with_weight
+from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.experts.proofs.cells import GEOMETRY, Grid
 
-ROUNDING = 1e-9  # subtracted from Phi and from the clearance: 1000 times their rounding errors and neglected terms
+ROUNDING = 1e-9  # m, added to e: 1000 times the rounding errors of distances
+RELATIVE_ROUNDING = 1e-6  # of a bound: 10 times that of single precision, and 1e6 times that of the barrier
 SQUARE = 1 / 8  # width of a square, in proximity scales, that is small enough
-MAX_PHI = 1e30  # larger values, which overflow single precision, are replaced by the bound 0
 MAX_SQUARES = 4  # squares per axis of a cell
 
 
@@ -58,34 +73,37 @@ def running_cost(scenario: Scenario, grid: Grid, needed: np.ndarray) -> RunningC
     cost = RunningCost(
         np.zeros(shape), np.full(shape, -np.inf), np.full(shape, np.inf), np.full((*shape, n, n), np.nan, np.float32)
     )
-    _bound(scenario.field, grid.x, grid.y, grid.spacing, needed, cost)
+    # With the weight 1, the proximity cost is the sum B.
+    field, weight = with_weight(scenario.field, 1.0), scenario.cost.proximity_weight
+    _bound(field, weight, grid.geometry, needed, cost)
     return cost
 
 
-@kernel(NOTHING(CONSTANT, float64, float64, float64, types.Array(boolean, 2, "C"), COST))
-def _bound(field, x, y, spacing, needed, cost):
-    """Fill the bounds of a grid whose first corner is (x, y)."""
-    n = cost.squares.shape[2]
-    reach = 0.5 * math.sqrt(2.0) * spacing / n
-    factor = math.exp(-reach / field[1])
+@kernel(NOTHING(CONSTANT, float64, GEOMETRY, types.Array(boolean, 2, "C"), COST))
+def _bound(field, weight, geometry, needed, cost):
+    """Fill the bounds of a grid for a proximity weight; that of the field is 1."""
+    n, spacing = cost.squares.shape[2], geometry.spacing
+    reach = 0.5 * math.sqrt(2.0) * spacing / n + ROUNDING
+    growth = math.exp(reach / field[1])
+    highest = barrier(CONTACT, CONTACT)[0]
     for i in range(needed.shape[0]):
         for j in range(needed.shape[1]):
             if not needed[i, j]:
                 continue
-            cx, cy = x + (i + 0.5) * spacing, y + (j + 0.5) * spacing
+            cx, cy = geometry.x + (i + 0.5) * spacing, geometry.y + (j + 0.5) * spacing
             middle = clearance(cx, cy, field)[0]
             cost.clearance[i, j] = middle
-            cost.centre[i, j] = disc_proximity(cx, cy, field[2], field)[0]
+            cost.centre[i, j] = weight * proximity_value(cx, cy, field[2], field)
             if middle < -spacing:
                 continue
             for a in range(n):
                 for b in range(n):
                     px, py = cx + ((a + 0.5) / n - 0.5) * spacing, cy + ((b + 0.5) / n - 0.5) * spacing
-                    if middle < spacing and clearance(px, py, field)[0] + reach < -ROUNDING:
+                    if middle < spacing and clearance(px, py, field)[0] + reach < 0.0:
                         continue
-                    value = disc_proximity(px, py, field[2], field)[0] * factor - ROUNDING
-                    if not value < MAX_PHI:  # also if it is not a number, deep in an obstacle
-                        value = 0.0
-                    # Rounded down to single precision.
-                    cost.squares[i, j, a, b] = max(value * (1.0 - 1e-6), 0.0)
-                    cost.lowest[i, j] = min(cost.lowest[i, j], max(value * (1.0 - 1e-6), 0.0))
+                    total, value = proximity_value(px, py, field[2], field), 0.0
+                    if 0.0 < total < np.inf:  # otherwise far away, or deep in an obstacle where the barrier overflows
+                        bound = min(1.0 / (growth / total + (growth - 1.0)), highest)
+                        value = weight * bound * (1.0 - RELATIVE_ROUNDING)
+                    cost.squares[i, j, a, b] = value
+                    cost.lowest[i, j] = min(cost.lowest[i, j], value)

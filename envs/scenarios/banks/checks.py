@@ -28,9 +28,9 @@ PRECISION = 4 * float(np.finfo(np.float32).eps)
 # The motion under the mean of the controls at two successive points ends at the second point, except for this fraction
 # of the largest difference of successive states. In the included banks that is at most 0.05.
 MOTION_TOLERANCE = 0.5
-# The trapezoidal rule yields the cost with this relative error: in the included banks at most 0.004, except in one narrow
-# passage, where the proximity cost has peaks between the points. With this number of points per interval, interpolated
-# by splines, the error is 0.009 there.
+# The trapezoidal rule yields the cost with this relative error: in the included banks at most 0.004, except in one
+# narrow passage, where the proximity cost has peaks between the points. With this number of points per interval,
+# interpolated by splines, the error is 0.009 there.
 COST_TOLERANCE, INTERPOLATED = 0.05, 8
 # Duration (s) of the motion whose difference quotient is the direction in which a control acts. The relative error of
 # its product with the costates is at most 6e-5 in the included banks.
@@ -240,8 +240,8 @@ def _check_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, in
         from scipy.interpolate import CubicSpline  # imported here because that takes time, and it is rarely used
 
         at = np.arange(len(states)), np.linspace(0, len(states) - 1, INTERPOLATED * (len(states) - 1) + 1)
-        fine = (CubicSpline(at[0], values)(at[1]) for values in (states, controls))
-        total = _path_cost(scenario, *fine, interval / INTERPOLATED)
+        fine = [CubicSpline(at[0], values)(at[1]) for values in (states, controls)]
+        total = _path_cost(scenario, fine[0], fine[1], interval / INTERPOLATED)
     if not abs(cost - total) <= COST_TOLERANCE * total:
         raise ValueError(f"costs: expected {total:.4g}, the cost of the path, got {cost:.4g}")
 
