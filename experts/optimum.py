@@ -50,9 +50,9 @@ REFINEMENT = 2  # of the second lattice, which is searched while a better path m
 # Distance (m) from start to goal above which shortest paths in the plane are the candidates, and their number.
 LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
-# Most families need 1/15 of it, slalom occasionally 4/3; among hundreds of obstacles one candidate takes 1/3. With
-# 10,000, one scenario of the included banks would lose its second-best optimum.
-ALTERNATIVES_BUDGET = 12_000
+# In narrow passages, an unsuccessful attempt takes up to 5,000. With 12,000, 4 of 40 alternatives in 12 scenarios of
+# `slalom` would be missed; 30,000 find no others.
+ALTERNATIVES_BUDGET = 20_000
 # `shortest_horizon`: candidates of each search, relative tolerance, and largest multiple of the scenario's horizon.
 N_BISECTED, HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 6, 0.02, 1000.0
 
@@ -278,7 +278,7 @@ def _search(
     """
     optima, shortest_time = None, np.inf
     for lattice in _lattices(scenario, effort.thorough):
-        if lattice.is_whole and optima is not None and optima.certified:
+        if (lattice.is_whole or lattice.is_strict) and optima is not None and optima.certified:
             break
         energy = first_energy(lattice)
         if energy > 0.0:
@@ -316,6 +316,7 @@ def _lattices(scenario: Scenario, thorough: bool) -> Iterator[Lattice]:
         yield plane_lattice(scenario)
     elif thorough:  # a passage or a short path may need smaller cells
         yield Lattice(scenario, REFINEMENT)
+        yield Lattice(scenario, REFINEMENT, strict=True)  # all paths may have been in collision
 
 
 def _candidate_search(lattice: Lattice, energy: float, effort: Effort) -> CandidateSearch:

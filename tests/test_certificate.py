@@ -76,7 +76,7 @@ def test_a_focal_point_of_free_end_components_is_no_success():
 
 
 def test_an_obstacle_between_two_integrator_steps_is_seen():
-    # Without a proximity cost the flow does not depend on this disc, so the integrator's steps are decimetres long.
+    # Without a barrier the flow does not depend on this disc, so the integrator's steps are decimetres long.
     fields = {
         **SCENARIOS["clutter-0"][0].to_dict(),
         "robot": {"model": "unicycle", "radius": 0.01, "max_speed": 2.0, "max_turn_rate": 3.0},
@@ -86,8 +86,10 @@ def test_an_obstacle_between_two_integrator_steps_is_seen():
         "goal": [8, 5, 0.0],
         "horizon": 6.0,
     }
-    extremal = find_optimum(Scenario.from_dict(fields))
-    assert not extremal.success
+    free = find_optimum(Scenario.from_dict({**fields, "obstacles": []}))
+    nodes = np.concatenate([free.states, free.costates], axis=1)
+    problem = OptimalControlProblem.from_scenario(Scenario.from_dict(fields))
+    extremal = certify(problem, free.times.copy(), nodes, Status.SUCCESS)
     assert extremal.status is Status.COLLISION
     assert extremal.certificate.clearance == pytest.approx(-0.03, abs=1e-3)
 
@@ -129,7 +131,7 @@ def test_the_costate_is_the_gradient_of_the_optimal_cost(name):
 def test_the_certificate_agrees_with_scipy_s_integrator(name):
     extremal = find_optimum(SCENARIOS[name][0])
     assert extremal.success
-    assert verify(extremal) <= 1e-9
+    assert verify(extremal) <= 1e-8  # the curvature of the distance from a polygon is discontinuous
     assert extremal.certificate.hamiltonian_drift <= 1e-8
     spoilt = replace(extremal, costates=extremal.costates + 1e-6 * (extremal.times > 1.0)[:, None])
     assert verify(spoilt) > 1e-7

@@ -243,7 +243,7 @@ def test_solve_prints_and_plots_the_alternatives(tmp_path, capsys):
         assert len(entry["states"]) == len(entry["times"])
     drawn = plot.read_text()
     assert f"best of {1 + len(solution['alternatives'])} local optima" in drawn
-    assert "(+4 %), backward, forward" in drawn
+    assert "(+48 %), backward, forward, backward" in drawn
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,8 @@ class Lattice:
         refinement: factor by which the cells are smaller than usual.
         max_cells: largest number of cells per side.
         whole: whether to cover all obstacles of a large arena, with large cells if necessary.
+        strict: whether to exclude all points in obstacles. Otherwise those are included that may be next to a passage
+            between the points, and paths may lead through passages that are slightly too narrow.
 
     Attributes:
         scenario: the scenario.
@@ -53,6 +55,7 @@ class Lattice:
         moves: motion primitives of the robot.
         cropped: whether the lattice covers only a part of the arena.
         is_whole: whether it covers all obstacles of a large arena.
+        is_strict: whether it excludes all points in obstacles.
 
     """
 
@@ -63,8 +66,9 @@ class Lattice:
         *,
         max_cells: int = MAX_CELLS,
         whole: bool = False,
+        strict: bool = False,
     ) -> None:
-        self.scenario, self.is_whole = scenario, whole
+        self.scenario, self.is_whole, self.is_strict = scenario, whole, strict
         robot, discs = scenario.robot, scenario.discs
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
@@ -93,7 +97,7 @@ class Lattice:
         self.columns, self.lines = left + right + 1, below + above + 1
         band = max(RELEVANT_DISTANCE * scenario.cost.proximity_scale, 0.1)
         # A passage that just admits the robot may lie between the points, half a diagonal of their squares away.
-        depth = -math.sqrt(0.5) * self.cell / 2
+        depth = 0.0 if strict else -math.sqrt(0.5) * self.cell / 2
         self.weight = scenario.cost.proximity_weight
         field = with_weight(scenario.field, 1.0)
         grid = PointGrid(*self.origin, self.cell / 2, 2 * self.columns - 1, 2 * self.lines - 1)

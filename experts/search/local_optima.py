@@ -47,7 +47,6 @@ SHORT_DISTANCE = 4.0  # m from start to goal; below it, the distance of duplicat
 # cost of their extremal by more; these were different extremals from the closest ones.
 DIRECT_ERROR, REFINED_ERROR = 0.01, 0.002
 UNCONVERGED_FACTOR = 10.0  # factor of these errors for a path whose iteration has not converged
-FAILURE_WEIGHT = 4  # evaluations for an expensive path without an extremal count this many times in the budget
 # Free horizon: factor and largest number of lengthenings of a path that the limits make infeasible, largest number of
 # changes of the horizon, and the change after which there is no other.
 LENGTHENING, MAX_LENGTHENED, MAX_RESCALED, SMALL_CHANGE = 1.25, 3, 4, 0.1
@@ -285,7 +284,7 @@ class LocalOptima:
         if self._failed_evaluations < MAX_FAILED_EVALUATIONS and (is_feasible or not self.certified):
             extremal, evaluations = self._extremal(problem, refined)
         if is_expensive:
-            self._budget -= evaluations if extremal is not None else FAILURE_WEIGHT * evaluations
+            self._budget -= evaluations
         if extremal is None:
             self._failed_evaluations += evaluations
             return Verdict(Outcome.STALLED, problem, refined)
