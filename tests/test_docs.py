@@ -43,7 +43,7 @@ PRINTED = {
     r"True 3 True\n",
     "lower_bounds.md": r"True\n",
     "training.md": r"20 True\n\(1, 56, 137\)\n1\n2 True\nTrue \(400,\)\n\(3,\) True\n",
-    "tutorial.md": rf"True {NUMBER} 0\.3106\d+\n\[5\.2072\d+, .*\]\nTrue 1\.0000\d*\n"
+    "tutorial.md": rf"True {NUMBER} 0\.3007\d+\n\[5\.1999\d+, .*\]\nTrue 1\.0000\d*\n"
     rf"RolloutSummary\(demonstrations=50, .*\)\n{NUMBER} {RATE} {RATE} 0\.00\d*\n{RATE}\n",
     "guides/compare.md": r"(.*\n)* expert +100\.0 +0\.0 +1\.000 (.*\n)*1\.0\n3\n",
     "guides/deploy.md": r"open\.onnx\.json\n0 goal\.ahead m\n(\d .*\n){8}9 lidar\[0\], .*\n"

@@ -242,7 +242,7 @@ def test_policies_are_evaluated_and_trained_with_hard_obstacles(tmp_path):
     assert json.loads((tmp_path / "scores.json").read_text())
     env = make_training_env(PPOConfig(out=tmp_path, obstacles="hard", n_envs=2))
     env.reset()
-    assert {scenario.cost.obstacles for scenario in env.unwrapped.scenarios} == {"hard"}
+    assert {scenario.cost.obstacles for scenario in env.unwrapped.venv.scenarios} == {"hard"}
     own = make_env(DAggerRunConfig(out=tmp_path, obstacles="hard"))
     assert own.reset(seed=0)[1]["scenario"].cost.obstacles == "hard"
 

@@ -114,7 +114,7 @@ def test_a_duality_gap_is_estimated_and_limits_the_bound():
         horizon=10.0,
         obstacles=tuple(
             {"polygon": {"vertices": ((wall[0], low), (wall[1], low), (wall[1], high), (wall[0], high))}}
-            for low, high in ((0.0, 0.69), (1.31, 3.2))
+            for low, high in ((0.0, 0.66), (1.34, 3.2))
         ),
     )
     optimum = find_optimum(scenario)

@@ -35,7 +35,7 @@ METHODS_SCENARIO = Scenario(
     start=(1, 2.2, 0),
     goal=(7, 2.1, 0),
     horizon=7,
-    obstacles=({"circle": {"center": (2.5, 3.7), "radius": 0.6}}, {"circle": {"center": (4.6, 2.2), "radius": 0.8}}),
+    obstacles=({"circle": {"center": (2.5, 3.9), "radius": 0.6}}, {"circle": {"center": (4.6, 2.8), "radius": 0.8}}),
     cost={"proximity_scale": 0.15},
 )
 SEGMENTS = 8  # of multiple shooting and of Leapfrog's first path
@@ -201,7 +201,7 @@ def cusp_scenario(heading: float) -> Scenario:
 
     """
     return Scenario(
-        name="conjugate point", arena=(-3, -1.5, 2, 3), start=(0, 0, 0), goal=(-0.95, 1.45, heading), horizon=8
+        name="conjugate point", arena=(-4, -3, 3, 4), start=(0, 0, 0), goal=(-0.95, 1.45, heading), horizon=8
     )
 
 
