@@ -36,7 +36,9 @@ def main(family: str = "clutter", index: int = 0, plot: Path | None = None) -> N
         milliseconds = 1000 * (perf_counter() - start)
         residual = "-" if extremal.certificate is None else f"{extremal.certificate.residual:.0e}"
         iterations = str(len(extremal.history))
-        table.add_row(method, extremal.status.name, f"{extremal.cost:.10g}", residual, iterations, f"{milliseconds:.1f}")
+        table.add_row(
+            method, extremal.status.name, f"{extremal.cost:.10g}", residual, iterations, f"{milliseconds:.1f}"
+        )
     Console().print(table)
     print(f"optimum of the global search: J = {find_optimum(scenario).cost:.9f}")
     if plot is not None:
