@@ -132,7 +132,7 @@ def rectangle(x_min, y_min, x_max, y_max):
     return Obstacle(polygon=Polygon(vertices=[(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]))
 
 
-@pytest.mark.parametrize(("gap", "is_open"), [(1.0, True), (0.4, False)])
+@pytest.mark.parametrize(("gap", "is_open"), [(0.8, True), (0.4, False)])
 def test_a_narrow_passage_of_a_large_arena_is_found(gap, is_open):
     scenario = Scenario(
         arena=(-100, -100, 100, 100),

@@ -185,6 +185,20 @@ def _move(Z, moved, step, damping):
             moved[k, i] = Z[k, i] + damping * step[stride * k + i]
 
 
+@kernel(boolean(MATRIX, VECTOR, VECTOR, int64, float64))
+def _is_contracting(matrix, rhs, step, half, reduction):
+    """Return whether the simplified Newton correction of a trial point is shorter than the step by a fraction.
+
+    This natural monotonicity test (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 3.3) does not change
+    if the equations are scaled or combined. In a narrow passage, the residual may have to increase along the only
+    steps that lead to the solution: a motion along the path hardly changes the cost, and the equations are sensitive.
+    """
+    correction = rhs.copy()
+    if not solve_banded(matrix.copy(), correction, half):
+        return False
+    return np.sqrt((correction**2).sum()) <= (1.0 - reduction) * np.sqrt((step**2).sum())
+
+
 @kernel(
     tuple_of(int64, int64, float64, int64)(FLOW, VECTOR, MATRIX, VECTOR, END_CONDITION, NEWTON_OPTIONS, VECTOR, MATRIX)
 )
@@ -204,6 +218,7 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
     half = 3 * n - 1 + 2 * extra
     step = np.empty(unknowns)
     rows, rhs = np.empty((unknowns, 3 * half + 1)), np.empty(unknowns)
+    matrix = np.empty((unknowns, 3 * half + 1))
     system = NewtonSystem(rows, rhs, costs, np.zeros(segments))
     tried = NewtonSystem(rows, rhs, np.empty(segments), np.zeros(segments))
     trial = np.empty((segments + 1, 2 * n))
@@ -225,6 +240,7 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
             return CONVERGED, iteration, residual, evaluations
         if iteration == options.max_iterations:
             break
+        matrix[:] = rows
         if not solve_banded(rows, rhs, half):
             return SINGULAR, iteration, residual, evaluations
         for i in range(unknowns):
@@ -254,6 +270,8 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
             # At the level of the integration errors no step decreases the residual further.
             if residual <= tolerance / MARGIN and current <= accuracy:
                 return CONVERGED, iteration, residual, evaluations
+            if trial_norm < np.inf and _is_contracting(matrix, rhs, step, half, damping / 4.0):
+                break
             damping /= 2.0
             if damping < MIN_DAMPING:
                 return STALLED, iteration, residual, evaluations
