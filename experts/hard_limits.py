@@ -36,7 +36,9 @@ SEARCH_WEIGHT, SINGLE_WEIGHT = 0.2, 2.0
 # Reduction of the cost, barrier included, on the way to the limit, as a multiple of the integral of the barrier: the
 # expected one, since the cost without the barrier decreases about as much as the barrier, and the largest one.
 EXPECTED_REDUCTION, LARGEST_REDUCTION = 2.0, 3.0
-MAX_FIT_ERROR = 0.1  # largest deviation from a constant Hamiltonian, relative to the variation of the barrier
+# Largest deviation from a constant Hamiltonian, relative to the variation of the barrier. In 240 references with hard
+# obstacles it is 4e-5 in the median and at most 0.01, except in one of them, which is far from all obstacles.
+MAX_FIT_ERROR = 0.1
 MAX_FOLLOWED = 4  # local optima that are followed at most
 GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)  # per step of the integrator
 

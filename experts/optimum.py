@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, cast
 
@@ -50,8 +50,7 @@ REFINEMENT = 2  # of the second lattice, which is searched while a better path m
 # Distance (m) from start to goal above which shortest paths in the plane are the candidates, and their number.
 LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
-# In narrow passages, an unsuccessful attempt takes up to 5,000. With 12,000, 4 of 40 alternatives in 12 scenarios of
-# `slalom` would be missed; 30,000 find no others.
+# With 12,000, 3 of 40 alternatives in 12 scenarios of `slalom` would be missed; 30,000 find no others.
 ALTERNATIVES_BUDGET = 20_000
 # `shortest_horizon`: candidates of each search, relative tolerance, and largest multiple of the scenario's horizon.
 N_BISECTED, HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 6, 0.02, 1000.0
@@ -277,9 +276,10 @@ def _search(
 
     """
     optima, shortest_time = None, np.inf
-    for lattice in _lattices(scenario, effort.thorough):
-        if (lattice.is_whole or lattice.is_strict) and optima is not None and optima.certified:
+    for build, is_optional in _lattices(scenario, effort.thorough):
+        if is_optional and optima is not None and optima.certified:
             break
+        lattice = build()
         energy = first_energy(lattice)
         if energy > 0.0:
             if optima is None:
@@ -305,18 +305,21 @@ def _search(
     return optima, Status.HORIZON_TOO_SHORT if shortest_time > horizon else None
 
 
-def _lattices(scenario: Scenario, thorough: bool) -> Iterator[Lattice]:
-    """Yield the lattices to search: of the surroundings of start and goal, and where necessary others."""
+def _lattices(scenario: Scenario, thorough: bool) -> Iterator[tuple[Callable[[], Lattice], bool]]:
+    """Yield functions that build the lattices to search, each with whether a certified extremal makes it unnecessary.
+
+    The first one covers the surroundings of start and goal.
+    """
     if math.dist(scenario.start[:2], scenario.goal[:2]) > LONG_DISTANCE:
-        yield plane_lattice(scenario)
+        yield lambda: plane_lattice(scenario), True
         return
     first = Lattice(scenario)
-    yield first
+    yield lambda: first, False
     if first.cropped:  # the path may leave the surroundings of start and goal
-        yield plane_lattice(scenario)
-    elif thorough:  # a passage or a short path may need smaller cells
-        yield Lattice(scenario, REFINEMENT)
-        yield Lattice(scenario, REFINEMENT, strict=True)  # all paths may have been in collision
+        yield lambda: plane_lattice(scenario), True
+    elif thorough:  # a passage or a short path may need smaller cells, or all paths may have been in collision
+        yield lambda: Lattice(scenario, REFINEMENT), False
+        yield lambda: Lattice(scenario, REFINEMENT, strict=True), True
 
 
 def _candidate_search(lattice: Lattice, energy: float, effort: Effort) -> CandidateSearch:

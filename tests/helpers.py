@@ -22,6 +22,17 @@ from leapnav.training import CloningConfig, make_policy
 DATA = Path(__file__).parent / "data"
 QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)  # a quick fit of low quality
 SMALL = (32, 32)  # hidden layers of a small network
+DISC_AND_TRIANGLE = Scenario(
+    name="a disc and a triangle",
+    arena=(0.0, 0.0, 5.0, 5.0),
+    start=(0.8, 0.8, 0.3),
+    goal=(4.2, 4.0, 1.2),
+    horizon=6.5,
+    obstacles=(
+        {"circle": {"center": (2.6, 2.2), "radius": 0.4}},
+        {"polygon": {"vertices": ((1.0, 3.0), (2.0, 3.4), (1.2, 4.2))}},
+    ),
+)
 
 
 def best_known() -> list[tuple[Scenario, float]]:

@@ -127,11 +127,14 @@ def test_the_costate_is_the_gradient_of_the_optimal_cost(name):
     assert by_time == pytest.approx(reference.hamiltonian[0], rel=1e-5)
 
 
-@pytest.mark.parametrize("name", ["clutter-5", "polygons-9", "rooms-11", "slalom-4"])
-def test_the_certificate_agrees_with_scipy_s_integrator(name):
+@pytest.mark.parametrize(
+    ("name", "accuracy"), [("clutter-5", 1e-9), ("polygons-9", 1e-8), ("rooms-11", 1e-9), ("slalom-4", 1e-9)]
+)
+def test_the_certificate_agrees_with_scipy_s_integrator(name, accuracy):
+    """The discontinuous curvature of the distance from a polygon limits the accuracy in the second scenario."""
     extremal = find_optimum(SCENARIOS[name][0])
     assert extremal.success
-    assert verify(extremal) <= 1e-8  # the curvature of the distance from a polygon is discontinuous
+    assert verify(extremal) <= accuracy
     assert extremal.certificate.hamiltonian_drift <= 1e-8
     spoilt = replace(extremal, costates=extremal.costates + 1e-6 * (extremal.times > 1.0)[:, None])
     assert verify(spoilt) > 1e-7

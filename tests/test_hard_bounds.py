@@ -5,33 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from helpers import DISC_AND_TRIANGLE as SCENARIO
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts import ProofError, check_proof, find_optimum, lower_bound
 
-SCENARIO = Scenario(
-    name="a disc and a triangle",
-    arena=(0.0, 0.0, 5.0, 5.0),
-    start=(0.8, 0.8, 0.3),
-    goal=(4.2, 4.0, 1.2),
-    horizon=6.5,
-    obstacles=(
-        {"circle": {"center": (2.6, 2.2), "radius": 0.4}},
-        {"polygon": {"vertices": ((1.0, 3.0), (2.0, 3.4), (1.2, 4.2))}},
-    ),
+
+@pytest.mark.parametrize(
+    ("weight", "horizon", "gap"), [(0.0, 6.5, 0.05), (0.0, None, 0.05), (0.01, None, 0.05), (0.01, 6.5, 0.08)]
 )
-
-
-@pytest.mark.parametrize("weight", [0.0, 0.01])
-@pytest.mark.parametrize("horizon", [6.5, None])
-def test_obstacles_may_cost_nothing_or_little(weight: float, horizon: float | None):
+def test_obstacles_may_cost_nothing_or_little(weight: float, horizon: float | None, gap: float):
     """With the proximity weight 0 only the collision-free paths count; their cost excludes the barrier."""
     cost = {"proximity_weight": weight, "time_weight": 0.5 if horizon is None else 0.0}
     scenario = Scenario.from_dict(SCENARIO.to_dict() | {"horizon": horizon, "cost": cost})
     optimum = find_optimum(scenario)
     assert optimum.success
-    found = lower_bound(scenario, optimum, gap=0.08)
-    assert found.gap == pytest.approx(0.08, abs=2e-3)
+    found = lower_bound(scenario, optimum, gap=gap)
+    assert found.gap == pytest.approx(gap, abs=2e-3)
     assert found.duality_gap < 2e-3
     assert check_proof(found.proof) == found.value
     assert all(found.value <= local.cost for local in (optimum, *optimum.alternatives))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import DISC_AND_TRIANGLE as SCENARIO
 
 from leapnav.cli import main
 from leapnav.envs.scenarios.families import sample_scenario
@@ -24,17 +25,6 @@ from leapnav.experts.proofs.near_source import cells_near
 from leapnav.experts.proofs.proof import Spline, Stage
 from leapnav.experts.proofs.running_cost import running_cost
 
-SCENARIO = Scenario(
-    name="a disc and a triangle",
-    arena=(0.0, 0.0, 5.0, 5.0),
-    start=(0.8, 0.8, 0.3),
-    goal=(4.2, 4.0, 1.2),
-    horizon=6.5,
-    obstacles=(
-        {"circle": {"center": (2.6, 2.2), "radius": 0.4}},
-        {"polygon": {"vertices": ((1.0, 3.0), (2.0, 3.4), (1.2, 4.2))}},
-    ),
-)
 VERTEX = (2.0, 3.4)
 
 

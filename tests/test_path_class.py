@@ -71,7 +71,7 @@ def test_alternatives_are_distinct_certified_and_in_order():
 
 
 def test_candidates_through_a_closed_passage_do_not_end_the_search():
-    """The first 12 lattice paths lead through such a passage; a detour costs 5.097."""
+    """The extremals through a passage with a clearance of 0.02 m cost 5.43; a detour costs 5.097."""
     optimum = find_optimum(sample_scenario("clutter", 910_065))
     assert optimum.cost < 5.0973
     assert optimum.path_class != optimum.alternatives[-1].path_class

@@ -7,6 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from helpers import DISC_AND_TRIANGLE
 
 from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario
@@ -77,12 +78,15 @@ def test_the_minimum_of_the_gauge_over_a_box_is_a_lower_bound(rng: np.random.Gen
         assert lowest <= gauge(*pose, source)
 
 
-WALLS_AND_CORNERS = (
-    {"circle": {"center": (2.6, 2.2), "radius": 0.4}},
-    {"polygon": {"vertices": ((1.0, 3.0), (2.0, 3.4), (1.2, 4.2))}},
-    {"polygon": {"vertices": ((3.2, 3.3), (3.8, 3.3), (3.8, 3.9), (3.2, 3.9))}},
-    {"circle": {"center": (3.3, 2.2), "radius": 0.05}},  # a passage between two discs that is narrower than the robot
-)
+def walls_and_corners(**cost: float) -> Scenario:
+    """A scenario with a passage between two discs that is narrower than the robot."""
+    more = (
+        {"circle": {"center": (3.3, 2.2), "radius": 0.05}},
+        {"polygon": {"vertices": ((3.2, 3.3), (3.8, 3.3), (3.8, 3.9), (3.2, 3.9))}},
+    )
+    fields = DISC_AND_TRIANGLE.to_dict()
+    fields |= {"obstacles": (*fields["obstacles"], *more)}
+    return Scenario.from_dict(fields | {"cost": cost})
 
 
 def barrier_sums(points: np.ndarray, scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -112,14 +116,7 @@ def barrier_sums(points: np.ndarray, scenario: Scenario) -> tuple[np.ndarray, np
 @pytest.mark.parametrize("weight", [0.0, 0.03, 1.0])
 def test_the_running_cost_is_bounded_on_every_square(spacing: float, weight: float, rng: np.random.Generator):
     """At 49 points of each square, with its corners, and close to contact; Phi is computed without the kernels."""
-    scenario = Scenario(
-        arena=(0.0, 0.0, 5.0, 5.0),
-        start=(0.8, 0.8, 0.3),
-        goal=(4.2, 4.0, 1.2),
-        horizon=6.5,
-        obstacles=WALLS_AND_CORNERS,
-        cost={"proximity_weight": weight},
-    )
+    scenario = walls_and_corners(proximity_weight=weight)
     grid = Grid.over(scenario.arena, spacing, 8)
     cost = running_cost(scenario, grid, np.ones((grid.columns, grid.lines), dtype=bool))
     n = cost.squares.shape[2]
@@ -154,14 +151,7 @@ def test_the_running_cost_is_bounded_on_every_square(spacing: float, weight: flo
 
 def test_the_running_cost_is_bounded_where_squares_are_small_in_proximity_scales(rng: np.random.Generator):
     """Near contact, the kernels replace the barrier by a polynomial, which the bound must not exceed either."""
-    scenario = Scenario(
-        arena=(0.0, 0.0, 5.0, 5.0),
-        start=(0.8, 0.8, 0.3),
-        goal=(4.2, 4.0, 1.2),
-        horizon=6.5,
-        obstacles=WALLS_AND_CORNERS,
-        cost={"proximity_scale": 1e4},
-    )
+    scenario = walls_and_corners(proximity_scale=1e4)
     grid = Grid.over(scenario.arena, 0.1, 8)
     cost = running_cost(scenario, grid, np.ones((grid.columns, grid.lines), dtype=bool))
     for x, y in rng.uniform(0.2, 4.8, (4000, 2)):

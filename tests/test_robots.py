@@ -241,7 +241,7 @@ def test_a_box_of_three_discs(name, width):
     walls = [{"polygon": {"vertices": [[3, low], [5, low], [5, high], [3, high]]}} for low, high in sides]
     scenario = task(name, robot=fields, start=[1.5, 4.0, 0.0], goal=[6.5, 4.0, 0.0], obstacles=walls)
     optimum = find_optimum(scenario)
-    assert optimum.success
+    assert optimum.success and optimum.doubts == ()
     times = np.linspace(0.0, scenario.horizon, 2001)
     states = optimum.evaluate(times)[0]
     inside = (states[:, 0] > 3.4) & (states[:, 0] < 4.6)

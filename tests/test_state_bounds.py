@@ -46,9 +46,11 @@ def drive_at_most(speed, distance=1.0, horizon=1.0, **changes):
 @pytest.mark.parametrize("limit", [1 / 12, 1 / 9, 1 / 5, 0.3])
 @pytest.mark.parametrize("method", METHODS)
 def test_bryson_denham(limit, method):
-    if method == "single_shooting" and limit == 1 / 12:
-        pytest.skip("the barrier amplifies errors too much for shooting over the whole horizon")
     extremal = solve(bryson_denham(limit), method)
+    if method == "single_shooting" and limit == 1 / 12:
+        # The barrier amplifies errors too much for shooting over the whole horizon, and the certificate refuses it.
+        assert extremal.status is Status.NOT_CERTIFIED
+        return
     assert extremal.success
     assert 0 < extremal.barrier <= 1e-3
     # The path is feasible, so it costs no less than the optimum.

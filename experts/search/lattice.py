@@ -55,7 +55,6 @@ class Lattice:
         moves: motion primitives of the robot.
         cropped: whether the lattice covers only a part of the arena.
         is_whole: whether it covers all obstacles of a large arena.
-        is_strict: whether it excludes all points in obstacles.
 
     """
 
@@ -68,7 +67,7 @@ class Lattice:
         whole: bool = False,
         strict: bool = False,
     ) -> None:
-        self.scenario, self.is_whole, self.is_strict = scenario, whole, strict
+        self.scenario, self.is_whole = scenario, whole
         robot, discs = scenario.robot, scenario.discs
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
