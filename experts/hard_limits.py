@@ -182,7 +182,7 @@ class _Continuation:
     @property
     def _is_reached(self) -> bool:
         problem = self._extremal.problem
-        return self._limit.barrier <= self._tolerance if problem.has_hard_limits else _weight(problem) <= self._weight
+        return self._limit.barrier <= self._tolerance if problem.has_hard_limits else problem.barrier_weight == 0.0
 
     def run(self, max_cost: float = math.inf) -> Extremal:
         """Follow the extremal until its limit, or until it costs more than `max_cost`."""

@@ -63,7 +63,8 @@ function lessonTable() {
         const iterate = iterateAt(method, step), last = method.iterates.length - 1;
         const state = step < last ? `iteration ${step}` : `${method.status} at iteration ${last}`;
         const miss = iterate.miss < 5e-4 ? "0" : iterate.miss.toFixed(3);
-        return [methodColor(i), method.name, iterate.cost.toFixed(4), iterate.residual.toExponential(0),
+        const cost = iterate.cost < 1e4 ? iterate.cost.toFixed(4) : iterate.cost.toExponential(0);  // in contact
+        return [methodColor(i), method.name, cost, iterate.residual.toExponential(0),
           `${miss}\u00a0m`, state];
       }),
     };
