@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from leapnav.experts.numerics.shooting import hamiltonians
+from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
@@ -25,9 +26,13 @@ BARRIER_TOLERANCE = 1e-3  # largest integral of the barrier, as a fraction of th
 # Factor of the weight of a step, and the factor above which a step is too small to continue. With 0.1, the extremals of
 # `slalom` took 3.5 times as long, because most steps were repeated.
 FACTOR, MAX_FACTOR = 0.3, 0.95
-# Steps of the certificate's integrator per segment: the segments are short where the barrier is steep. With 8, one of
-# 30 extremals failed; 2 took as long.
-STEPS_PER_SEGMENT, MIN_SEGMENTS = 4, 8
+# Tolerance of the extremals on the way, which are not certified: with 1e-9 and certificates, the continuation took 1.6
+# times as long.
+TOLERANCE = 1e-3
+# Steps of the integrator per segment, for extremals on the way and for certified ones, whose steps are shorter: the
+# segments are short where the barrier is steep. With 2 and 4, the continuation took 1.2 times as long; with 8 and 16,
+# 1.3 times, and one extremal of 100 stalled. If the last extremal stalls, one step per segment is tried.
+STEPS_PER_SEGMENT, CERTIFIED_STEPS_PER_SEGMENT, MIN_SEGMENTS = 4, 8, 8
 OPTIONS = SolverOptions(max_iterations=20)
 # Smallest barrier weight of the first extremals, in units of the mean running cost E: of a search for several paths,
 # and of a single path. With 0.1 E the extremals differ less from those of the limit, but direct transcription sometimes
@@ -186,10 +191,20 @@ class _Continuation:
 
     def run(self, max_cost: float = math.inf) -> Extremal:
         """Follow the extremal until its limit, or until it costs more than `max_cost`."""
+        while self._approach(max_cost):
+            if self._extremal.success:
+                return self._limit
+            certified = self._certified()
+            if certified is None:
+                break
+            self._set(certified)  # its barrier may be slightly above the tolerance again
+        return replace(self._limit, status=Status.STALLED)
+
+    def _approach(self, max_cost: float) -> bool:
+        """Decrease the weight until the limit is reached or costs more than `max_cost`; False if a step fails."""
         factor = FACTOR
         while not self._is_reached and self.lowest < max_cost:
-            weight = max(factor * _weight(self._extremal.problem), self._weight)
-            found = self._step(weight)
+            found = self._step(max(factor * _weight(self._extremal.problem), self._weight))
             if found is not None:
                 self._before = self._extremal
                 self._set(found)
@@ -197,28 +212,43 @@ class _Continuation:
             else:
                 factor = math.sqrt(factor)
                 if factor > MAX_FACTOR:
-                    return replace(self._limit, status=Status.STALLED)
-        return self._limit
+                    return False
+        return True
+
+    def _certified(self) -> Extremal | None:
+        """Return the last extremal with a certificate; None if Newton's method does not converge."""
+        problem = self._extremal.problem
+        for steps in (STEPS_PER_SEGMENT, 1):
+            times, nodes = self._nodes(steps)
+            status, history, evaluations = polish(problem, times, nodes, OPTIONS.tol, OPTIONS.max_iterations)
+            found = confirm(problem, times, nodes, status, history, evaluations, OPTIONS)
+            if found.success:
+                return found
+        return None
 
     def _step(self, weight: float) -> Extremal | None:
-        """Return the extremal at another weight; None if Newton's method does not converge."""
+        """Return the extremal at another weight, not certified; None if Newton's method does not converge."""
         problem = self._extremal.problem.with_barrier(weight if weight > self._weight else 0.0)
         for times, nodes in self._guesses(weight):
-            status, history, evaluations = polish(problem, times, nodes, OPTIONS.tol, OPTIONS.max_iterations)
+            status, _, _ = polish(problem, times, nodes, TOLERANCE, OPTIONS.max_iterations)
             if status is Status.SUCCESS:
-                found = confirm(problem, times, nodes, status, history, evaluations, OPTIONS)
-                if found.success:
+                found = certify(problem, times, nodes, Status.MAX_ITERATIONS)
+                if found.status is Status.MAX_ITERATIONS and len(found.times):
                     return found
         return None
+
+    def _nodes(self, steps_per_segment: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return times and nodes of the last extremal."""
+        extremal = self._extremal
+        steps = len(extremal.times) - 1
+        segments = max(round(steps / steps_per_segment), MIN_SEGMENTS)
+        at = np.unique(np.rint(np.linspace(0, steps, segments + 1)).astype(int))
+        return extremal.times[at], np.concatenate([extremal.states[at], extremal.costates[at]], axis=1)
 
     def _guesses(self, weight: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return times and nodes of initial guesses: extrapolated, and those of the last extremal."""
         extremal, before, n = self._extremal, self._before, self._extremal.problem.system.n
-        steps = len(extremal.times) - 1
-        at = np.rint(np.linspace(0, steps, max(round(steps / STEPS_PER_SEGMENT), MIN_SEGMENTS) + 1)).astype(int)
-        at = np.unique(at)
-        times = extremal.times[at]
-        nodes = np.concatenate([extremal.states[at], extremal.costates[at]], axis=1)
+        times, nodes = self._nodes(CERTIFIED_STEPS_PER_SEGMENT if extremal.success else STEPS_PER_SEGMENT)
         guesses = [(times.copy(), nodes.copy())]
         if before is not None:
             last, first = (math.sqrt(_weight(one.problem)) for one in (extremal, before))
