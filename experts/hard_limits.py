@@ -29,10 +29,9 @@ FACTOR, MAX_FACTOR = 0.3, 0.95
 # Tolerance of the extremals on the way, which are not certified: with 1e-9 and certificates, the continuation took 1.6
 # times as long.
 TOLERANCE = 1e-3
-# Steps of the integrator per segment, for extremals on the way and for certified ones, whose steps are shorter: the
-# segments are short where the barrier is steep. With 2 and 4, the continuation took 1.2 times as long; with 8 and 16,
-# 1.3 times, and one extremal of 100 stalled. If the last extremal stalls, one step per segment is tried.
-STEPS_PER_SEGMENT, CERTIFIED_STEPS_PER_SEGMENT, MIN_SEGMENTS = 4, 8, 8
+# Steps of the integrator per segment: the segments are short where the barrier is steep. With 2 the continuation took
+# 1.2 times as long; with 8, 1.3 times, and one extremal of 100 stalled. If the last extremal stalls, 1 is tried.
+STEPS_PER_SEGMENT, MIN_SEGMENTS = 4, 8
 OPTIONS = SolverOptions(max_iterations=20)
 # Smallest barrier weight of the first extremals, in units of the mean running cost E: of a search for several paths,
 # and of a single path. With 0.1 E the extremals differ less from those of the limit, but direct transcription sometimes
@@ -248,7 +247,7 @@ class _Continuation:
     def _guesses(self, weight: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return times and nodes of initial guesses: extrapolated, and those of the last extremal."""
         extremal, before, n = self._extremal, self._before, self._extremal.problem.system.n
-        times, nodes = self._nodes(CERTIFIED_STEPS_PER_SEGMENT if extremal.success else STEPS_PER_SEGMENT)
+        times, nodes = self._nodes(STEPS_PER_SEGMENT)
         guesses = [(times.copy(), nodes.copy())]
         if before is not None:
             last, first = (math.sqrt(_weight(one.problem)) for one in (extremal, before))

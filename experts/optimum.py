@@ -52,6 +52,8 @@ LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
 # With 12,000, 3 of 40 alternatives in 12 scenarios of `slalom` would be missed; 30,000 find no others.
 ALTERNATIVES_BUDGET = 20_000
+# Factor of the barrier weight at which the continuation stalled, for a second search.
+SHARPER = 0.3
 # `shortest_horizon`: candidates of each search, relative tolerance, and largest multiple of the scenario's horizon.
 N_BISECTED, HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 6, 0.02, 1000.0
 
@@ -199,7 +201,13 @@ def find_optimum(
     optima, failed = _search(scenario, problem, effort)
     if optima is None or (failed is not None and not optima.certified):
         return as_optimum(failure(problem, failed or Status.NO_PATH))
-    return _result(optima, barrier_tolerance, alternatives)
+    found = _result(optima, barrier_tolerance, alternatives)
+    if optima.certified and not found.success:  # the continuation stalled at a barrier weight
+        weight = max(SHARPER * found.problem.barrier_weight, scenario.cost.proximity_weight)
+        optima, _ = _search(scenario, problem.with_barrier(weight), effort)
+        if optima is not None and optima.certified:
+            found = _result(optima, barrier_tolerance, alternatives)
+    return found
 
 
 def find_reached_optimum(

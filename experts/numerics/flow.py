@@ -59,18 +59,19 @@ class NewtonOptions(NamedTuple):
         tolerance: largest residual.
         accuracy: tolerance of the integrator close to the solution.
         max_iterations: largest number of Newton steps.
-        predict: whether the residual of the last iterate may be predicted from quadratic convergence.
+        adaptive: whether the accuracy of the integrator follows the residual, and that of the last iterate may be
+            predicted from quadratic convergence.
 
     """
 
     tolerance: float
     accuracy: float
     max_iterations: int
-    predict: bool = True
+    adaptive: bool = True
 
 
 FLOW = record_type(ExtremalFlow, function=FLOW_FUNCTION, data=CONSTANT, field=CONSTANT)
 END_CONDITION = record_type(EndCondition, goal=VECTOR, free=FLAGS, free_time=types.boolean)
 NEWTON_OPTIONS = record_type(
-    NewtonOptions, tolerance=float64, accuracy=float64, max_iterations=types.int64, predict=types.boolean
+    NewtonOptions, tolerance=float64, accuracy=float64, max_iterations=types.int64, adaptive=types.boolean
 )

@@ -58,7 +58,7 @@ def confirm(
     extremal = certify(problem, times, nodes, status, history, evaluations)
     if extremal.status is not Status.NOT_CERTIFIED:
         return extremal
-    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations, False, FINE_ACCURACY)
+    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations, fine=True)
     return certify(problem, times, nodes, status, history + rows, evaluations + count)
 
 
@@ -68,8 +68,7 @@ def polish(
     nodes: np.ndarray,
     tol: float,
     max_iterations: int,
-    predict: bool = True,
-    accuracy: float = ACCURACY,
+    fine: bool = False,
 ) -> tuple[Status, tuple[Iteration, ...], int]:
     """Apply Newton's method of multiple shooting to nodes, in place.
 
@@ -79,9 +78,8 @@ def polish(
         nodes: (segments + 1, 2n), changed in place.
         tol: largest residual.
         max_iterations: largest number of Newton steps.
-        predict: whether the evaluation of the last iterate may be skipped if quadratic convergence predicts its
-            residual.
-        accuracy: tolerance of the integrator relative to `tol`.
+        fine: whether to integrate with the fine accuracy from the start, and to evaluate the last iterate also if
+            quadratic convergence predicts its residual.
 
     Returns:
         Status, one `Iteration` per iterate, and the number of evaluations of the flow.
@@ -90,7 +88,8 @@ def polish(
     arrays = problem.arrays
     costs = np.empty(len(times) - 1)
     log = np.zeros((max_iterations + 1, 3))
-    newton = NewtonOptions(MARGIN * tol, MARGIN * tol * accuracy, max_iterations, predict)
+    accuracy = FINE_ACCURACY if fine else ACCURACY
+    newton = NewtonOptions(MARGIN * tol, MARGIN * tol * accuracy, max_iterations, not fine)
     code, iterations, _, evaluations = solve_nodes(
         arrays.flow, times, nodes, arrays.start, arrays.end, newton, costs, log
     )
