@@ -27,7 +27,7 @@ def easy(model, horizon, **changes):
         "arena": [0, 0, 8, 8],
         "robot": {"model": model},
         "start": [2.0, 3.0, 0.4],
-        "goal": [3.0, 3.4, 0.4],
+        "goal": [3.2, 3.4, 0.4],
         "horizon": horizon,
         "obstacles": [{"circle": {"center": [3.6, 5.6], "radius": 0.7}}],
         "cost": {"time_weight": 1.0} if horizon is None else {},

@@ -301,7 +301,7 @@ class LocalOptima:
         Returns the extremal, or None, and the number of evaluations of the flow.
         """
         history: tuple[Iteration, ...] = ()
-        total = 0
+        total, refused = 0, None
         is_expensive = self._is_expensive(direct, REFINED_ERROR)  # not the optimum
         n_attempts = 1 if is_expensive else MAX_ATTEMPTS
         # On a long path, some place is too coarse for the first attempts.
@@ -323,9 +323,11 @@ class LocalOptima:
             if status is Status.SUCCESS:
                 options = SolverOptions(TOLERANCE, iterations)
                 found = confirm(problem, times, nodes, status, history, total, options)
-                if len(found.times):  # otherwise re-integration diverged
+                if found.status is Status.NOT_CERTIFIED:  # on shorter segments, integration errors grow less
+                    refused = found
+                elif len(found.times):  # otherwise re-integration diverged
                     return found, total
-        return None, total
+        return refused, total
 
     def _extremals(self) -> list[Extremal]:
         """Return the distinct extremals."""

@@ -113,7 +113,7 @@ def _multiple_shooting(problem: OptimalControlProblem, times: np.ndarray, guess:
     status = Status.MAX_ITERATIONS
     for limit in range(MAX_NEWTON_STEPS + 1):
         nodes = guess.copy()
-        status, rows, _ = polish(problem, times, nodes, TOLERANCE, limit, predict=False)
+        status, rows, _ = polish(problem, times, nodes, TOLERANCE, limit, fine=True)
         if len(rows) <= limit:
             break
         iterates.append(_iterate(problem, times, nodes, rows[-1].cost, rows[-1].residual))
