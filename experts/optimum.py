@@ -293,7 +293,6 @@ def _search(
             if optima is None:
                 budget = ALTERNATIVES_BUDGET * effort.candidates if effort.alternatives else 0.0
                 optima = LocalOptima(scenario, problem, energy, budget)
-            optima.reset_failure_budget()
             found = _candidate_search(lattice.with_weight(optima.problem.proximity_weight), energy, effort)
             for _ in range(1 if lattice.is_whole or not effort.thorough else MAX_ROUNDS):
                 batch, last = _add(optima, found, effort)

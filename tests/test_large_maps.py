@@ -57,7 +57,14 @@ def random_cells(size, percentage, rng):
 
 
 # Maker, size, and width or percentage.
-SMALL = [(rooms, 64, 7), (maze, 64, 5), (random_cells, 64, 20), (random_cells, 64, 45)]
+SMALL = [
+    (rooms, 64, 7),
+    (rooms, 512, 31),
+    (maze, 512, 7),
+    (maze, 64, 5),
+    (random_cells, 64, 20),
+    (random_cells, 64, 45),
+]
 LARGE = [
     *((rooms, *sizes) for sizes in ((64, 15), (128, 7), (128, 31), (256, 7), (256, 15), (256, 31))),
     *((rooms, *sizes) for sizes in ((512, 7), (512, 15), (512, 31))),

@@ -23,7 +23,8 @@ from leapnav.experts.transcription.arcs_riccati import backward
 from leapnav.experts.transcription.quadratic_model import MODEL, Model, Regularisation, end_multipliers
 
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of the horizon (s)
-INTERVALS_OF_PART = 512  # a path with more intervals is long
+# A path with more intervals is long. With 512, the barrier has more curvature than the largest shift in mazes of 500 m.
+INTERVALS_OF_PART = 64
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
 END_PENALTY, PENALTY = 1e4, 300.0
 MAX_STEP_LENGTHS = 5  # step lengths that the line search tries: 1, 1/2, ...
