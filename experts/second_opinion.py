@@ -89,7 +89,6 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     def record(source_name: str, count: int) -> None:
         nonlocal best, source, tried
         tried += count
-        search.reset_failure_budget()
         if search.certified:
             found = follow_best(search.certified, scenario.cost.proximity_weight, alternatives=False)[0]
             if found.success and found.cost < best:

@@ -29,7 +29,7 @@ def test_fresh_scenarios_are_solved_and_certified(family):
         certificate = extremal.certificate
         assert certificate.residual <= 1e-8
         assert certificate.defect <= 1e-8
-        assert certificate.hamiltonian_drift <= 1e-8
+        assert certificate.hamiltonian_drift <= 3e-8  # the sum of the defects
         assert certificate.clearance > 0
         assert certificate.conjugate_point is None
 
