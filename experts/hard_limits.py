@@ -30,7 +30,8 @@ FACTOR, MAX_FACTOR = 0.3, 0.95
 # times as long.
 TOLERANCE = 1e-3
 # Steps of the integrator per segment: the segments are short where the barrier is steep. With 2 the continuation took
-# 1.2 times as long; with 8, 1.3 times, and one extremal of 100 stalled. If the last extremal stalls, 1 is tried.
+# 1.3 times as long; with 8 (16 from the first extremal) too, and one extremal of 100 stalled. If the last extremal
+# stalls, 1 is tried.
 STEPS_PER_SEGMENT, MIN_SEGMENTS = 4, 8
 OPTIONS = SolverOptions(max_iterations=20)
 # Smallest barrier weight of the first extremals, in units of the mean running cost E: of a search for several paths,

@@ -18,7 +18,7 @@ from leapnav.envs.shapes.proximity import footprint_proximity
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
-from leapnav.experts.hard_limits import BARRIER_TOLERANCE, follow_best
+from leapnav.experts.hard_limits import BARRIER_TOLERANCE, FACTOR, follow_best
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
@@ -52,8 +52,6 @@ LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
 # With 12,000, 3 of 40 alternatives in 12 scenarios of `slalom` would be missed; 30,000 find no others.
 ALTERNATIVES_BUDGET = 20_000
-# Factor of the barrier weight at which the continuation stalled, for a second search.
-SHARPER = 0.3
 # `shortest_horizon`: candidates of each search, relative tolerance, and largest multiple of the scenario's horizon.
 N_BISECTED, HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 6, 0.02, 1000.0
 
@@ -203,7 +201,7 @@ def find_optimum(
         return as_optimum(failure(problem, failed or Status.NO_PATH))
     found = _result(optima, barrier_tolerance, alternatives)
     if optima.certified and not found.success:  # the continuation stalled at a barrier weight
-        weight = max(SHARPER * found.problem.barrier_weight, scenario.cost.proximity_weight)
+        weight = max(FACTOR * found.problem.barrier_weight, scenario.cost.proximity_weight)
         optima, _ = _search(scenario, problem.with_barrier(weight), effort)
         if optima is not None and optima.certified:
             found = _result(optima, barrier_tolerance, alternatives)

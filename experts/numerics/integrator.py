@@ -31,9 +31,8 @@ EXTRA_STAGES = len(EXTRA_A)
 DENSE_TERMS = 3 + len(DENSE)  # number of terms of the interpolant of order 7
 
 MAX_STEPS = 1_000  # per interval; segments of extremals take 10 to 100
-SMALL_ERROR = (
-    1e-2  # relative to the tolerance; after a rejection, a step of a smooth solution has an error of about 0.4
-)
+# Error relative to the tolerance; after a rejected step, a step of a smooth solution has an error of about 0.4.
+SMALL_ERROR = 1e-2
 MAX_VALUE = 1e14  # a state or costate beyond this has diverged
 MIN_STEP = 1e-13  # relative to the interval; smaller steps are at rounding level
 

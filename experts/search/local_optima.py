@@ -31,7 +31,7 @@ from leapnav.experts.solvers.nodes import SolverOptions
 from leapnav.experts.transcription.direct import DirectPath, discretise, optimise
 
 TOLERANCE = 1e-9
-NEWTON_ITERATIONS = 20  # with 14, 1.4 times as many evaluations in 84 difficult scenarios; with 25 about the same
+NEWTON_ITERATIONS = 20  # with 14, 1.4 times as many evaluations in 93 difficult scenarios; with 25 about the same
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
 INTERVALS_PER_SEGMENT, MIN_SEGMENTS, MAX_ATTEMPTS = 8, 8, 3
 # A long refined path: number of intervals above which it is one, attempts that it omits, and intervals per segment.
@@ -45,7 +45,7 @@ SHORT_DISTANCE = 4.0  # m from start to goal; below it, the distance of duplicat
 # cost of their extremal by more; these were different extremals from the closest ones.
 DIRECT_ERROR, REFINED_ERROR = 0.01, 0.002
 # Free horizon: factor and largest number of lengthenings of a path that the limits make infeasible. Without them, 11 of
-# 84 difficult optima are not found.
+# 93 difficult optima are not found.
 LENGTHENING, MAX_LENGTHENED = 1.25, 3
 LIMIT_TOLERANCE = 1e-3  # relative; a control is at its limit within this tolerance
 RELAXED_WEIGHT = 2.0  # proximity weight of the relaxed barrier, at least, in units of E

@@ -35,7 +35,7 @@ NOISE_LEVEL = 1000.0
 # convergence: a single step that happens to converge fast is weak evidence.
 PREDICTION_SAFETY, MIN_QUADRATIC_CONSTANT = 0.1, 100.0
 # Tolerance of the integrator of multiple shooting for the next iterate, relative to the square of the residual. With
-# 1e-2, twice as many iterations; with the full accuracy below a residual of 1e-2, 1.1 times as many evaluations.
+# 1e-2, 1.3 times as many iterations; with the full accuracy below a residual of 1e-2, 1.1 times as many evaluations.
 SQUARE_ACCURACY = 1e-4
 
 
