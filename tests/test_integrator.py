@@ -3,10 +3,8 @@ import pytest
 from helpers import best_known, published_problems
 from scipy.integrate import solve_ivp
 
-from leapnav.experts import (
-    OptimalControlProblem,
-    find_optimum,
-)
+from leapnav.envs import sample_scenario
+from leapnav.experts import OptimalControlProblem, find_optimum
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.linear import solve_banded, solve_dense, solve_positive
 
@@ -47,6 +45,28 @@ def test_the_integrator_s_error_follows_its_tolerance():
         errors.append(np.abs(z - exact).max())
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 1e-6
+
+
+def test_steps_end_where_the_closest_edge_or_vertex_of_a_polygon_changes():
+    # The curvature of the distance is discontinuous there, and a step across it has a low order.
+    optimum = find_optimum(sample_scenario("rooms", 0))
+    flow, duration = optimum.problem.arrays.flow, optimum.horizon / 60
+    smooth = PROBLEMS["van-der-pol-free-end"][0].arrays.flow.piece  # always the same number
+    saved = []
+    for t in np.arange(60) * duration:
+        z = np.concatenate(optimum.evaluate(t)[::2])
+        ends, sensitivities, evaluations = [], [], []
+        for piece in (flow.piece, smooth):
+            end, S = z.copy(), np.eye(6)
+            count = propagate(flow._replace(piece=piece), end, S, duration, 1e-11, 0.0, False)[-1]
+            ends.append(end)
+            sensitivities.append(S)
+            evaluations.append(count)
+        assert ends[0] == pytest.approx(ends[1], abs=1e-9)
+        assert sensitivities[0] == pytest.approx(sensitivities[1], abs=1e-2 * np.abs(S).max())
+        if evaluations[0] != evaluations[1]:
+            saved.append(1.0 - evaluations[0] / evaluations[1])
+    assert len(saved) >= 5 and np.median(saved) > 0.2
 
 
 def test_dense_evaluation_agrees_with_independent_integration():

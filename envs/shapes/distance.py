@@ -41,6 +41,38 @@ def circle_geometry(dx, dy, radius):
     return distance - radius, dx * curvature, dy * curvature, curvature
 
 
+@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, int64), inline="always")
+def _nearest_edge(x, y, field, at):
+    """Edge of a polygon whose line is farthest away: (signed distance of the line (m), index of the edge, beyond).
+
+    `beyond` is the coordinate (m) along the line beyond the ends of the edge: negative before its first vertex,
+    positive after its second, zero between them.
+    """
+    largest, nearest = -np.inf, at + POLYGON_HEAD
+    row = at + POLYGON_HEAD
+    for _ in range(int(field[at])):
+        height = field[row] * x + field[row + 1] * y - field[row + 2]
+        if height > largest:
+            largest, nearest = height, row
+        row += COLUMNS
+    along = field[nearest] * (y - field[nearest + 4]) - field[nearest + 1] * (x - field[nearest + 3])
+    return largest, nearest, min(along, max(along - field[nearest + 5], 0.0))
+
+
+@kernel(int64(float64, float64, CONSTANT, int64), inline="always")
+def closest_feature(x, y, field, at):
+    """Index in the field of the edge or of the vertex of a polygon that is closest to a point outside.
+
+    A vertex has the index of the edge that begins there, plus 1. The curvature of the distance is continuous where the
+    feature does not change.
+    """
+    _, nearest, beyond = _nearest_edge(x, y, field, at)
+    if beyond <= 0.0:
+        return nearest if beyond == 0.0 else nearest + 1
+    following = nearest + COLUMNS
+    return following + 1 if following < at + POLYGON_HEAD + COLUMNS * int(field[at]) else at + POLYGON_HEAD + 1
+
+
 @kernel(tuple_of(*[float64] * 4)(float64, float64, CONSTANT, int64), inline="always")
 def polygon_geometry(x, y, field, at):
     """Signed distance (m), normal (2) and curvature (1/m) for a rounded convex polygon.
@@ -53,16 +85,8 @@ def polygon_geometry(x, y, field, at):
         at: index at which the polygon begins in the field.
 
     """
-    largest, nearest = -np.inf, at + POLYGON_HEAD
-    row = at + POLYGON_HEAD
-    for _ in range(int(field[at])):
-        height = field[row] * x + field[row + 1] * y - field[row + 2]
-        if height > largest:
-            largest, nearest = height, row
-        row += COLUMNS
+    largest, nearest, beyond = _nearest_edge(x, y, field, at)
     nx, ny, rounding = field[nearest], field[nearest + 1], field[at + ROUNDING]
-    along = nx * (y - field[nearest + 4]) - ny * (x - field[nearest + 3])
-    beyond = min(along, max(along - field[nearest + 5], 0.0))  # distance along the edge's line beyond its ends
     if beyond == 0.0:  # everywhere inside
         return largest - rounding, nx, ny, 0.0
     distance = math.sqrt(largest * largest + beyond * beyond)

@@ -14,7 +14,7 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.distance import circle_geometry, polygon_geometry, wall_distance
+from leapnav.envs.shapes.distance import circle_geometry, closest_feature, polygon_geometry, wall_distance
 from leapnav.envs.shapes.field import (
     CENTRE,
     CIRCLES,
@@ -29,6 +29,10 @@ from leapnav.envs.shapes.field import (
 )
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
+HASH_FACTOR = 31
+# Proximity scales beyond which the closest feature of a polygon is irrelevant for the steps of the integrator: with 5,
+# 1.2 times as many evaluations of the flow in random scenarios with polygons, with 20 1.07 times as many.
+FEATURE_REACH = 8.0
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT), inline="always")
@@ -204,6 +208,46 @@ def footprint_proximity(x, y, heading, data, first, field):
         hyh += txy * dx + tyy * dy
         hhh += (txx * dx + 2.0 * txy * dy) * dx + tyy * dy * dy - a * (tx * cos + ty * sin)
     return value, gx, gy, gh, hxx, hxy, hxh, hyy, hyh, hhh
+
+
+@kernel(int64(float64, float64, float64, CONSTANT, int64), inline="always")
+def _feature(x, y, radius, field, at):
+    """Index of the feature of the polygon at an index of the field that is closest to a disc; 0 if it is far away."""
+    dx, dy, rim = x - field[at + CENTRE], y - field[at + CENTRE + 1], field[at + RIM] + radius
+    if dx * dx + dy * dy >= (rim + FEATURE_REACH * field[1]) ** 2:
+        return 0
+    return closest_feature(x, y, field, at)
+
+
+@kernel(int64(float64, float64, float64, CONSTANT))
+def disc_features(x, y, radius, field):
+    """Number of the edges and vertices of polygons that are closest to a disc.
+
+    The number changes where second derivatives of the proximity cost are discontinuous, apart from negligible terms.
+    """
+    number, cell = 0, cell_of(x, y, field)
+    if cell == 0:
+        at = SHAPES + 3 * int(field[CIRCLES])
+        for _ in range(int(field[POLYGONS])):
+            number = HASH_FACTOR * number + _feature(x, y, radius, field, at)
+            at += POLYGON_HEAD + COLUMNS * int(field[at])
+    else:
+        first = cell + 2 + int(field[cell])
+        for i in range(first, first + int(field[cell + 1])):
+            feature = _feature(x, y, radius, field, int(field[i]))
+            number += feature * feature  # does not depend on the cell
+    return number
+
+
+@kernel(int64(float64, float64, float64, CONSTANT, int64, CONSTANT))
+def footprint_features(x, y, heading, data, first, field):
+    """Number of the closest features of a footprint, see `disc_features` and `footprint_proximity`."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    number = 0
+    for k in range(first, len(data), 2):
+        features = disc_features(x + data[k] * cos, y + data[k] * sin, data[k + 1], field)
+        number = HASH_FACTOR * number + features
+    return number
 
 
 @kernel(VECTOR(float64[:, :], CONSTANT_MATRIX, CONSTANT))

@@ -16,8 +16,11 @@ from leapnav.envs.kernels.types import CONSTANT, FLAGS, MATRIX, NOTHING, VECTOR
 FLOW_SIGNATURE = float64(VECTOR, CONSTANT, CONSTANT, MATRIX, VECTOR, MATRIX)
 # control(z, data, u): fills the control u (m,) of the minimum principle.
 CONTROL_SIGNATURE = NOTHING(VECTOR, CONSTANT, VECTOR)
+# piece(z, data, field) -> number of the smooth piece of the flow that contains z.
+PIECE_SIGNATURE = types.int64(VECTOR, CONSTANT, CONSTANT)
 FLOW_FUNCTION = types.FunctionType(FLOW_SIGNATURE)
 CONTROL_FUNCTION = types.FunctionType(CONTROL_SIGNATURE)
+PIECE_FUNCTION = types.FunctionType(PIECE_SIGNATURE)
 
 
 class ExtremalFlow(NamedTuple):
@@ -25,6 +28,8 @@ class ExtremalFlow(NamedTuple):
 
     Attributes:
         function: the compiled flow, of type FLOW_SIGNATURE.
+        piece: the number of a smooth piece of the flow, of type PIECE_SIGNATURE. The derivatives of the flow are
+            discontinuous where a control reaches a limit, and where the closest edge or vertex of a polygon changes.
         data: control weights (m,), lower and upper control bounds (2m,), parameters of the system, three numbers for
             each limit of a state (`leapnav.experts.numerics.state_bounds`), offsets and radii of the discs of a
             footprint.
@@ -33,6 +38,7 @@ class ExtremalFlow(NamedTuple):
     """
 
     function: FunctionPointer
+    piece: FunctionPointer
     data: np.ndarray
     field: np.ndarray
 
@@ -70,7 +76,7 @@ class NewtonOptions(NamedTuple):
     adaptive: bool = True
 
 
-FLOW = record_type(ExtremalFlow, function=FLOW_FUNCTION, data=CONSTANT, field=CONSTANT)
+FLOW = record_type(ExtremalFlow, function=FLOW_FUNCTION, piece=PIECE_FUNCTION, data=CONSTANT, field=CONSTANT)
 END_CONDITION = record_type(EndCondition, goal=VECTOR, free=FLAGS, free_time=types.boolean)
 NEWTON_OPTIONS = record_type(
     NewtonOptions, tolerance=float64, accuracy=float64, max_iterations=types.int64, adaptive=types.boolean

@@ -28,11 +28,15 @@ WEIGHTS = np.ascontiguousarray(DOP853.B)
 ERROR_3, ERROR_5 = np.ascontiguousarray(DOP853.E3), np.ascontiguousarray(DOP853.E5)
 EXTRA_A, DENSE = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(DOP853.D)
 EXTRA_STAGES = len(EXTRA_A)
+ALL_STAGES = STAGES + 1 + EXTRA_STAGES
 DENSE_TERMS = 3 + len(DENSE)  # number of terms of the interpolant of order 7
 
 MAX_STEPS = 1_000  # per interval; segments of extremals take 10 to 100
-# Error relative to the tolerance; after a rejected step, a step of a smooth solution has an error of about 0.4.
-SMALL_ERROR = 1e-2
+# Accuracy of the fraction of a step up to a discontinuity, and that of its first estimate. A
+# deviation of FRACTION_ACCURACY causes an error of z at rounding level. After the fraction AHEAD of a step, the flow is
+# certainly in the next piece.
+FRACTION_ACCURACY, MARGIN, AHEAD = 1e-7, 1e-4, 1e-5
+MAX_ESTIMATES = 3
 MAX_VALUE = 1e14  # a state or costate beyond this has diverged
 MIN_STEP = 1e-13  # relative to the interval; smaller steps are at rounding level
 
@@ -41,7 +45,7 @@ class Stages(NamedTuple):
     """The stages of one step.
 
     Attributes:
-        slopes: (STAGES + 1 or STAGES + 1 + EXTRA_STAGES, len(y)), derivatives of y = (z, S).
+        slopes: (ALL_STAGES, len(y)), derivatives of y = (z, S); the last EXTRA_STAGES serve the interpolant.
         running: (number of slopes,), running costs.
 
     """
@@ -114,59 +118,6 @@ def next_step(h, error):
     return h * min(6.0, max(0.2, 0.9 * max(error, 1e-10) ** -0.125))
 
 
-@kernel(tuple_of(boolean, float64, float64, float64, int64)(FLOW, VECTOR, MATRIX, float64, float64, float64, boolean))
-def propagate(flow, z, S, duration, tolerance, first_step, once):
-    """Advance z (2n,) and S (2n, columns) in place by `duration`, or by one accepted step if `once`.
-
-    Returns (success, cost, elapsed time, next step size, evaluations of the flow). Without success the flow diverged or
-    the step size fell to rounding level; then z, S and the cost are NaN, so that no caller can use them by mistake.
-    """
-    size, columns = S.shape
-    length = size * (1 + columns)
-    y, new = np.empty(length), np.empty(length)
-    stages = Stages(np.empty((STAGES + 1, length)), np.empty(STAGES + 1))
-    K, L = stages.slopes, stages.running
-    for i in range(size):
-        y[i] = z[i]
-        for c in range(columns):
-            y[size + i * columns + c] = S[i, c]
-    cost, elapsed, evaluations = 0.0, 0.0, 1
-    h = duration if first_step <= 0.0 else first_step
-    evaluate_stage(flow, y, stages, 0, size)
-    failed, rejected = False, False
-    while elapsed < duration:
-        proposed = h
-        last = elapsed + h >= duration * (1 - 1e-14)
-        if last:
-            h = duration - elapsed
-        part, error = step(flow, y, new, stages, size, h, tolerance, 0.0)
-        evaluations += STAGES
-        # A small error after a rejected step, except the first, indicates a discontinuous derivative ahead, at a vertex
-        # of a polygon. The step size then does not grow, which takes 0.8 of the evaluations.
-        following = h if rejected and elapsed > 0.0 and error < SMALL_ERROR else next_step(h, error)
-        rejected = error > 1.0
-        if not rejected:
-            cost += part
-            L[0] = L[STAGES]
-            y, new = new, y
-            for e in range(length):
-                K[0, e] = K[STAGES, e]
-            for i in range(size):
-                failed = failed or not abs(y[i]) < MAX_VALUE
-            elapsed = duration if last else elapsed + h
-            if last:  # the step was shortened to end with the interval; the step size control keeps its proposal
-                following = max(following, proposed)
-        h = following
-        failed = failed or evaluations > STAGES * MAX_STEPS or h < MIN_STEP * duration
-        if failed or (once and not rejected):
-            break
-    for i in range(size):
-        z[i] = np.nan if failed else y[i]
-        for c in range(columns):
-            S[i, c] = np.nan if failed else y[size + i * columns + c]
-    return not failed, np.nan if failed else cost, elapsed, h, evaluations
-
-
 @kernel(NOTHING(FLOW, VECTOR, VECTOR, STAGES_TYPE, float64, float64, MATRIX))
 def interpolant(flow, y, new, stages, h, cost, terms):
     """Fill the coefficients (DENSE_TERMS, 2n + 1) of the interpolant of order 7 of z and the cost.
@@ -206,3 +157,138 @@ def evaluate_interpolant(start, s, terms, i):
     for k in range(DENSE_TERMS - 1, -1, -1):
         value = (value + terms[k, i]) * (s if k % 2 == 0 else 1.0 - s)
     return start + value
+
+
+@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64, float64, float64))
+def _boundary(flow, y, new, stages, size, h, cost, end, accuracy):
+    """Return the fraction of a step, at most `end`, at which its interpolant leaves the smooth piece of y.
+
+    The end of the step, at the fraction 1, is given.
+    """
+    first = flow.piece(part_of(y, 0, size), flow.data, flow.field)
+    low, high, fraction = 0.0, 1.0, end
+    if flow.piece(part_of(new, 0, size), flow.data, flow.field) == first:
+        if end == 1.0:
+            return end
+        low, high = 1.0, end
+    else:
+        fraction = 0.5
+    terms, z = np.empty((DENSE_TERMS, size + 1)), np.empty(size)
+    interpolant(flow, y, new, stages, h, cost, terms)
+    while high - low > accuracy:
+        for i in range(size):
+            z[i] = evaluate_interpolant(y[i], fraction, terms, i)
+        if flow.piece(z, flow.data, flow.field) != first:
+            high = fraction
+        elif fraction == end:
+            return end
+        else:
+            low = fraction
+        fraction = 0.5 * (low + high)
+    return low
+
+
+@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64))
+def smooth_fraction(flow, y, new, stages, size, h, cost):
+    """Return the fraction of a step at which its smooth piece of the flow ends; 1 if both ends are in the same piece.
+
+    A step across a discontinuity of the derivatives has a low order, so that many steps are rejected before it. A step
+    that ends there keeps the order. After such a step, `enter_piece` is necessary. (Its last stage may be in the next
+    piece, which causes an error of S of up to 1 %.)
+
+    The interpolant of the step gives a first estimate. Another step of z that ends just before it has an accurate
+    interpolant.
+    """
+    fraction = _boundary(flow, y, new, stages, size, h, cost, 1.0, MARGIN)
+    if not 2.0 * MARGIN < fraction < 1.0:
+        return 1.0
+    start, end = y[:size].copy(), np.empty(size)
+    closer = Stages(np.empty((ALL_STAGES, size)), np.empty(ALL_STAGES))
+    closer.slopes[0] = stages.slopes[0, :size]
+    closer.running[0] = stages.running[0]
+    for _ in range(MAX_ESTIMATES):
+        before = fraction - MARGIN
+        cost, _ = step(flow, start, end, closer, size, before * h, 1.0, 0.0)
+        farthest = 1.0 + 4.0 * MARGIN / before
+        found = _boundary(flow, start, end, closer, size, before * h, cost, farthest, FRACTION_ACCURACY)
+        fraction = found * before
+        if 1.0 < found < farthest:
+            break
+    return min(fraction, 1.0)
+
+
+@kernel(NOTHING(FLOW, VECTOR, STAGES_TYPE, int64, float64))
+def enter_piece(flow, y, stages, size, distance):
+    """Replace the slope of the sensitivities at y in stage 0 by that in the next piece of the flow.
+
+    The slope of z is continuous, and is kept. The next piece contains the point after `distance` (s).
+    """
+    K, running = stages.slopes, stages.running[0]
+    ahead, slope = np.empty(len(y)), np.empty(size)
+    for e in range(len(y)):
+        ahead[e] = y[e] + distance * K[0, e]
+    for i in range(size):
+        slope[i] = K[0, i]
+    evaluate_stage(flow, ahead, stages, 0, size)
+    for i in range(size):
+        K[0, i] = slope[i]
+    stages.running[0] = running
+
+
+@kernel(tuple_of(boolean, float64, float64, float64, int64)(FLOW, VECTOR, MATRIX, float64, float64, float64, boolean))
+def propagate(flow, z, S, duration, tolerance, first_step, once):
+    """Advance z (2n,) and S (2n, columns) in place by `duration`, or by one accepted step if `once`.
+
+    Returns (success, cost, elapsed time, next step size, evaluations of the flow). Without success the flow diverged or
+    the step size fell to rounding level; then z, S and the cost are NaN, so that no caller can use them by mistake. The
+    evaluations for interpolants, without sensitivities, are not counted.
+    """
+    size, columns = S.shape
+    length = size * (1 + columns)
+    y, new = np.empty(length), np.empty(length)
+    stages = Stages(np.empty((ALL_STAGES, length)), np.empty(ALL_STAGES))
+    K, L = stages.slopes, stages.running
+    for i in range(size):
+        y[i] = z[i]
+        for c in range(columns):
+            y[size + i * columns + c] = S[i, c]
+    cost, elapsed, evaluations = 0.0, 0.0, 1
+    h = duration if first_step <= 0.0 else first_step
+    evaluate_stage(flow, y, stages, 0, size)
+    failed, rejected, proposed, fraction = False, False, h, 1.0
+    while elapsed < duration:
+        if fraction == 1.0:
+            proposed = h
+        last = elapsed + h >= duration * (1 - 1e-14)
+        if last:
+            h = duration - elapsed
+        part, error = step(flow, y, new, stages, size, h, tolerance, 0.0)
+        evaluations += STAGES
+        following, rejected = next_step(h, error), error > 1.0
+        if rejected:
+            fraction = smooth_fraction(flow, y, new, stages, size, h, part) if error < np.inf else 1.0
+            if fraction < 1.0:
+                following = fraction * h
+        else:
+            cost += part
+            L[0] = L[STAGES]
+            y, new = new, y
+            for e in range(length):
+                K[0, e] = K[STAGES, e]
+            for i in range(size):
+                failed = failed or not abs(y[i]) < MAX_VALUE
+            elapsed = duration if last else elapsed + h
+            if fraction < 1.0:
+                enter_piece(flow, y, stages, size, AHEAD * h)
+                evaluations += 1
+            if last or fraction < 1.0:  # the step was shortened; the step size control keeps its proposal
+                following, fraction = max(following, proposed), 1.0
+        h = following
+        failed = failed or evaluations > STAGES * MAX_STEPS or h < MIN_STEP * duration
+        if failed or (once and not rejected):
+            break
+    for i in range(size):
+        z[i] = np.nan if failed else y[i]
+        for c in range(columns):
+            S[i, c] = np.nan if failed else y[size + i * columns + c]
+    return not failed, np.nan if failed else cost, elapsed, h, evaluations

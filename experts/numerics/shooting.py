@@ -10,7 +10,7 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import END_CONDITION, FLOW
-from leapnav.experts.numerics.integrator import propagate
+from leapnav.experts.numerics.integrator import ORDER, propagate
 
 
 @kernel(NOTHING(MATRIX, int64))
@@ -48,7 +48,7 @@ class NewtonSystem(NamedTuple):
         rows: (unknowns, 3 half + 1), the banded matrix, see `solve_banded`.
         rhs: (unknowns,), negative residuals.
         costs: (segments,), cost of each segment.
-        hints: (segments,), last step size of the integrator in each segment.
+        hints: (segments,), last step size of the integrator in each segment, for the accuracy 1; 0 if unknown.
 
     """
 
@@ -84,7 +84,7 @@ def linearise(flow, times, factor, Z, start, end, accuracy, system):
             rows[i, j] = 0.0
     z, rates = np.empty(size), np.empty(size)
     S = np.empty((size, size))
-    evaluations = 0
+    evaluations, scale, hint = 0, accuracy ** (1.0 / ORDER), 0.0
     for i in range(n):
         rows[i, half] = 1.0
         rhs[i] = start[i] - Z[0, i]
@@ -98,12 +98,13 @@ def linearise(flow, times, factor, Z, start, end, accuracy, system):
             z[i] = Z[k, i]
         set_identity(S, 0)
         duration = times[k + 1] - times[k]
-        success, cost, _, hint, count = propagate(flow, z, S, factor * duration, accuracy, system.hints[k], False)
+        first_step = scale * system.hints[k] if system.hints[k] > 0.0 else hint
+        success, cost, _, hint, count = propagate(flow, z, S, factor * duration, accuracy, first_step, False)
         evaluations += count
         if not success:
             return np.inf, np.inf, evaluations
         system.costs[k] = cost
-        system.hints[k] = hint
+        system.hints[k] = hint / scale
         for i in range(size):
             row = first + stride * k + i
             rhs[row] = Z[k + 1, i] - z[i]

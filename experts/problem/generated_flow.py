@@ -16,7 +16,7 @@ import sympy as sp
 
 from leapnav.envs.kernels.numba_internals import FunctionPointer
 from leapnav.envs.utils.caching import computed_once
-from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION
+from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION, PIECE_FUNCTION
 from leapnav.experts.numerics.state_bounds import ENTRIES
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
@@ -34,7 +34,7 @@ Obstacles = Literal["none", "disc", "footprint"]
 @computed_once(maxsize=64)
 def compile_flow(
     system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...] = ()
-) -> tuple[FunctionPointer, FunctionPointer]:
+) -> tuple[FunctionPointer, FunctionPointer, FunctionPointer]:
     """Compile the extremal flow and the control law of a system.
 
     Args:
@@ -44,7 +44,7 @@ def compile_flow(
         limited: for each limit of a state the index of the state.
 
     Returns:
-        `flow(z, data, field, S, dz, dS) -> running cost` and `control(z, data, u)`, see
+        `flow(z, data, field, S, dz, dS) -> running cost`, `piece(z, data, field)` and `control(z, data, u)`, see
         `leapnav.experts.numerics.flow`.
 
     Raises:
@@ -55,7 +55,11 @@ def compile_flow(
     declaration = declare(system, state_cost, obstacles, limited)
     imported = (*IMPORTED, *LIMITS_IMPORTED) if limited else IMPORTED
     module = load("flow", __name__, declaration, imported, lambda: _generate(system, state_cost, obstacles, limited))
-    return FunctionPointer(module.flow, FLOW_FUNCTION), FunctionPointer(module.control, CONTROL_FUNCTION)
+    return (
+        FunctionPointer(module.flow, FLOW_FUNCTION),
+        FunctionPointer(module.piece, PIECE_FUNCTION),
+        FunctionPointer(module.control, CONTROL_FUNCTION),
+    )
 
 
 def declare(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...]) -> str:
@@ -120,8 +124,10 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             entry = hessian[a + n, b] if a < n else -hessian[a - n, b]
             if entry != 0:
                 jacobian[a, b] = entry
-    costs = call_costs(at, limited, 3 * m + len(parameters))
-    return _render(n, len(parameters), switching, value, rate, jacobian, costs, import_costs(limited))
+    first = 3 * m + len(parameters)
+    costs = call_costs(at, limited, first)
+    features = _call("features", at, first + ENTRIES * len(limited)) if at else "0"
+    return _render(n, len(parameters), switching, value, rate, jacobian, costs, features, import_costs(limited))
 
 
 # Names of the value, gradient and Hessian (upper triangle, by rows) of the proximity cost, by the number of states on
@@ -162,16 +168,22 @@ def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[st
     for k, (i, symbols) in enumerate(zip(limited, limit_symbols(limited), strict=True)):
         lines.append(f"    {', '.join(map(str, symbols))} = limit_cost(q{i}, data, {first + ENTRIES * k})")
     if at:
-        states, discs = ", ".join(f"q{i}" for i in at), first + ENTRIES * len(limited)
-        call = f"proximity({states}, field)" if len(at) == 2 else f"footprint_proximity({states}, data, {discs}, field)"
-        lines.append(f"    {', '.join(PHI[len(at)])} = {call}")
+        lines.append(f"    {', '.join(PHI[len(at)])} = {_call('proximity', at, first + ENTRIES * len(limited))}")
     return lines
+
+
+def _call(name: str, at: Sequence[int], first: int) -> str:
+    """Return the call of a function of a disc or of a footprint, whose discs begin at an index of the data."""
+    states = ", ".join(f"q{i}" for i in at)
+    disc, footprint = f"disc_{name}({states}, field[2], field)", f"footprint_{name}({states}, data, {first}, field)"
+    return disc if len(at) == 2 else footprint
 
 
 def import_costs(limited: Sequence[int]) -> list[str]:
     """Return the lines that import what the lines of `call_costs` call."""
     limits = ["from leapnav.experts.numerics.state_bounds import limit_cost"] if limited else []
-    return ["from leapnav.envs.shapes.proximity import footprint_proximity, proximity", *limits]
+    names = "disc_features, disc_proximity, footprint_features, footprint_proximity"
+    return [f"from leapnav.envs.shapes.proximity import {names}", *limits]
 
 
 def _render(
@@ -182,11 +194,13 @@ def _render(
     rate: list[sp.Expr],
     jacobian: dict[tuple[int, int], sp.Expr],
     costs: list[str],
+    features: str,
     imports: list[str],
 ) -> str:
     """Return the source of a module that computes the given expressions, with common subexpressions removed.
 
-    Its flow computes the lines `costs` first, which call functions of the lines `imports`.
+    Its flow computes the lines `costs` first. These lines and the expression `features` for the number of the closest
+    features call functions of the lines `imports`.
     """
     m = len(switching)
     expressions = {
@@ -212,6 +226,9 @@ def _render(
         ]
     control_body = [*controls, *(f"    u[{j}] = u{j}" for j in range(m))]
 
+    piece_body = [*controls, f"    number = {features}"]
+    piece_body += [f"    number = 2 * number + (1 if slope{j} == 0.0 else 0)" for j in range(m)]
+
     lines = [*unpack, *controls, *costs]
     lines += assign("value", "value", "    ")
     for i in range(2 * n):
@@ -232,11 +249,17 @@ def _render(
             "import math",
             "from leapnav.envs.kernels import kernel",
             *imports,
-            "from leapnav.experts.numerics.flow import CONTROL_SIGNATURE, FLOW_SIGNATURE",
+            "from leapnav.experts.numerics.flow import CONTROL_SIGNATURE, FLOW_SIGNATURE, PIECE_SIGNATURE",
             "",
             "@kernel(FLOW_SIGNATURE)",
             "def flow(z, data, field, S, dz, dS):",
             *lines,
+            "",
+            "@kernel(PIECE_SIGNATURE)",
+            "def piece(z, data, field):",
+            *unpack,
+            *piece_body,
+            "    return number",
             "",
             "@kernel(CONTROL_SIGNATURE)",
             "def control(z, data, u):",

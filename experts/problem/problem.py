@@ -319,7 +319,7 @@ class OptimalControlProblem:
         from leapnav.experts.problem.generated_flow import compile_flow
 
         m, limits = self.system.m, self.state_limits
-        flow, control = compile_flow(*self._compiled, self._obstacles, tuple(limit.state for limit in limits))
+        flow, piece, control = compile_flow(*self._compiled, self._obstacles, tuple(limit.state for limit in limits))
         bounds = np.array(
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
@@ -330,7 +330,7 @@ class OptimalControlProblem:
         data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *discs])
         field = _constant([]) if self.field is None else with_weight(self.field, self.proximity_weight)
         return ProblemArrays(
-            flow=ExtremalFlow(flow, data, field),
+            flow=ExtremalFlow(flow, piece, data, field),
             control=control,
             start=np.array(self.start, dtype=float),
             end=EndCondition(goal, np.array([g is None for g in self.goal]), self.horizon is None),

@@ -14,15 +14,17 @@ from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW
 from leapnav.experts.numerics.integrator import (
-    EXTRA_STAGES,
+    AHEAD,
+    ALL_STAGES,
     MAX_VALUE,
     MIN_STEP,
-    STAGES,
     Stages,
+    enter_piece,
     evaluate_interpolant,
     evaluate_stage,
     interpolant,
     next_step,
+    smooth_fraction,
     step,
 )
 from leapnav.experts.problem.frames import MIN_DETERMINANT, SENSITIVITY_ACCURACY, orthonormalise
@@ -64,14 +66,15 @@ def trace(flow, control, times, Z, accuracy, record):
     m = out.shape[1] - 4 - 2 * size
     length = size * (1 + n)
     y, new = np.zeros(length), np.empty(length)
-    stages = Stages(np.empty((STAGES + 1 + EXTRA_STAGES, length)), np.empty(STAGES + 1 + EXTRA_STAGES))
+    stages = Stages(np.empty((ALL_STAGES, length)), np.empty(ALL_STAGES))
     K, L = stages.slopes, stages.running
     before_step = np.zeros((size, n))
     for i in range(n):
         y[size + (n + i) * n + i] = 1.0
     rows, defect, conjugate, total, sign, determinant = 0, 0.0, -1, 0.0, 0.0, 0.0
     last = len(times) - 2
-    h = (times[1] - times[0]) / 4.0
+    h, fraction = (times[1] - times[0]) / 4.0, 1.0
+    proposed = h
     for k in range(last + 1):
         for i in range(size):
             y[i] = Z[k, i]
@@ -93,7 +96,8 @@ def trace(flow, control, times, Z, accuracy, record):
             if finished:
                 break
             while True:
-                proposed = h
+                if fraction == 1.0:
+                    proposed = h
                 ends = elapsed + h >= duration * (1 - 1e-14)
                 if ends:
                     h = duration - elapsed
@@ -101,10 +105,14 @@ def trace(flow, control, times, Z, accuracy, record):
                 taken, h = h, next_step(h, error)
                 if error <= 1.0:
                     break
+                fraction = smooth_fraction(flow, y, new, stages, size, taken, cost) if error < np.inf else 1.0
+                if fraction < 1.0:
+                    h = fraction * taken
                 if h < MIN_STEP * times[last + 1]:
                     return DIVERGED, np.inf, conjugate
-            if ends:  # the step was shortened to end at the node; the step size control keeps its proposal
-                h = max(h, proposed)
+            located = fraction < 1.0
+            if ends or located:  # the step was shortened; the step size control keeps its proposal
+                h, fraction = max(h, proposed), 1.0
             interpolant(flow, y, new, stages, taken, cost, record.terms[rows])
             rows += 1
             total += cost
@@ -121,6 +129,8 @@ def trace(flow, control, times, Z, accuracy, record):
             determinant = orthonormalise(matrix_of(y, size, size, n))
             # Orthonormalisation changed S, so the last stage of the step cannot serve as the first of the next one.
             evaluate_stage(flow, y, stages, 0, size)
+            if located:
+                enter_piece(flow, y, stages, size, AHEAD * taken)
             if abs(determinant) > MIN_DETERMINANT and conjugate < 0:
                 if sign == 0.0:
                     sign = math.copysign(1.0, determinant)
