@@ -159,8 +159,8 @@ def evaluate_interpolant(start, s, terms, i):
     return start + value
 
 
-@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64, float64, float64))
-def _boundary(flow, y, new, stages, size, h, cost, end, accuracy):
+@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64, float64))
+def _boundary(flow, y, new, stages, size, h, end, accuracy):
     """Return the fraction of a step, at most `end`, at which its interpolant leaves the smooth piece of y.
 
     The end of the step, at the fraction 1, is given.
@@ -174,7 +174,7 @@ def _boundary(flow, y, new, stages, size, h, cost, end, accuracy):
     else:
         fraction = 0.5
     terms, z = np.empty((DENSE_TERMS, size + 1)), np.empty(size)
-    interpolant(flow, y, new, stages, h, cost, terms)
+    interpolant(flow, y, new, stages, h, 0.0, terms)
     while high - low > accuracy:
         for i in range(size):
             z[i] = evaluate_interpolant(y[i], fraction, terms, i)
@@ -188,8 +188,8 @@ def _boundary(flow, y, new, stages, size, h, cost, end, accuracy):
     return low
 
 
-@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64))
-def smooth_fraction(flow, y, new, stages, size, h, cost):
+@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64))
+def smooth_fraction(flow, y, new, stages, size, h):
     """Return the fraction of a step at which its smooth piece of the flow ends; 1 if both ends are in the same piece.
 
     A step across a discontinuity of the derivatives has a low order, so that many steps are rejected before it. A step
@@ -199,7 +199,7 @@ def smooth_fraction(flow, y, new, stages, size, h, cost):
     The interpolant of the step gives a first estimate. Another step of z that ends just before it has an accurate
     interpolant.
     """
-    fraction = _boundary(flow, y, new, stages, size, h, cost, 1.0, MARGIN)
+    fraction = _boundary(flow, y, new, stages, size, h, 1.0, MARGIN)
     if not 2.0 * MARGIN < fraction < 1.0:
         return 1.0
     start, end = y[:size].copy(), np.empty(size)
@@ -208,9 +208,9 @@ def smooth_fraction(flow, y, new, stages, size, h, cost):
     closer.running[0] = stages.running[0]
     for _ in range(MAX_ESTIMATES):
         before = fraction - MARGIN
-        cost, _ = step(flow, start, end, closer, size, before * h, 1.0, 0.0)
+        step(flow, start, end, closer, size, before * h, 1.0, 0.0)
         farthest = 1.0 + 4.0 * MARGIN / before
-        found = _boundary(flow, start, end, closer, size, before * h, cost, farthest, FRACTION_ACCURACY)
+        found = _boundary(flow, start, end, closer, size, before * h, farthest, FRACTION_ACCURACY)
         fraction = found * before
         if 1.0 < found < farthest:
             break
@@ -266,7 +266,7 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
         evaluations += STAGES
         following, rejected = next_step(h, error), error > 1.0
         if rejected:
-            fraction = smooth_fraction(flow, y, new, stages, size, h, part) if error < np.inf else 1.0
+            fraction = smooth_fraction(flow, y, new, stages, size, h) if error < np.inf else 1.0
             if fraction < 1.0:
                 following = fraction * h
         else:

@@ -127,7 +127,12 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
     first = 3 * m + len(parameters)
     costs = call_costs(at, limited, first)
     features = _call("features", at, first + ENTRIES * len(limited)) if at else "0"
-    return _render(n, len(parameters), switching, value, rate, jacobian, costs, features, import_costs(limited))
+    unpack = [
+        "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
+        "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n)),
+        *(f"    parameter{i} = data[{3 * m + i}]" for i in range(len(parameters))),
+    ]
+    return _render(unpack, switching, value, rate, jacobian, costs, features, import_costs(limited))
 
 
 # Names of the value, gradient and Hessian (upper triangle, by rows) of the proximity cost, by the number of states on
@@ -187,8 +192,7 @@ def import_costs(limited: Sequence[int]) -> list[str]:
 
 
 def _render(
-    n: int,
-    parameters: int,
+    unpack: list[str],
     switching: Sequence[Any],
     value: Any,
     rate: list[sp.Expr],
@@ -199,10 +203,10 @@ def _render(
 ) -> str:
     """Return the source of a module that computes the given expressions, with common subexpressions removed.
 
-    Its flow computes the lines `costs` first. These lines and the expression `features` for the number of the closest
-    features call functions of the lines `imports`.
+    All functions begin with the lines `unpack`, and the flow computes the lines `costs` first. These lines and the
+    expression `features` for the number of the closest features call functions of the lines `imports`.
     """
-    m = len(switching)
+    m, size = len(switching), len(rate)
     expressions = {
         **{f"p{j}": p for j, p in enumerate(switching)},
         "value": value,
@@ -211,11 +215,6 @@ def _render(
     }
     assign = Assignments(expressions).assign
 
-    unpack = [
-        "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
-        "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n)),
-        *(f"    parameter{i} = data[{3 * m + i}]" for i in range(parameters)),
-    ]
     controls: list[str] = []
     for j in range(m):
         controls += assign(f"p{j}", f"p{j}", "    ")
@@ -231,14 +230,14 @@ def _render(
 
     lines = [*unpack, *controls, *costs]
     lines += assign("value", "value", "    ")
-    for i in range(2 * n):
+    for i in range(size):
         lines += assign(f"dz[{i}]", f"rate{i}", "    ")
     lines.append("    if S.shape[1] > 0:")
     for a, b in jacobian:
         lines += assign(f"A{a}_{b}", f"A{a}_{b}", "        ")
     lines.append("        for c in range(S.shape[1]):")
-    for a in range(2 * n):
-        terms = [f"A{a}_{b} * S[{b}, c]" for b in range(2 * n) if (a, b) in jacobian]
+    for a in range(size):
+        terms = [f"A{a}_{b} * S[{b}, c]" for b in range(size) if (a, b) in jacobian]
         lines.append(f"            dS[{a}, c] = {' + '.join(terms) or '0.0'}")
     effort = " + ".join(f"0.5 * data[{j}] * u{j} * u{j}" for j in range(m))
     lines.append(f"    return value + {effort}")

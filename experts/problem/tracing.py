@@ -105,7 +105,7 @@ def trace(flow, control, times, Z, accuracy, record):
                 taken, h = h, next_step(h, error)
                 if error <= 1.0:
                     break
-                fraction = smooth_fraction(flow, y, new, stages, size, taken, cost) if error < np.inf else 1.0
+                fraction = smooth_fraction(flow, y, new, stages, size, taken) if error < np.inf else 1.0
                 if fraction < 1.0:
                     h = fraction * taken
                 if h < MIN_STEP * times[last + 1]:
