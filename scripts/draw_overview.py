@@ -79,7 +79,7 @@ def main() -> None:
         pose = path[round(fraction * 399), :3]
         draw_robot(plane, pose, scenario.discs, OPTIMUM, alpha=0.5)
     plane.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)
-    plane.set_title("Feasible paths converge to the certified optimum", fontsize=10)
+    plane.set_title("Leapfrog finds a local optimum, the search the best one", fontsize=10)
     names = list(SCORES)
     colors = ["#b9bec6"] * (len(names) - 1) + [OPTIMUM]
     drawn = bars.barh(names, list(SCORES.values()), color=colors)

@@ -32,10 +32,9 @@ ALL_STAGES = STAGES + 1 + EXTRA_STAGES
 DENSE_TERMS = 3 + len(DENSE)  # number of terms of the interpolant of order 7
 
 MAX_STEPS = 1_000  # per interval; segments of extremals take 10 to 100
-# Accuracy of the fraction of a step up to a discontinuity, and that of its first estimate. A
-# deviation of FRACTION_ACCURACY causes an error of z at rounding level. After the fraction AHEAD of a step, the flow is
-# certainly in the next piece.
-FRACTION_ACCURACY, MARGIN, AHEAD = 1e-7, 1e-4, 1e-5
+# Fractions of a step: accuracy of the boundary of a smooth piece, with which the error of z is at rounding level, and
+# distances before and after the boundary at which a point and the stages around it are in one piece.
+FRACTION_ACCURACY, MARGIN, BEYOND = 1e-10, 1e-4, 1e-9
 MAX_ESTIMATES = 3
 MAX_VALUE = 1e14  # a state or costate beyond this has diverged
 MIN_STEP = 1e-13  # relative to the interval; smaller steps are at rounding level
@@ -59,16 +58,15 @@ STAGES_TYPE = record_type(Stages, slopes=MATRIX, running=VECTOR)
 
 @kernel(NOTHING(FLOW, VECTOR, STAGES_TYPE, int64, int64))
 def evaluate_stage(flow, y, stages, s, size):
-    """Fill slope and running cost of stage s at y = (z, S), flat, of which z are the first `size` entries."""
-    length = len(y)
-    columns = length // size - 1
+    """Fill slope and running cost of stage s at y = (z, S), flat, or at y = z, of `size` entries."""
+    start, columns = s * stages.slopes.shape[1], len(y) // size - 1
     stages.running[s] = flow.function(
         part_of(y, 0, size),
         flow.data,
         flow.field,
         matrix_of(y, size, size, columns),
-        part_of(stages.slopes, s * length, size),
-        matrix_of(stages.slopes, s * length + size, size, columns),
+        part_of(stages.slopes, start, size),
+        matrix_of(stages.slopes, start + size, size, columns),
     )
 
 
@@ -118,6 +116,20 @@ def next_step(h, error):
     return h * min(6.0, max(0.2, 0.9 * max(error, 1e-10) ** -0.125))
 
 
+@kernel(NOTHING(VECTOR, VECTOR, STAGES_TYPE, float64, float64, MATRIX))
+def cubic_interpolant(y, new, stages, h, cost, terms):
+    """Fill the coefficients of the cubic interpolant, see `interpolant`."""
+    K, L = stages.slopes, stages.running
+    size = terms.shape[1] - 1
+    terms[:] = 0.0
+    for i in range(size + 1):
+        change = new[i] - y[i] if i < size else cost
+        first, last = (K[0, i], K[STAGES, i]) if i < size else (L[0], L[STAGES])
+        terms[0, i] = change
+        terms[1, i] = h * first - change
+        terms[2, i] = 2.0 * change - h * (last + first)
+
+
 @kernel(NOTHING(FLOW, VECTOR, VECTOR, STAGES_TYPE, float64, float64, MATRIX))
 def interpolant(flow, y, new, stages, h, cost, terms):
     """Fill the coefficients (DENSE_TERMS, 2n + 1) of the interpolant of order 7 of z and the cost.
@@ -137,12 +149,8 @@ def interpolant(flow, y, new, stages, h, cost, terms):
             z[i] = y[i] + h * total
         slope = part_of(K, (STAGES + 1 + s) * K.shape[1], size)
         L[STAGES + 1 + s] = flow.function(z, flow.data, flow.field, none, slope, d_none)
+    cubic_interpolant(y, new, stages, h, cost, terms)
     for i in range(size + 1):
-        change = new[i] - y[i] if i < size else cost
-        first, last = (K[0, i], K[STAGES, i]) if i < size else (L[0], L[STAGES])
-        terms[0, i] = change
-        terms[1, i] = h * first - change
-        terms[2, i] = 2.0 * change - h * (last + first)
         for d in range(DENSE_TERMS - 3):
             total = 0.0
             for j in range(STAGES + 1 + EXTRA_STAGES):
@@ -189,12 +197,8 @@ def _boundary(flow, y, new, stages, size, h, end, accuracy):
 
 
 @kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64))
-def smooth_fraction(flow, y, new, stages, size, h):
+def _smooth_fraction(flow, y, new, stages, size, h):
     """Return the fraction of a step at which its smooth piece of the flow ends; 1 if both ends are in the same piece.
-
-    A step across a discontinuity of the derivatives has a low order, so that many steps are rejected before it. A step
-    that ends there keeps the order. After such a step, `enter_piece` is necessary. (Its last stage may be in the next
-    piece, which causes an error of S of up to 1 %.)
 
     The interpolant of the step gives a first estimate. Another step of z that ends just before it has an accurate
     interpolant.
@@ -217,22 +221,36 @@ def smooth_fraction(flow, y, new, stages, size, h):
     return min(fraction, 1.0)
 
 
-@kernel(NOTHING(FLOW, VECTOR, STAGES_TYPE, int64, float64))
-def enter_piece(flow, y, stages, size, distance):
-    """Replace the slope of the sensitivities at y in stage 0 by that in the next piece of the flow.
+@kernel(tuple_of(float64, float64)(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64, float64))
+def shorter_step(flow, y, new, stages, size, h, error):
+    """Return the step size after a rejected step of length h, and the distance (s) to a boundary where it will end.
 
-    The slope of z is continuous, and is kept. The next piece contains the point after `distance` (s).
+    A step across a discontinuity of the derivatives has a low order, so that many steps would be rejected before it.
+    Therefore the next step ends just before the boundary of its smooth piece, which `cross` crosses. The distance is 0
+    if the step does not leave its piece.
     """
-    K, running = stages.slopes, stages.running[0]
-    ahead, slope = np.empty(len(y)), np.empty(size)
+    if error < np.inf:
+        fraction = _smooth_fraction(flow, y, new, stages, size, h)
+        if fraction < 1.0:
+            return (fraction - MARGIN) * h, (MARGIN + BEYOND) * h
+    return next_step(h, error), 0.0
+
+
+@kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64))
+def cross(flow, y, new, stages, size, h):
+    """Make a very short step of length h across the boundary of a smooth piece, and return its cost.
+
+    The step is of Heun's method for z, and of Euler's for S. Like `step`, it computes the last slopes, which are the
+    first of the next step.
+    """
+    K, L = stages.slopes, stages.running
     for e in range(len(y)):
-        ahead[e] = y[e] + distance * K[0, e]
+        new[e] = y[e] + h * K[0, e]
+    evaluate_stage(flow, part_of(new, 0, size), stages, STAGES, size)
     for i in range(size):
-        slope[i] = K[0, i]
-    evaluate_stage(flow, ahead, stages, 0, size)
-    for i in range(size):
-        K[0, i] = slope[i]
-    stages.running[0] = running
+        new[i] = y[i] + 0.5 * h * (K[0, i] + K[STAGES, i])
+    evaluate_stage(flow, new, stages, STAGES, size)
+    return 0.5 * h * (L[0] + L[STAGES])
 
 
 @kernel(tuple_of(boolean, float64, float64, float64, int64)(FLOW, VECTOR, MATRIX, float64, float64, float64, boolean))
@@ -241,7 +259,7 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
 
     Returns (success, cost, elapsed time, next step size, evaluations of the flow). Without success the flow diverged or
     the step size fell to rounding level; then z, S and the cost are NaN, so that no caller can use them by mistake. The
-    evaluations for interpolants, without sensitivities, are not counted.
+    evaluations that locate and cross boundaries of smooth pieces are not counted.
     """
     size, columns = S.shape
     length = size * (1 + columns)
@@ -255,20 +273,20 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
     cost, elapsed, evaluations = 0.0, 0.0, 1
     h = duration if first_step <= 0.0 else first_step
     evaluate_stage(flow, y, stages, 0, size)
-    failed, rejected, proposed, fraction = False, False, h, 1.0
+    failed, last, proposed, gap, crosses = False, False, h, 0.0, False
     while elapsed < duration:
-        if fraction == 1.0:
-            proposed = h
-        last = elapsed + h >= duration * (1 - 1e-14)
-        if last:
-            h = duration - elapsed
-        part, error = step(flow, y, new, stages, size, h, tolerance, 0.0)
-        evaluations += STAGES
-        following, rejected = next_step(h, error), error > 1.0
-        if rejected:
-            fraction = smooth_fraction(flow, y, new, stages, size, h) if error < np.inf else 1.0
-            if fraction < 1.0:
-                following = fraction * h
+        if crosses:
+            taken, error, part = gap, 0.0, cross(flow, y, new, stages, size, gap)
+        else:
+            if gap == 0.0:
+                proposed = h
+            last = elapsed + h >= duration * (1 - 1e-14)
+            if last:
+                h = duration - elapsed
+            part, error = step(flow, y, new, stages, size, h, tolerance, 0.0)
+            taken, evaluations = h, evaluations + STAGES
+        if error > 1.0:
+            h, gap = shorter_step(flow, y, new, stages, size, h, error)
         else:
             cost += part
             L[0] = L[STAGES]
@@ -277,15 +295,14 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
                 K[0, e] = K[STAGES, e]
             for i in range(size):
                 failed = failed or not abs(y[i]) < MAX_VALUE
-            elapsed = duration if last else elapsed + h
-            if fraction < 1.0:
-                enter_piece(flow, y, stages, size, AHEAD * h)
-                evaluations += 1
-            if last or fraction < 1.0:  # the step was shortened; the step size control keeps its proposal
-                following, fraction = max(following, proposed), 1.0
-        h = following
+            elapsed = duration if last else elapsed + taken
+            if not crosses:
+                # A shortened step keeps the proposal of the step size control.
+                h = max(next_step(h, error), proposed) if last or gap > 0.0 else next_step(h, error)
+            crosses = gap > 0.0 and not crosses
+            gap = gap if crosses else 0.0
         failed = failed or evaluations > STAGES * MAX_STEPS or h < MIN_STEP * duration
-        if failed or (once and not rejected):
+        if failed or (once and error <= 1.0):
             break
     for i in range(size):
         z[i] = np.nan if failed else y[i]

@@ -14,17 +14,17 @@ from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW
 from leapnav.experts.numerics.integrator import (
-    AHEAD,
     ALL_STAGES,
     MAX_VALUE,
     MIN_STEP,
     Stages,
-    enter_piece,
+    cross,
+    cubic_interpolant,
     evaluate_interpolant,
     evaluate_stage,
     interpolant,
     next_step,
-    smooth_fraction,
+    shorter_step,
     step,
 )
 from leapnav.experts.problem.frames import MIN_DETERMINANT, SENSITIVITY_ACCURACY, orthonormalise
@@ -73,8 +73,8 @@ def trace(flow, control, times, Z, accuracy, record):
         y[size + (n + i) * n + i] = 1.0
     rows, defect, conjugate, total, sign, determinant = 0, 0.0, -1, 0.0, 0.0, 0.0
     last = len(times) - 2
-    h, fraction = (times[1] - times[0]) / 4.0, 1.0
-    proposed = h
+    h, gap, crosses = (times[1] - times[0]) / 4.0, 0.0, False
+    proposed, taken, ends = h, h, False
     for k in range(last + 1):
         for i in range(size):
             y[i] = Z[k, i]
@@ -95,25 +95,26 @@ def trace(flow, control, times, Z, accuracy, record):
                 out[rows, 3 + m + 2 * size] = determinant
             if finished:
                 break
-            while True:
-                if fraction == 1.0:
-                    proposed = h
-                ends = elapsed + h >= duration * (1 - 1e-14)
-                if ends:
-                    h = duration - elapsed
-                cost, error = step(flow, y, new, stages, size, h, accuracy, SENSITIVITY_ACCURACY)
-                taken, h = h, next_step(h, error)
-                if error <= 1.0:
-                    break
-                fraction = smooth_fraction(flow, y, new, stages, size, taken) if error < np.inf else 1.0
-                if fraction < 1.0:
-                    h = fraction * taken
-                if h < MIN_STEP * times[last + 1]:
-                    return DIVERGED, np.inf, conjugate
-            located = fraction < 1.0
-            if ends or located:  # the step was shortened; the step size control keeps its proposal
-                h, fraction = max(h, proposed), 1.0
-            interpolant(flow, y, new, stages, taken, cost, record.terms[rows])
+            if crosses:
+                taken, cost = gap, cross(flow, y, new, stages, size, gap)
+                cubic_interpolant(y, new, stages, taken, cost, record.terms[rows])
+            else:
+                while True:
+                    if gap == 0.0:
+                        proposed = h
+                    ends = elapsed + h >= duration * (1 - 1e-14)
+                    if ends:
+                        h = duration - elapsed
+                    cost, error = step(flow, y, new, stages, size, h, accuracy, SENSITIVITY_ACCURACY)
+                    taken = h
+                    if error <= 1.0:
+                        break
+                    h, gap = shorter_step(flow, y, new, stages, size, h, error)
+                    if h < MIN_STEP * times[last + 1]:
+                        return DIVERGED, np.inf, conjugate
+                # A shortened step keeps the proposal of the step size control.
+                h = max(next_step(h, error), proposed) if ends or gap > 0.0 else next_step(h, error)
+                interpolant(flow, y, new, stages, taken, cost, record.terms[rows])
             rows += 1
             total += cost
             elapsed = duration if ends else elapsed + taken
@@ -129,8 +130,8 @@ def trace(flow, control, times, Z, accuracy, record):
             determinant = orthonormalise(matrix_of(y, size, size, n))
             # Orthonormalisation changed S, so the last stage of the step cannot serve as the first of the next one.
             evaluate_stage(flow, y, stages, 0, size)
-            if located:
-                enter_piece(flow, y, stages, size, AHEAD * taken)
+            crosses = gap > 0.0 and not crosses
+            gap = gap if crosses else 0.0
             if abs(determinant) > MIN_DETERMINANT and conjugate < 0:
                 if sign == 0.0:
                     sign = math.copysign(1.0, determinant)
