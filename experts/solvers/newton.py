@@ -27,10 +27,6 @@ MIN_DAMPING = 1.0 / 64.0
 MIN_STEP_FACTOR = 0.25  # a step may not reduce a free final time to less than this fraction
 COARSE_ACCURACY = 1e-4  # tolerance of the integrator far from the solution
 MARGIN = 0.1  # the tolerance in the options is this fraction of the residual that the caller accepts
-# Multiple shooting accepts a residual of this multiple of the tolerance if no step decreases it: errors of steps across
-# a discontinuous curvature, at the vertices of polygons, are larger than estimated. If the certificate is then not
-# confirmed, the caller polishes with a more accurate integrator.
-NOISE_LEVEL = 1000.0
 # A predicted residual must be below this fraction of the tolerance, assuming at least this constant of quadratic
 # convergence: a single step that happens to converge fast is weak evidence.
 PREDICTION_SAFETY, MIN_QUADRATIC_CONSTANT = 0.1, 100.0
@@ -211,9 +207,8 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
     """Apply damped Newton's method to the nodes Z (segments + 1, 2n), in place, and fill the segments' `costs`.
 
     A free final time changes all times in proportion, in place. `log` (max_iterations + 1, 3) receives residual, cost
-    and damping of each iterate, except for a last iterate whose residual is predicted. A residual at the level of the
-    integration errors is accepted if no step decreases it; whether it is sufficient is left to the certificate. Returns
-    (exit code, iterations, residual, evaluations).
+    and damping of each iterate, except for a last iterate whose residual is predicted. Returns (exit code,
+    iterations, residual, evaluations).
     """
     tolerance, accuracy = options.tolerance, options.accuracy
     n = len(end.goal)
@@ -272,9 +267,6 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
             slack = accuracy_slack(current, required, unknowns)
             if is_sufficient_decrease(trial_norm, norm, damping / 4.0, slack):
                 break
-            # At the level of the integration errors no step decreases the residual further.
-            if residual <= NOISE_LEVEL * tolerance and current <= accuracy:
-                return CONVERGED, iteration, residual, evaluations
             if trial_norm < np.inf and _is_contracting(matrix, rhs, step, half, damping / 4.0):
                 break
             damping /= 2.0
