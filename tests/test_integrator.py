@@ -77,6 +77,19 @@ def test_steps_end_where_the_closest_edge_or_vertex_of_a_polygon_changes():
     assert np.sum(evaluations, axis=0)[0] < 0.6 * np.sum(evaluations, axis=0)[1]
 
 
+def test_a_control_at_its_limit_is_another_piece_of_the_flow():
+    problem = OptimalControlProblem.from_scenario(sample_scenario("open", 1))
+    flow, limits = problem.arrays.flow, np.array(problem.control_bounds)
+    controls, numbers = np.empty((401, 2)), np.empty(401, dtype=int)
+    for k, scale in enumerate(np.linspace(-8.0, 8.0, 401)):
+        z = np.array([5.0, 5.0, 0.3, scale, 0.2, 0.4 * scale])
+        problem.arrays.control(z, flow.data, controls[k])
+        numbers[k] = flow.piece(z, flow.data, flow.field)
+    saturated = (controls == limits[:, 0]) | (controls == limits[:, 1])
+    assert saturated.any(axis=0).all() and not saturated.all(axis=0).any()
+    assert ((numbers[1:] != numbers[:-1]) == (saturated[1:] != saturated[:-1]).any(axis=1)).all()
+
+
 def test_dense_evaluation_agrees_with_independent_integration():
     scenario, _ = SCENARIOS["clutter-9"]
     extremal = find_optimum(scenario)

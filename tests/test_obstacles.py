@@ -5,10 +5,16 @@ import numpy as np
 import pytest
 from helpers import best_known, scenario_fields
 
-from leapnav.envs import Obstacle, Polygon, Scenario, Unicycle
+from leapnav.envs import Circle, Obstacle, Polygon, Scenario, Unicycle
 from leapnav.envs.shapes.barrier import CONTACT, barrier
 from leapnav.envs.shapes.clearance import clearance, clearances
-from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
+from leapnav.envs.shapes.proximity import (
+    disc_features,
+    footprint_features,
+    proximity,
+    proximity_value,
+    proximity_values,
+)
 from leapnav.envs.simulation.arcs import arc_point, arc_proximity, follow_arc
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
@@ -71,6 +77,31 @@ def test_gradient_and_hessian_agree_with_finite_differences(scenario):
         differences += [(right[1] - left[1]) / (2 * h), (right[2] - left[2]) / (2 * h), (above[2] - below[2]) / (2 * h)]
         # The difference quotient's own error, relative to the largest derivative there.
         assert [gx, gy, hxx, hxy, hyy] == pytest.approx(differences, rel=1e-5, abs=1e-6 * max(1, *map(abs, values)))
+
+
+@pytest.mark.parametrize("others", [0, 20], ids=["no grid", "grid"])
+def test_the_number_of_the_closest_features_changes_where_the_hessian_jumps(others):
+    box = Obstacle(polygon=Polygon(vertices=((4.5, 4.7), (5.5, 4.7), (5.5, 5.3), (4.5, 5.3))))
+    discs = [Obstacle(circle=Circle(center=(19.0, 0.5 + k / 2), radius=0.1)) for k in range(others)]
+    field = Scenario(arena=(0, 0, 20, 20), start=(1, 1, 0), goal=(9, 9, 0), horizon=20, obstacles=[box, *discs]).field
+    angles = np.linspace(0.1, 0.1 + 2 * math.pi, 4000)
+    path = 5.0 + 1.2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    numbers = np.array([disc_features(x, y, 0.25, field) for x, y in path])
+    assert len(set(numbers)) == 8  # four edges, four vertices
+    hessians = np.array([proximity(x, y, field)[3:] for x, y in path])
+    steps = np.abs(np.diff(hessians, axis=0)).max(axis=1)
+    changes = np.flatnonzero(np.diff(numbers))
+    assert len(changes) == 8
+    assert steps[changes].min() > 10 * np.median(steps)
+    assert set(np.argsort(steps)[-8:]) == set(changes)
+    assert disc_features(15.0, 15.0, 0.25, field) == 0  # far away
+    # A footprint changes with each of its discs.
+    data = np.array([0.0, 0.25, 0.3, 0.25])
+    whole = [footprint_features(x, y, 0.4, data, 0, field) for x, y in path]
+    dx, dy = 0.3 * math.cos(0.4), 0.3 * math.sin(0.4)
+    parts = [(disc_features(x, y, 0.25, field), disc_features(x + dx, y + dy, 0.25, field)) for x, y in path]
+    assert len(set(whole)) == len(set(parts)) > 8
+    assert [a != b for a, b in pairwise(whole)] == [a != b for a, b in pairwise(parts)]
 
 
 def test_the_barrier_function_and_its_derivatives():

@@ -59,14 +59,16 @@ def _nearest_edge(x, y, field, at):
     return largest, nearest, min(along, max(along - field[nearest + 5], 0.0))
 
 
-@kernel(int64(float64, float64, CONSTANT, int64), inline="always")
-def closest_feature(x, y, field, at):
-    """Index in the field of the edge or of the vertex of a polygon that is closest to a point outside.
+@kernel(int64(float64, float64, CONSTANT, int64, float64), inline="always")
+def closest_feature(x, y, field, at, reach):
+    """Index in the field of the edge or of the vertex of a rounded polygon that is closest to a point outside.
 
     A vertex has the index of the edge that begins there, plus 1. The curvature of the distance is continuous where the
-    feature does not change.
+    feature does not change. Beyond the distance `reach` (m) the result is 0.
     """
-    _, nearest, beyond = _nearest_edge(x, y, field, at)
+    largest, nearest, beyond = _nearest_edge(x, y, field, at)
+    if math.sqrt(largest * largest + beyond * beyond) - field[at + ROUNDING] >= reach:
+        return 0
     if beyond <= 0.0:
         return nearest if beyond == 0.0 else nearest + 1
     following = nearest + COLUMNS

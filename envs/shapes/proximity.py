@@ -29,7 +29,7 @@ from leapnav.envs.shapes.field import (
 )
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
-HASH_FACTOR = 31
+HASH_FACTOR = 31  # of numbers that are combined to one
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT), inline="always")
@@ -210,10 +210,11 @@ def footprint_proximity(x, y, heading, data, first, field):
 @kernel(int64(float64, float64, float64, CONSTANT, int64), inline="always")
 def _feature(x, y, radius, field, at):
     """Index of the feature of the polygon at an index of the field that is closest to a disc; 0 if it is far away."""
-    dx, dy, rim = x - field[at + CENTRE], y - field[at + CENTRE + 1], field[at + RIM] + radius
-    if dx * dx + dy * dy >= (rim + CUTOFF * field[1]) ** 2:
+    reach = CUTOFF * field[1] + radius
+    dx, dy = x - field[at + CENTRE], y - field[at + CENTRE + 1]
+    if dx * dx + dy * dy >= (field[at + RIM] + reach) ** 2:
         return 0
-    return closest_feature(x, y, field, at)
+    return closest_feature(x, y, field, at, reach)
 
 
 @kernel(int64(float64, float64, float64, CONSTANT))
@@ -232,7 +233,7 @@ def disc_features(x, y, radius, field):
         first = cell + 2 + int(field[cell])
         for i in range(first, first + int(field[cell + 1])):
             feature = _feature(x, y, radius, field, int(field[i]))
-            number += feature * feature  # does not depend on the cell
+            number += feature * feature  # a sum does not depend on the order of the polygons in the cell
     return number
 
 

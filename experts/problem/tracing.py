@@ -109,7 +109,7 @@ def trace(flow, control, times, Z, accuracy, record):
                     taken = h
                     if error <= 1.0:
                         break
-                    h, gap = shorter_step(flow, y, new, stages, size, h, error)
+                    h, gap, _ = shorter_step(flow, y, new, stages, size, h, error)
                     if h < MIN_STEP * times[last + 1]:
                         return DIVERGED, np.inf, conjugate
                 # A shortened step keeps the proposal of the step size control.
