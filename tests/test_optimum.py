@@ -255,6 +255,16 @@ def test_a_partial_search_finds_the_same_candidates():
         assert partial.limit == whole.limit and len(partial.taken) == len(whole.taken)
 
 
+def test_a_passage_hardly_wider_than_the_spacing_is_found():
+    """Between the corner of a box and the wall, 0.12 m wider than the robot; the detour costs 4.04."""
+    box = {"polygon": {"vertices": [[7.7916, 0.6194], [8.1972, 1.0661], [6.7359, 2.3929], [6.3303, 1.9462]]}}
+    start, goal = [5.2894, 0.9761, 2.3663], [9.3039, 0.8405, -2.2572]
+    scenario = Scenario.from_dict(scenario_fields(obstacles=[box], start=start, goal=goal, horizon=7.1))
+    optimum = find_optimum(scenario)
+    assert optimum.cost == pytest.approx(2.9689, rel=1e-4)
+    assert optimum.driving_modes == ("backward",)
+
+
 @pytest.mark.parametrize(("seed", "cost"), [(700_000, 4.80888), (710_085, 6.20218)])
 def test_a_first_path_through_a_closed_passage_does_not_degenerate_the_metric(seed, cost):
     """Such a path takes nearly the horizon even at E = 0, and at E = 0 the metric is degenerate."""

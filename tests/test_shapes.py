@@ -20,7 +20,7 @@ from leapnav.envs.shapes.distance import polygon_geometry
 from leapnav.envs.shapes.field import MAX_OBSTACLES_WITHOUT_GRID, blend_fields, obstacle_centres
 from leapnav.envs.shapes.field import SHAPES as FIRST
 from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
-from leapnav.envs.shapes.sampling import PointGrid, sample_grid
+from leapnav.envs.shapes.sampling import OFFSET, PointGrid, sample_grid
 from leapnav.envs.simulation.rendering import Scene, draw_scene
 from leapnav.envs.simulation.sensing import scan
 from leapnav.envs.utils.colors import OBSTACLE
@@ -139,7 +139,7 @@ def test_cost_and_clearance_on_a_grid_of_points_are_those_of_single_points(shape
     for i, j in np.ndindex(12, 12):
         x, y = 2.5 + 0.25 * i, 1.5 + 0.25 * j
         distances = [part_distance(part, np.array([x, y])) for part in shape.parts()] + [x, 8 - x, y, 6 - y]
-        expected = sum(1 / math.expm1(max(d - ROBOT, 0.125) / 0.1) for d in distances)
+        expected = sum(1 / math.expm1((max(d - ROBOT, 0.0) + 0.25 * OFFSET) / 0.1) for d in distances)
         assert phi[i, j] == pytest.approx(expected, rel=1e-6, abs=1e-6)
         assert free[i, j] == pytest.approx(min(clearance(x, y, field)[0], 2.0), abs=1e-9)
 

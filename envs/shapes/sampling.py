@@ -13,6 +13,11 @@ from leapnav.envs.shapes.barrier import CONTACT, barrier
 from leapnav.envs.shapes.distance import circle_geometry, polygon_geometry, wall_distance
 from leapnav.envs.shapes.field import CENTRE, CIRCLES, COLUMNS, POLYGON_HEAD, POLYGONS, RIM, SHAPES
 
+# Added to the distances of the points, relative to the spacing. With 0 (and at least half the spacing), 3 optima of
+# 2,000 scenarios of the unicycle are missed, by 3 to 36 %; for other robots, 8 of 800 results differ, as many better as
+# worse. With 0.71, 3 of 400 become worse by 11 to 19 %, and none better.
+OFFSET = 0.25
+
 
 class PointGrid(NamedTuple):
     """The points (x0 + i spacing, y0 + j spacing), i < columns and j < lines; in metres."""
@@ -38,11 +43,13 @@ def sample_grid(field, radius, grid, band):
     """Phi and clearance (m) of a disc of a radius (m), both (columns, lines), at the points of a grid.
 
     Obstacles farther away than `band` (m) do not contribute to Phi, and the clearance is at most `band`, so that each
-    obstacle is evaluated at the points around it only. A path between the points can have a distance that is larger by
-    half the spacing, so Phi is computed with at least this distance.
+    obstacle is evaluated at the points around it only. A path between the points can be farther away from obstacles,
+    so Phi is computed for a distance that is larger by OFFSET; otherwise a path through a passage that is hardly wider
+    than the spacing would cost far too much.
     """
     weight, steepness = field[0], 1.0 / field[1]
     x0, y0, spacing, columns, lines = grid.x0, grid.y0, grid.spacing, grid.columns, grid.lines
+    offset = OFFSET * spacing
     phi = np.empty((columns, lines))
     closest = np.empty((columns, lines))
     for i in range(columns):
@@ -52,7 +59,7 @@ def sample_grid(field, radius, grid, band):
             for side in range(4):
                 distance = wall_distance(x, y, field, side) - radius
                 if distance < band:
-                    phi[i, j] += weight * barrier(max(distance, spacing / 2) * steepness, CONTACT)[0]
+                    phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
     reach = band + radius
     at = SHAPES
@@ -65,7 +72,7 @@ def sample_grid(field, radius, grid, band):
             for j in range(bottom, top):
                 distance = circle_geometry(x0 + i * spacing - cx, y0 + j * spacing - cy, r + radius)[0]
                 if distance < band:
-                    phi[i, j] += weight * barrier(max(distance, spacing / 2) * steepness, CONTACT)[0]
+                    phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
     for _ in range(int(field[POLYGONS])):
         cx, cy, r = field[at + CENTRE], field[at + CENTRE + 1], field[at + RIM]
@@ -75,7 +82,7 @@ def sample_grid(field, radius, grid, band):
             for j in range(bottom, top):
                 distance = polygon_geometry(x0 + i * spacing, y0 + j * spacing, field, at)[0] - radius
                 if distance < band:
-                    phi[i, j] += weight * barrier(max(distance, spacing / 2) * steepness, CONTACT)[0]
+                    phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
         at += POLYGON_HEAD + COLUMNS * int(field[at])
     return phi, closest
