@@ -1,6 +1,5 @@
 """Gymnasium environments of a wheeled robot among obstacles, and the scenarios played in them."""
 
-from leapnav.deprecated import deprecated_names
 from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
@@ -45,5 +44,3 @@ __all__ = [
     "register_family",
     "sample_scenario",
 ]
-
-__getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})

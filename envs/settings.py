@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.utils.validation import (
@@ -259,6 +258,3 @@ def _as_dataclass(name: str, kind: type, value: Any) -> Any:
         if key not in known:
             raise ValueError(f"{name}: expected the attributes {', '.join(known)}, got {key!r}")
     return kind(**value)
-
-
-__getattr__ = deprecated_names(__name__, {"Settings": "EnvironmentSettings"})

@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from leapnav.deprecated import deprecated_names
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.bounds.lower_bound import LowerBound, lower_bound
 from leapnav.experts.continuation import continuation
@@ -85,11 +84,10 @@ _LAZY = {
 }
 
 
-_deprecated = deprecated_names(__name__, {"Path": "Trajectory"})
-
-
 def __getattr__(name: str) -> Any:
-    return getattr(import_module(_LAZY[name]), name) if name in _LAZY else _deprecated(name)
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -9,16 +9,12 @@ from pkgutil import extend_path
 
 import gymnasium
 
-from leapnav import deprecated
-
 __all__ = ["__version__"]
 
 # In the repository the packages are beside this directory. With an editable install, or when Python is started in the
 # repository, this directory is found first, and the directories of the installed package are added here.
 __path__ = extend_path(__path__, __name__)
 __version__ = version("leapnav")
-
-deprecated.install()
 
 for _name, _module in (("Navigate", "navigation"), ("NavigateGoal", "goal_navigation")):
     if f"leapnav/{_name}-v0" not in gymnasium.registry:  # a subprocess worker imports the package again

@@ -279,19 +279,6 @@ def test_a_failure_is_raised_on_request_with_the_failed_result():
     assert solve(VAN_DER_POL, raise_on_failure=True).success
 
 
-@pytest.mark.parametrize(("old", "new"), [("nodes", "n_nodes"), ("work", "n_evaluations")])
-def test_old_names_of_an_extremal_still_work(old, new):
-    extremal = solve(VAN_DER_POL)
-    with pytest.warns(DeprecationWarning, match=f"Extremal.{old} is now Extremal.{new}"):
-        assert getattr(extremal, old) == getattr(extremal, new) > 0
-
-
-def test_the_old_method_plot_of_an_extremal_draws_it(tmp_path):
-    with pytest.warns(DeprecationWarning, match=r"Extremal.plot is now leapnav.experts.plot_extremal"):
-        solve(VAN_DER_POL).plot(tmp_path / "plot.png")
-    assert (tmp_path / "plot.png").exists()
-
-
 def test_half_of_a_cost_that_is_not_positive_moves_no_node():
     system = ControlAffineSystem(state=(x,), drift=(0,), fields=((1,),))
     problem = OptimalControlProblem(system, (1,), (1,), 2.0, (1.0,), state_cost=-(x**2) / 2)

@@ -10,8 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self, cast
 
-from leapnav.deprecated import renamed_fields
-
 # Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start, "-warm-motor"
 # those for a warm start of a robot with motors, "-free" those for a free horizon, "-lidar" those for lidar alone; a
 # sub-table with the name of a family contains the changes for this family.
@@ -72,7 +70,6 @@ class CloningConfig:
     """Random seed of the validation split, the order of the samples and the augmentation."""
 
 
-@renamed_fields(failures="max_failures", episodes="max_episodes")
 @dataclass(frozen=True)
 class DAggerConfig:
     """Settings of dataset aggregation (DAgger)."""

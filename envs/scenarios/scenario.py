@@ -17,7 +17,6 @@ from typing import Any, Self
 import numpy as np
 from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
 
-from leapnav.deprecated import deprecated_names
 from leapnav.envs.robots import Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
@@ -441,6 +440,3 @@ def _known_fields(location: Sequence[Any], robot: type[RobotModel] = Unicycle) -
     names = [key for key in location if isinstance(key, str)]
     model = parts.get(names[-1]) if names else Scenario
     return tuple(KINDS) if model is None else tuple(model.model_fields)
-
-
-__getattr__ = deprecated_names(__name__, {"Robot": "Unicycle"})

@@ -78,7 +78,6 @@ class ScenarioSource:
 
     """
 
-    # Defaults, also of sources in checkpoints of earlier versions.
     _custom: CustomFamily | None = None
     obstacles: str = "cost"
 

@@ -1,5 +1,1 @@
 """Optimal control problems, extremals and certificates."""
-
-from leapnav.deprecated import moved_names
-
-__getattr__ = moved_names(__name__, "problem", "extremal")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-import os
-import warnings
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, ClassVar
@@ -268,24 +265,6 @@ class Extremal:
         values = self.cost - self._interpolate(as_vector("t", np.atleast_1d(t)))[:, -1]
         return values if np.ndim(t) else float(values[0])
 
-    def plot(self, path: str | os.PathLike[str] | None = None, title: str | None = None) -> Any:
-        """Plot the extremal. Deprecated: use `leapnav.experts.plot_extremal`."""
-        _warn_deprecated("Extremal.plot", "leapnav.experts.plot_extremal(extremal, path)")
-        # Imported by name at run time, so that the solvers do not depend on the plots.
-        return importlib.import_module("leapnav.experts.plotting").plot_extremal(self, path, title=title)
-
-    @property
-    def nodes(self) -> int:
-        """Number of nodes of the solver. Deprecated: use `n_nodes`."""
-        _warn_deprecated("Extremal.nodes", "Extremal.n_nodes")
-        return self.n_nodes
-
-    @property
-    def work(self) -> int:
-        """Number of evaluations of the extremal flow. Deprecated: use `n_evaluations`."""
-        _warn_deprecated("Extremal.work", "Extremal.n_evaluations")
-        return self.n_evaluations
-
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a dictionary that JSON can represent, as `leapnav solve --json` writes it.
 
@@ -311,8 +290,3 @@ class Extremal:
     def to_json(self) -> str:
         """Return `to_dict` as JSON text."""
         return encode(self.to_dict())
-
-
-def _warn_deprecated(name: str, replacement: str) -> None:
-    text = f"{name} is now {replacement}; the old name is removed in the next version"
-    warnings.warn(text, DeprecationWarning, stacklevel=3)

@@ -30,7 +30,7 @@ from leapnav.training.policies.architecture import KINDS, Architecture, is_actor
 from leapnav.training.policies.zips import is_zip, load_zip
 
 BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
-FORMAT, READ_FORMATS = 4, (2, 3, 4)  # version of policy.json; before 3 all have the default network, before 4 no memory
+FORMAT = 4  # version of policy.json
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
 OBSERVED = (*SENSORS, "robot", "horizon", "actuation", "dict_observation")
@@ -122,7 +122,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         found = description["format"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
-    if found not in READ_FORMATS:
+    if found != FORMAT:
         raise ValueError(f"{path}: format: expected {FORMAT}, got {found!r}; train the policy again")
     try:
         environment = description["environment"]["id"]
@@ -183,9 +183,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
         observation_space = spaces.Box(low, high, dtype=np.float32)
         action_space = spaces.Box(-1.0, 1.0, (_n_controls(description["environment"]),), np.float32)
-        architecture = Architecture(
-            **{field.name: description[field.name] for field in fields(Architecture) if field.name in description}
-        )
+        architecture = Architecture(**{field.name: description[field.name] for field in fields(Architecture)})
         policy = architecture.make(observation_space, action_space)
     except ModuleNotFoundError:
         raise
@@ -228,13 +226,12 @@ def _n_controls(environment: Mapping[str, Any]) -> int:
         ValueError: the robot's model is not registered.
 
     """
-    return robot_class(environment.get("robot", "unicycle")).sizes()[1]
+    return robot_class(environment["robot"]).sizes()[1]
 
 
 def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
     """Check that an environment has the observations that the policy was trained with."""
-    # Earlier files contain neither the robot nor the horizon.
-    trained = {"robot": "unicycle", "horizon": "fixed", **description["environment"]}
+    trained = description["environment"]
     for inner in unwrap(env):
         settings = _as_dict(inner.settings)
         differing = [

@@ -35,18 +35,6 @@ TEST_COUNT, TEST_SEED = 100, 1  # of the bank for the evaluations of a family th
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
-# Settings that earlier versions did not have, with the values that correspond to them.
-NEW_SETTINGS: dict[str, Any] = {
-    "horizon": "fixed",
-    "obstacles": "cost",
-    "observation": "lidar",
-    "memory": "none",
-    "actuation": "velocity",
-    "disturbance": 0.0,
-    "levels": "fresh",
-    "level_bank": None,
-}
-NEW_DAGGER_SETTINGS = {"takeovers": "schedule", "regret_threshold": 0.3}
 MEASURES = ("success", "collision", "soc", "regret")  # of an evaluation, for each family
 
 
@@ -114,11 +102,6 @@ class Run:
             stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
-        for name, value in NEW_SETTINGS.items():
-            if name in self._settings:
-                stored.setdefault(name, value)
-        if isinstance(stored.get("dagger"), dict):
-            stored["dagger"] = {**NEW_DAGGER_SETTINGS, **stored["dagger"]}
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
