@@ -10,11 +10,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from leapnav.envs.kernels import prepare
-from leapnav.envs.kernels.compilation import called_kernels, missing
-from leapnav.envs.kernels.numba_internals import Kernel
+from leapnav.envs.kernels.decorator import kernels_of
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.proximity import footprint_proximity
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_integer
@@ -29,13 +27,11 @@ from leapnav.experts.search.candidates import (
     first_energy,
     shortest_durations,
 )
-from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 from leapnav.experts.solve import solve
-from leapnav.experts.transcription import descent
 
 # Factor of the number of candidates for a robot that cannot rotate in place: the costs of its lattice paths differ from
 # those of the extremals by up to 20 %. Of 400 test scenarios of the car, 13 optima would be missed without this factor,
@@ -113,29 +109,28 @@ class Optimum(Extremal):
         return heading_winding(self.states[:, 2])
 
 
-# Kernels that a search for the unicycle does not call: those of the general transcription and of the lattices of robots
-# that cannot rotate in place.
-NOT_FOR_UNICYCLE = frozenset({descent.descend, general_tree})
-# Kernels of a robot with a footprint that only the generated flow calls.
-FOR_FOOTPRINT = (footprint_proximity,)
-
-
-def search_kernels(is_unicycle: bool, has_footprint: bool) -> list[Kernel]:
-    """Return the kernels of a search.
-
-    Args:
-        is_unicycle: whether the robot is the unicycle without a footprint.
-        has_footprint: whether the robot has a footprint.
-
-    """
-    called = [*called_kernels(find_optimum), *(FOR_FOOTPRINT if has_footprint else ())]
-    return [one for one in called if not (is_unicycle and one in NOT_FOR_UNICYCLE)]
+# The modules with the kernels of a search, and those whose kernels are called only for robots other than the unicycle.
+SEARCH_MODULES = (
+    "leapnav.envs.shapes",
+    "leapnav.experts.numerics",
+    "leapnav.experts.problem",
+    "leapnav.experts.search",
+    "leapnav.experts.solvers.newton",
+    "leapnav.experts.transcription",
+)
+OTHER_ROBOTS = (
+    "leapnav.experts.search.general_paths",
+    "leapnav.experts.transcription.descent",
+    "leapnav.experts.transcription.midpoint",
+    "leapnav.experts.transcription.riccati",
+)
 
 
 @computed_once()
-def _compile_kernels(is_unicycle: bool, has_footprint: bool) -> None:
-    """Compile the kernels of a search that are not in the cache; the others are loaded when they are called."""
-    prepare(*missing(search_kernels(is_unicycle, has_footprint)))
+def _compile_kernels(is_unicycle: bool) -> None:
+    """Compile the kernels of a search that are not in the cache."""
+    others = set(kernels_of(*OTHER_ROBOTS)) if is_unicycle else set()
+    prepare(*(one for one in kernels_of(*SEARCH_MODULES) if one not in others))
 
 
 class Effort(NamedTuple):
@@ -187,8 +182,7 @@ def find_optimum(
     if not isinstance(cast(object, scenario), Scenario):
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
-    is_unicycle = type(scenario.robot) is Unicycle and scenario.robot.footprint is None
-    _compile_kernels(is_unicycle, scenario.robot.footprint is not None)
+    _compile_kernels(type(scenario.robot) is Unicycle and scenario.robot.footprint is None)
     problem = OptimalControlProblem.from_scenario(scenario)
     if problem.horizon is None and problem.starts_at_goal:
         return as_optimum(failure(problem, Status.ZERO_HORIZON))

@@ -167,10 +167,13 @@ class RobotModel(Frozen):
         return ()
 
     def discs(self) -> np.ndarray:
-        """Return the footprint as an array (D, 2) of offsets and radii (m)."""
-        if self.footprint is None:
-            return np.array([[0.0, self.radius]])
-        return np.array([[disc.offset, disc.radius] for disc in self.footprint])
+        """Return the footprint as a read-only array (D, 2) of offsets and radii (m)."""
+        discs = (
+            [(0.0, self.radius)] if self.footprint is None else [(disc.offset, disc.radius) for disc in self.footprint]
+        )
+        array = np.array(discs, dtype=float)
+        array.flags.writeable = False
+        return array
 
     def metric(self, cost: CostWeights) -> tuple[float, float]:
         """Return the weights of the squared speed and turn rate in the metric of the lattice."""

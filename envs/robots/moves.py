@@ -62,6 +62,7 @@ def rotating_moves(cell: float, speed_weight: float, turn_weight: float) -> Move
     """
     targets, points, squares, turns = _rotating_table()
     lengths = np.sqrt(speed_weight * squares * cell * cell + turn_weight * turns * turns)
+    targets.flags.writeable = False
     return Moves(targets, points, (lengths / 6.0)[:, :, None] * SIMPSON, rotating=True)
 
 
@@ -131,4 +132,5 @@ def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: f
             points[heading, move, 1 : 2 * len(path) : 2] = corners[:-1] + corners[1:]
             for k, length in enumerate(lengths.tolist()):
                 weights[heading, move, 2 * k : 2 * k + 3] += length / 6.0 * SIMPSON
+    targets.flags.writeable = False
     return Moves(targets, points, weights)

@@ -144,9 +144,7 @@ class Scenario(Frozen):
     @cached_property
     def discs(self) -> np.ndarray:
         """The discs of the robot's footprint (D, 2): offset along its axis and radius (m) (read-only)."""
-        discs = self.robot.discs()
-        discs.flags.writeable = False
-        return discs
+        return self.robot.discs()
 
     @property
     def start_state(self) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.distance import polygon_geometry, wall_distance
 from leapnav.envs.shapes.field import CENTRE, CIRCLES, COLUMNS, GRID, POLYGON_HEAD, POLYGONS, RIM, SHAPES
 
@@ -78,7 +78,7 @@ def footprint_clearance(x, y, heading, discs, field):
     return best, found
 
 
-@kernel(VECTOR(float64[:, :], CONSTANT_MATRIX, CONSTANT))
+@kernel(VECTOR(MATRIX, CONSTANT_MATRIX, CONSTANT))
 def footprint_clearances(poses, discs, field):
     """Clearance (m) of the robot's outline at many poses, shape (N, >= 3) -> (N,)."""
     result = np.empty(len(poses))
@@ -87,7 +87,7 @@ def footprint_clearances(poses, discs, field):
     return result
 
 
-@kernel(float64(float64[:, :], CONSTANT_MATRIX, CONSTANT))
+@kernel(float64(MATRIX, CONSTANT_MATRIX, CONSTANT))
 def path_clearance(poses, discs, field):
     """Smallest clearance (m) of the robot's outline along a path of poses (N, >= 3), N >= 2, also between them.
 
@@ -108,7 +108,7 @@ def path_clearance(poses, discs, field):
     return best
 
 
-@kernel(VECTOR(float64[:, :], CONSTANT))
+@kernel(VECTOR(MATRIX, CONSTANT))
 def clearances(points, field):
     """Clearance (m) of many points, shape (N, >= 2) -> (N,)."""
     result = np.empty(len(points))

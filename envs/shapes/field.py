@@ -101,7 +101,9 @@ def _assemble(header: Sequence[float], arena: Sequence[float], parts: FieldParts
     polygons = [_pack_polygon(vertices, rounding) for vertices, rounding in parts.polygons]
     obstacles = np.concatenate([np.ravel(parts.circles), *polygons, parts.indices])
     counts = float(len(parts.circles)), float(len(polygons))
-    return np.concatenate([[*header, *counts, *arena, float(SHAPES + len(obstacles)), CONTACT], obstacles])
+    field = np.concatenate([[*header, *counts, *arena, float(SHAPES + len(obstacles)), CONTACT], obstacles])
+    field.flags.writeable = False
+    return field
 
 
 def _pack_polygon(vertices: np.ndarray, rounding: float) -> np.ndarray:

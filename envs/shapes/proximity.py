@@ -12,7 +12,7 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, tuple_of
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.barrier import barrier
 from leapnav.envs.shapes.distance import circle_geometry, closest_feature, polygon_geometry, wall_distance
 from leapnav.envs.shapes.field import (
@@ -50,20 +50,16 @@ def barrier_term(distance, nx, ny, curvature, field):
     return value, slope * nx, slope * ny, bend * nx * nx + curl, bend * nx * ny, bend * ny * ny + curl
 
 
-@kernel(tuple_of(*[float64] * 6)(float64, float64, CONSTANT))
-def proximity(x, y, field):
-    """Proximity cost of a disc with the radius of the field, see `disc_proximity`."""
-    return disc_proximity(x, y, field[2], field)
-
-
-@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT, int64), inline="always")
-def _circle_term(x, y, radius, reach, field, at):
-    """Barrier of the circle at an index of the field, zero beyond `reach` (m), with gradient and Hessian."""
-    dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2] + radius
-    if dx * dx + dy * dy >= (rim + reach) ** 2:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    distance, nx, ny, curvature = circle_geometry(dx, dy, rim)
-    return barrier_term(distance, nx, ny, curvature, field)
+@kernel(int64(float64, float64, CONSTANT), inline="always")
+def cell_of(x, y, field):
+    """Index in the field of the cell of its grid at (x, y); 0 without a grid."""
+    grid = int(field[GRID])
+    columns, lines = int(field[grid + 3]), int(field[grid + 4])
+    if columns == 0:
+        return 0
+    column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
+    line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
+    return grid + int(field[grid + 5 + column * lines + line])
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT, int64), inline="always")
@@ -75,6 +71,16 @@ def _polygon_term(x, y, radius, reach, field, at):
         if distance - radius < reach:
             return barrier_term(distance - radius, nx, ny, curvature, field)
     return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, CONSTANT, int64), inline="always")
+def _circle_term(x, y, radius, reach, field, at):
+    """Barrier of the circle at an index of the field, zero beyond `reach` (m), with gradient and Hessian."""
+    dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2] + radius
+    if dx * dx + dy * dy >= (rim + reach) ** 2:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    distance, nx, ny, curvature = circle_geometry(dx, dy, rim)
+    return barrier_term(distance, nx, ny, curvature, field)
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
@@ -117,22 +123,10 @@ def disc_proximity(x, y, radius, field):
     return k * value, k * gx, k * gy, k * hxx, k * hxy, k * hyy
 
 
-@kernel(int64(float64, float64, CONSTANT), inline="always")
-def cell_of(x, y, field):
-    """Index in the field of the cell of its grid at (x, y); 0 without a grid."""
-    grid = int(field[GRID])
-    columns, lines = int(field[grid + 3]), int(field[grid + 4])
-    if columns == 0:
-        return 0
-    column = min(max(int((x - field[grid]) / field[grid + 2]), 0), columns - 1)
-    line = min(max(int((y - field[grid + 1]) / field[grid + 2]), 0), lines - 1)
-    return grid + int(field[grid + 5 + column * lines + line])
-
-
-@kernel(float64(float64, float64, float64, CONSTANT))
-def proximity_value(x, y, radius, field):
-    """Proximity cost of a disc, without derivatives, to 2e-9 of the weight for each obstacle."""
-    return proximity_values(x, y, x, y, x, y, radius, field)[1]
+@kernel(tuple_of(*[float64] * 6)(float64, float64, CONSTANT))
+def proximity(x, y, field):
+    """Proximity cost of a disc with the radius of the field, see `disc_proximity`."""
+    return disc_proximity(x, y, field[2], field)
 
 
 @kernel(tuple_of(*[float64] * 3)(float64, float64, float64, float64, float64, float64, float64, CONSTANT))
@@ -171,6 +165,12 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
         at += POLYGON_HEAD + COLUMNS * int(field[at])
     weight = field[0]
     return weight * first, weight * second, weight * third
+
+
+@kernel(float64(float64, float64, float64, CONSTANT))
+def proximity_value(x, y, radius, field):
+    """Proximity cost of a disc, without derivatives, to 2e-9 of the weight for each obstacle."""
+    return proximity_values(x, y, x, y, x, y, radius, field)[1]
 
 
 @kernel(tuple_of(*[float64] * 10)(float64, float64, float64, CONSTANT, int64, CONSTANT))
@@ -248,7 +248,7 @@ def footprint_features(x, y, heading, data, first, field):
     return number
 
 
-@kernel(VECTOR(float64[:, :], CONSTANT_MATRIX, CONSTANT))
+@kernel(VECTOR(MATRIX, CONSTANT_MATRIX, CONSTANT))
 def footprint_proximities(poses, discs, field):
     """Proximity cost of the discs of a robot at many poses, shape (N, >= 3) -> (N,)."""
     result = np.zeros(len(poses))

@@ -13,7 +13,7 @@ import numpy as np
 from numba import float64, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
 from leapnav.envs.shapes.barrier import CONTACT

@@ -8,7 +8,7 @@ import numpy as np
 from numba import float64, int64, types
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.numba_internals import part_of
+from leapnav.envs.kernels.internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.shapes.distance import polygon_geometry
 from leapnav.envs.shapes.field import (

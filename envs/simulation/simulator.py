@@ -8,22 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from leapnav.envs.geodesics import geodesic_map
+from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
-from leapnav.envs.kernels.compilation import called_kernels
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.robots.base import ARCS, GENERAL
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.banks.checks import check_optimum
 from leapnav.envs.scenarios.scenario import GOAL, LIMITS, Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.shapes.clearance import clearances, footprint_clearance, footprint_clearances
+from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.envs.simulation import stepping
-from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies
+from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
 from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, RobotMotion, no_state_cost
-from leapnav.envs.simulation.sensing import check_map
+from leapnav.envs.simulation.sensing import check_map, max_vertices
 from leapnav.envs.simulation.state import (
     CLEARANCE,
     COLUMNS,
@@ -304,6 +303,7 @@ class BatchSimulator:
         duration = float(row[REMAINING])
         field, discs = self.fields[i], self._robots[i, self._first_disc :].reshape(-1, 2)
         discs = discs[discs[:, 1] > 0.0]
+        discs.flags.writeable = False
         motor = self.settings.motor
         if i not in self._contacts:
             self._contacts[i] = ContactWorld(field, discs, motor.mass, motor.moment, motor.friction)
@@ -393,6 +393,10 @@ def _required_discs(discs: np.ndarray) -> int:
     return 1 if len(discs) == 1 and discs[0, 0] == 0.0 else max(len(discs), 2)
 
 
+# Kernels that only some observations need.
+OBSERVING = {"map": max_vertices, "geodesic": solve_eikonal}
+
+
 def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
     motors = stepping.command, stepping.drive_motors, stepping.read_velocities
@@ -404,13 +408,11 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
             settings.model.advance,
             settings.model.state_cost or no_state_cost,
         )
-    if settings.reward == "shaped":
-        guiding = called_kernels(check_optimum)  # of banks, whose optima guide the robots
-        moving = *moving, *guiding, settings.model.advance, settings.model.state_cost or no_state_cost
-    observing = {"map": check_map, "geodesic": geodesic_map}.get(settings.observation)
-    if observing is not None:
-        moving = *moving, *called_kernels(observing)
+    if settings.reward == "shaped":  # the optima of banks, which guide the robots, are checked
+        moving = *moving, footprint_clearance, proximity_value
+    if settings.observation in OBSERVING:
+        moving = *moving, OBSERVING[settings.observation]
     if not settings.terminate_on_collision:
-        contact = BatchSimulator._drive_in_contact, BatchSimulator._command
-        moving = *moving, settings.model.advance, *(one for method in contact for one in called_kernels(method))
-    return stepping.start_episodes, *moving, stepping.end_periods, observe_robots
+        moving = *moving, settings.model.advance, resolve_overlap, proximity_value, stepping.wheel_forces
+    sampling = clearances, footprint_clearances
+    return *sampling, stepping.start_episodes, *moving, stepping.end_periods, observe_robots

@@ -8,7 +8,7 @@ import numpy as np
 from numba import float32, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.numba_internals import vector_at
+from leapnav.envs.kernels.internals import vector_at
 from leapnav.envs.kernels.types import CONSTANT, CUBE, INTEGERS, MATRIX, VECTOR
 from leapnav.envs.shapes.field import pack_field
 

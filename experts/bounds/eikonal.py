@@ -74,85 +74,11 @@ def solve_eikonal(
             repeat(values, factor, locked, layout, medium, tolerance)
 
 
-@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, float64))
-def relax(values, factor, locked, layout, medium, tolerance):
-    """Visit blocks, that whose surroundings changed to the lowest value first, until nothing changes.
-
-    Args:
-        values: the solution; it only decreases.
-        factor: factor of n in each cell.
-        locked: cells that are not changed.
-        layout, medium, tolerance: see `solve_eikonal`.
-
-    """
-    local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
-    keys = np.full(len(values), np.inf)  # lowest value to which the surroundings changed since the last visit
-    n_k, n_i, n_j = layout.slots.shape
-    for b in range(len(values)):
-        if locked[b].any():
-            keys[b] = values[b].min()
-    for _ in range(MAX_VISITS * len(values)):
-        b = np.argmin(keys)
-        if keys[b] == np.inf:
-            break
-        keys[b] = np.inf
-        gather(values, layout, b, local)
-        _sweep_block(local, factor[b], locked[b], medium, layout.blocks[b], tolerance, False)
-        lowest = _store(local, values[b], tolerance)
-        if lowest == np.inf:
-            continue
-        k0, i0, j0 = layout.blocks[b, 0], layout.blocks[b, 1], layout.blocks[b, 2]
-        for dk in range(-1, 2):
-            for di in range(-1, 2):
-                for dj in range(-1, 2):
-                    if 0 <= i0 + di < n_i and 0 <= j0 + dj < n_j:
-                        slot = layout.slots[(k0 + dk) % n_k, i0 + di, j0 + dj]
-                        if slot >= 0 and slot != b:
-                            keys[slot] = min(keys[slot], lowest)
-
-
-@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, float64))
-def repeat(values, factor, locked, layout, medium, tolerance):
-    """Visit each block once in the order of their values, which may also increase; see `relax`."""
-    local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
-    keys = np.empty(len(values))
-    for b in range(len(values)):
-        keys[b] = values[b].min()
-    for b in np.argsort(keys):
-        gather(values, layout, b, local)
-        _sweep_block(local, factor[b], locked[b], medium, layout.blocks[b], tolerance, True)
-        _store(local, values[b], tolerance)
-
-
 _BLOCK_VALUES = types.Array(float32, 3, "C")
 _BLOCK_MASK = types.Array(boolean, 3, "C")
 
 
 _POSITION = types.Array(int32, 1, "C")
-
-
-@kernel(float64(CUBE, _BLOCK_VALUES, float64))
-def _store(local, values, tolerance):
-    """Copy a block back; return the lowest value that decreased by more than the tolerance, or infinity."""
-    lowest = np.inf
-    for k in range(BLOCK):
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                value = float32(local[k + 1, i + 1, j + 1])
-                if values[k, i, j] - value > tolerance:
-                    lowest = min(lowest, value)
-                values[k, i, j] = value
-    return lowest
-
-
-@kernel(NOTHING(CUBE, _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, _POSITION, float64, boolean))
-def _sweep_block(local, factor, locked, medium, block, tolerance, assign):
-    """Sweep over a block until nothing changes, at most once in each of 8 orders."""
-    idle = 0
-    for sweep in range(8):
-        idle = 0 if _sweep(local, factor, locked, medium, block, sweep, tolerance, assign) else idle + 1
-        if idle == IDLE:
-            break
 
 
 @kernel(
@@ -208,6 +134,80 @@ def _sweep(local, factor, locked, medium, block, sweep, tolerance, assign):
                     changed = changed or abs(present - value) > tolerance
                     local[a, i + 1, j + 1] = value
     return changed
+
+
+@kernel(NOTHING(CUBE, _BLOCK_VALUES, _BLOCK_MASK, MEDIUM, _POSITION, float64, boolean))
+def _sweep_block(local, factor, locked, medium, block, tolerance, assign):
+    """Sweep over a block until nothing changes, at most once in each of 8 orders."""
+    idle = 0
+    for sweep in range(8):
+        idle = 0 if _sweep(local, factor, locked, medium, block, sweep, tolerance, assign) else idle + 1
+        if idle == IDLE:
+            break
+
+
+@kernel(float64(CUBE, _BLOCK_VALUES, float64))
+def _store(local, values, tolerance):
+    """Copy a block back; return the lowest value that decreased by more than the tolerance, or infinity."""
+    lowest = np.inf
+    for k in range(BLOCK):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                value = float32(local[k + 1, i + 1, j + 1])
+                if values[k, i, j] - value > tolerance:
+                    lowest = min(lowest, value)
+                values[k, i, j] = value
+    return lowest
+
+
+@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, float64))
+def relax(values, factor, locked, layout, medium, tolerance):
+    """Visit blocks, that whose surroundings changed to the lowest value first, until nothing changes.
+
+    Args:
+        values: the solution; it only decreases.
+        factor: factor of n in each cell.
+        locked: cells that are not changed.
+        layout, medium, tolerance: see `solve_eikonal`.
+
+    """
+    local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
+    keys = np.full(len(values), np.inf)  # lowest value to which the surroundings changed since the last visit
+    n_k, n_i, n_j = layout.slots.shape
+    for b in range(len(values)):
+        if locked[b].any():
+            keys[b] = values[b].min()
+    for _ in range(MAX_VISITS * len(values)):
+        b = np.argmin(keys)
+        if keys[b] == np.inf:
+            break
+        keys[b] = np.inf
+        gather(values, layout, b, local)
+        _sweep_block(local, factor[b], locked[b], medium, layout.blocks[b], tolerance, False)
+        lowest = _store(local, values[b], tolerance)
+        if lowest == np.inf:
+            continue
+        k0, i0, j0 = layout.blocks[b, 0], layout.blocks[b, 1], layout.blocks[b, 2]
+        for dk in range(-1, 2):
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    if 0 <= i0 + di < n_i and 0 <= j0 + dj < n_j:
+                        slot = layout.slots[(k0 + dk) % n_k, i0 + di, j0 + dj]
+                        if slot >= 0 and slot != b:
+                            keys[slot] = min(keys[slot], lowest)
+
+
+@kernel(NOTHING(VALUES, VALUES, MASKS, LAYOUT, MEDIUM, float64))
+def repeat(values, factor, locked, layout, medium, tolerance):
+    """Visit each block once in the order of their values, which may also increase; see `relax`."""
+    local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
+    keys = np.empty(len(values))
+    for b in range(len(values)):
+        keys[b] = values[b].min()
+    for b in np.argsort(keys):
+        gather(values, layout, b, local)
+        _sweep_block(local, factor[b], locked[b], medium, layout.blocks[b], tolerance, True)
+        _store(local, values[b], tolerance)
 
 
 @kernel(NOTHING(VALUES, VALUES, LAYOUT, MEDIUM))

@@ -105,6 +105,19 @@ def _project(local, k, i, j, matrix, points, point, radius):
                 q += 1
 
 
+@kernel(NOTHING(LAYOUT, MASKS, int64, int64, int64, MASKS))
+def _mark_around(layout, mask, k, i, j, pending):
+    """Mark the cells of the set within two cells of cell (k, i, j)."""
+    n_k, n_i, n_j = layout.slots.shape
+    for a in range(k - 2, k + 3):
+        a = a % (n_k * BLOCK)
+        for b in range(max(i - 2, 0), min(i + 3, n_i * BLOCK)):
+            for c in range(max(j - 2, 0), min(j + 3, n_j * BLOCK)):
+                slot = layout.slots[a // BLOCK, b // BLOCK, c // BLOCK]
+                if slot >= 0 and mask[slot, a % BLOCK, b % BLOCK, c % BLOCK]:
+                    pending[slot, a % BLOCK, b % BLOCK, c % BLOCK] = True
+
+
 @kernel(int64(VALUES, LAYOUT, MASKS, MASKS, COST, CONSTRAINTS))
 def project_once(values, layout, mask, pending, cost, constraints):
     """Visit the pending cells once, and return the number of projections.
@@ -164,16 +177,3 @@ def project_once(values, layout, mask, pending, cost, constraints):
         if changed:
             scatter(local, layout, block, values)
     return count
-
-
-@kernel(NOTHING(LAYOUT, MASKS, int64, int64, int64, MASKS))
-def _mark_around(layout, mask, k, i, j, pending):
-    """Mark the cells of the set within two cells of cell (k, i, j)."""
-    n_k, n_i, n_j = layout.slots.shape
-    for a in range(k - 2, k + 3):
-        a = a % (n_k * BLOCK)
-        for b in range(max(i - 2, 0), min(i + 3, n_i * BLOCK)):
-            for c in range(max(j - 2, 0), min(j + 3, n_j * BLOCK)):
-                slot = layout.slots[a // BLOCK, b // BLOCK, c // BLOCK]
-                if slot >= 0 and mask[slot, a % BLOCK, b % BLOCK, c % BLOCK]:
-                    pending[slot, a % BLOCK, b % BLOCK, c % BLOCK] = True

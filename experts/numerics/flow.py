@@ -8,7 +8,7 @@ import numpy as np
 from numba import float64, types
 
 from leapnav.envs.kernels import record_type
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.kernels.types import CONSTANT, FLAGS, MATRIX, NOTHING, VECTOR
 
 # flow(z, data, field, S, dz, dS) -> running cost: fills dz = z' and dS = S' for z = (q, lam) and S (2n, columns).

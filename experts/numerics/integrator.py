@@ -17,7 +17,7 @@ from numba import boolean, float64, int64
 from scipy.integrate import DOP853
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.numba_internals import matrix_of, part_of
+from leapnav.envs.kernels.internals import matrix_of, part_of
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import FLOW
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -14,7 +15,7 @@ from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.pycode import PythonCodePrinter
 from sympy.simplify.cse_main import tree_cse
 
-from leapnav.envs.kernels.decorator import cache_root, source_stamp
+from leapnav.envs.kernels.decorator import cache_root
 from leapnav.envs.utils.files import write_text
 
 
@@ -103,22 +104,18 @@ class Assignments:
         return [*lines, f"{indent}{target} = {PRINTER.doprint(expression)}"]
 
 
-def load(
-    kind: str, generator: str, declaration: str, imported: Iterable[str], generate: Callable[[], str]
-) -> ModuleType:
+def load(kind: str, generator: str, declaration: str, generate: Callable[[], str]) -> ModuleType:
     """Return a generated module, which is written if the cache does not contain it.
 
     Args:
         kind: prefix of the module's name.
-        generator: name of the module that generates it. The content depends on its source, and on the version of SymPy.
+        generator: source file of the module that generates it. The content depends on it, and on the version of SymPy.
         declaration: text that determines the content of the module, together with the generator.
-        imported: the modules that it imports. The functions that it calls are compiled into it, so its name depends on
-            their source.
         generate: function that returns the source.
 
     """
-    stamps = map(source_stamp, (generator, *imported))
-    identity = "\n".join([sp.__version__, declaration, *stamps])
+    sources = (Path(file).read_text(encoding="utf-8") for file in (__file__, generator))
+    identity = "\n".join([sp.__version__, declaration, *sources])
     name = f"{kind}_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
     path = cache_root() / f"{name}.py"
     if not path.exists():

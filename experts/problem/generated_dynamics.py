@@ -12,12 +12,11 @@ from typing import NamedTuple
 import sympy as sp
 from numba import float64, types
 
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.generated_flow import (
-    LIMITS_IMPORTED,
     PHI,
     Obstacles,
     call_costs,
@@ -40,8 +39,6 @@ RATES_FUNCTION = types.FunctionType(RATES_SIGNATURE)
 DERIVATIVES_FUNCTION = types.FunctionType(DERIVATIVES_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
 
-IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.problem.generated_dynamics"
-
 
 class CompiledDynamics(NamedTuple):
     """The compiled dynamics of a system and its state cost, see the signatures of this module."""
@@ -63,10 +60,7 @@ def compile_dynamics(
     """
     check_obstacles(system, obstacles)
     declaration = declare(system, state_cost, obstacles, limited)
-    imported = (*IMPORTED, *LIMITS_IMPORTED) if limited else IMPORTED
-    module = load(
-        "dynamics", __name__, declaration, imported, lambda: _generate(system, state_cost, obstacles, limited)
-    )
+    module = load("dynamics", __file__, declaration, lambda: _generate(system, state_cost, obstacles, limited))
     return CompiledDynamics(
         FunctionPointer(module.rates, RATES_FUNCTION),
         FunctionPointer(module.derivatives, DERIVATIVES_FUNCTION),

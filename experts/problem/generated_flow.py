@@ -14,17 +14,12 @@ from typing import Any, Literal
 
 import sympy as sp
 
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION, PIECE_FUNCTION
 from leapnav.experts.numerics.state_bounds import ENTRIES
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
-
-# The modules that the generated module imports.
-IMPORTED = "leapnav.envs.shapes.proximity", "leapnav.experts.numerics.flow"
-LIMITS_IMPORTED = ("leapnav.experts.numerics.state_bounds",)  # with limits of states
-
 
 # What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or
 # that of the discs of a footprint.
@@ -53,8 +48,7 @@ def compile_flow(
     """
     check_obstacles(system, obstacles)
     declaration = declare(system, state_cost, obstacles, limited)
-    imported = (*IMPORTED, *LIMITS_IMPORTED) if limited else IMPORTED
-    module = load("flow", __name__, declaration, imported, lambda: _generate(system, state_cost, obstacles, limited))
+    module = load("flow", __file__, declaration, lambda: _generate(system, state_cost, obstacles, limited))
     return (
         FunctionPointer(module.flow, FLOW_FUNCTION),
         FunctionPointer(module.piece, PIECE_FUNCTION),

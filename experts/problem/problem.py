@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.field import check_field, with_weight
 from leapnav.envs.shapes.proximity import footprint_proximities
@@ -299,8 +299,8 @@ class OptimalControlProblem:
     def discs(self) -> np.ndarray:
         """The discs of the robot (D, 2), offset along its heading and radius (m); (0, 2) without obstacles."""
         if self.field is None:
-            return np.empty((0, 2))
-        return np.array(self.footprint if self.footprint is not None else [(0.0, self.field[2])], dtype=float)
+            return _constant(()).reshape(-1, 2)
+        return _constant(self.footprint or ((0.0, self.field[2]),))
 
     @cached_property
     def compiled_dynamics(self) -> CompiledDynamics:
@@ -434,7 +434,7 @@ def _is_finite(value: Any) -> bool:
     return _is_number(value) and math.isfinite(float(value))
 
 
-def _constant(values: Sequence[float] | list[float]) -> np.ndarray:
+def _constant(values: Any) -> np.ndarray:
     """Return a read-only array, as the kernels expect for constants."""
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False

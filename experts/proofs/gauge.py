@@ -131,12 +131,6 @@ def angle_between(angle, reference):
     return (angle - reference + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@kernel(float64(float64, float64, float64, SOURCE))
-def gauge(x, y, heading, source):
-    """The gauge at a pose."""
-    return gauge_minimum(x, y, heading, 0.0, 0.0, source)
-
-
 @kernel(float64(float64, float64, float64, float64, float64, SOURCE))
 def gauge_minimum(x, y, heading, width, angle_width, source):
     """A lower bound of the gauge over a box of poses.
@@ -168,3 +162,9 @@ def gauge_minimum(x, y, heading, width, angle_width, source):
     square = r_v * u * u + r_w * near * near
     koranyi = math.sqrt(math.sqrt(square * square + 16.0 * r_v * r_w * w * w))
     return max(lowest, min(koranyi, source.limit) / source.gradient) * (1.0 - ROUNDING)
+
+
+@kernel(float64(float64, float64, float64, SOURCE))
+def gauge(x, y, heading, source):
+    """The gauge at a pose."""
+    return gauge_minimum(x, y, heading, 0.0, 0.0, source)

@@ -63,6 +63,47 @@ def _mark_near(mask, layout, source, geometry, radius, near):
                         near[b, k, i, j] = lowest < radius
 
 
+@kernel(NOTHING(CUBE, int64, float64, float64, CUBE))
+def _restrict(points, axis, low, high, result):
+    """Control points of a part of a cell, from `low` to `high` along one axis; `result` may be `points`."""
+    for a in range(3):
+        for b in range(3):
+            i0, j0, k0 = (0, a, b) if axis == 0 else ((a, 0, b) if axis == 1 else (a, b, 0))
+            i1, j1, k1 = (1, a, b) if axis == 0 else ((a, 1, b) if axis == 1 else (a, b, 1))
+            i2, j2, k2 = (2, a, b) if axis == 0 else ((a, 2, b) if axis == 1 else (a, b, 2))
+            p0, p1, p2 = points[i0, j0, k0], points[i1, j1, k1], points[i2, j2, k2]
+            result[i0, j0, k0] = (1 - low) * (1 - low) * p0 + 2 * low * (1 - low) * p1 + low * low * p2
+            result[i1, j1, k1] = (
+                (1 - low) * (1 - high) * p0 + (low * (1 - high) + high * (1 - low)) * p1 + low * high * p2
+            )
+            result[i2, j2, k2] = (1 - high) * (1 - high) * p0 + 2 * high * (1 - high) * p1 + high * high * p2
+
+
+@kernel(float64(VALUES, LAYOUT, MASKS, SOURCE, GEOMETRY, float64, float64, float64))
+def _largest_at_centres(values, layout, mask, source, geometry, scale, slope, radius):
+    """The excess at the centres of the cells, from which most other cells need no division."""
+    spacing, angle = geometry.spacing, geometry.angle
+    local, points, best = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2)), np.empty((3, 3, 3)), -np.inf
+    for b in range(len(mask)):
+        if not mask[b].any():
+            continue
+        gather(values, layout, b, local)
+        for k in range(BLOCK):
+            heading = (layout.blocks[b, 0] * BLOCK + k + 0.5) * angle
+            for i in range(BLOCK):
+                px = geometry.x + (layout.blocks[b, 1] * BLOCK + i + 0.5) * spacing
+                for j in range(BLOCK):
+                    if mask[b, k, i, j]:
+                        py = geometry.y + (layout.blocks[b, 2] * BLOCK + j + 0.5) * spacing
+                        control_points(local, k + 1, i + 1, j + 1, points)
+                        value = 0.0
+                        for a in range(27):  # Bernstein polynomials of degree 2 at 1/2: 1/4, 1/2, 1/4
+                            u, v, w = a // 9, a // 3 % 3, a % 3
+                            value += (1 + u % 2) * (1 + v % 2) * (1 + w % 2) / 64.0 * points[u, v, w]
+                        best = max(best, scale * value - slope * min(gauge(px, py, heading, source), radius))
+    return best
+
+
 @kernel(float64(VALUES, LAYOUT, MASKS, SOURCE, GEOMETRY, float64, float64, float64))
 def excess(values, layout, mask, source, geometry, scale, slope, radius):
     """Upper bound of scale * S - slope * min(gauge, radius) over the cells of a set.
@@ -117,44 +158,3 @@ def excess(values, layout, mask, source, geometry, scale, slope, radius):
                             stack[size, 2], stack[size, 3] = 2 * q + child // 2 % 2, 2 * r + child % 2
                             size += 1
     return best
-
-
-@kernel(float64(VALUES, LAYOUT, MASKS, SOURCE, GEOMETRY, float64, float64, float64))
-def _largest_at_centres(values, layout, mask, source, geometry, scale, slope, radius):
-    """The excess at the centres of the cells, from which most other cells need no division."""
-    spacing, angle = geometry.spacing, geometry.angle
-    local, points, best = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2)), np.empty((3, 3, 3)), -np.inf
-    for b in range(len(mask)):
-        if not mask[b].any():
-            continue
-        gather(values, layout, b, local)
-        for k in range(BLOCK):
-            heading = (layout.blocks[b, 0] * BLOCK + k + 0.5) * angle
-            for i in range(BLOCK):
-                px = geometry.x + (layout.blocks[b, 1] * BLOCK + i + 0.5) * spacing
-                for j in range(BLOCK):
-                    if mask[b, k, i, j]:
-                        py = geometry.y + (layout.blocks[b, 2] * BLOCK + j + 0.5) * spacing
-                        control_points(local, k + 1, i + 1, j + 1, points)
-                        value = 0.0
-                        for a in range(27):  # Bernstein polynomials of degree 2 at 1/2: 1/4, 1/2, 1/4
-                            u, v, w = a // 9, a // 3 % 3, a % 3
-                            value += (1 + u % 2) * (1 + v % 2) * (1 + w % 2) / 64.0 * points[u, v, w]
-                        best = max(best, scale * value - slope * min(gauge(px, py, heading, source), radius))
-    return best
-
-
-@kernel(NOTHING(CUBE, int64, float64, float64, CUBE))
-def _restrict(points, axis, low, high, result):
-    """Control points of a part of a cell, from `low` to `high` along one axis; `result` may be `points`."""
-    for a in range(3):
-        for b in range(3):
-            i0, j0, k0 = (0, a, b) if axis == 0 else ((a, 0, b) if axis == 1 else (a, b, 0))
-            i1, j1, k1 = (1, a, b) if axis == 0 else ((a, 1, b) if axis == 1 else (a, b, 1))
-            i2, j2, k2 = (2, a, b) if axis == 0 else ((a, 2, b) if axis == 1 else (a, b, 2))
-            p0, p1, p2 = points[i0, j0, k0], points[i1, j1, k1], points[i2, j2, k2]
-            result[i0, j0, k0] = (1 - low) * (1 - low) * p0 + 2 * low * (1 - low) * p1 + low * low * p2
-            result[i1, j1, k1] = (
-                (1 - low) * (1 - high) * p0 + (low * (1 - high) + high * (1 - low)) * p1 + low * high * p2
-            )
-            result[i2, j2, k2] = (1 - high) * (1 - high) * p0 + 2 * high * (1 - high) * p1 + high * high * p2

@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64
+from numba import boolean, float64, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CUBE, FLAGS, INDICES, INTEGERS, LINKS, MATRIX, NOTHING, VECTOR, tuple_of
@@ -114,7 +114,7 @@ METRIC = record_type(
     cell=float64,
     speed_weight=float64,
     turn_weight=float64,
-    targets=int64[:, :, ::1],
+    targets=types.Array(int64, 3, "C", readonly=True),
     points=int64[:, :, :, ::1],
     weights=CUBE,
 )

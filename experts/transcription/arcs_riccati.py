@@ -10,7 +10,7 @@ import math
 from numba import boolean
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.numba_internals import carray, matrix_of, part_of, scratch_buffer
+from leapnav.envs.kernels.internals import carray, matrix_of, part_of, scratch_buffer
 from leapnav.envs.kernels.types import MATRIX, SIGNS, VECTOR
 from leapnav.experts.transcription.arcs import DISCRETE_PROBLEM, EXPANSION
 from leapnav.experts.transcription.quadratic_model import MODEL, REGULARISATION

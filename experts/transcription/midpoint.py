@@ -12,7 +12,7 @@ import numpy as np
 from numba import float64
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.numba_internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import END_CONDITION, EndCondition
 from leapnav.experts.problem.generated_dynamics import DERIVATIVES_FUNCTION, RATES_FUNCTION, STATE_COST_FUNCTION

@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
 from time import perf_counter
+from typing import Any
 
 from leapnav.outputs import check_outputs, write_json
-
-
-@dataclass(frozen=True)
-class CompilationSummary:
-    """The result of `compile_missing`.
-
-    Attributes:
-        compiled: names of the kernels that were not in the cache, by module.
-        cache: directory of the cache.
-        seconds: duration (s).
-
-    """
-
-    compiled: dict[str, list[str]]
-    cache: Path
-    seconds: float
-
-    @property
-    def count(self) -> int:
-        """Number of kernels that were compiled."""
-        return sum(map(len, self.compiled.values()))
 
 
 @dataclass(frozen=True)
@@ -51,38 +32,31 @@ class Compile:
             check_integer("jobs", self.jobs, 1)
         check_outputs(self.json)
         summary = compile_missing(self.jobs)
-        if summary.count == 0:
-            print(f"all kernels are in the cache ({summary.seconds:.1f} s)")
-        print(f"cache: {summary.cache}")
-        write_json(asdict(summary), self.json)
+        print(f"compiled {summary['compiled']} kernels in {summary['seconds']:.1f} s; cache: {summary['cache']}")
+        write_json(summary, self.json)
         return 0
 
 
-def compile_missing(jobs: int | None = None) -> CompilationSummary:
-    """Compile the kernels that are not in the cache, and print their names; print nothing if there are none.
-
-    The extremal flow of the unicycle is included, which is generated when it is first needed.
+def compile_missing(jobs: int | None = None) -> dict[str, Any]:
+    """Compile the kernels that are not in the cache, and the extremal flow of the unicycle.
 
     Args:
         jobs: number of processes; None for one per core.
 
+    Returns:
+        `compiled`, the number of kernels; `cache`, the directory; `seconds`.
+
     """
-    from leapnav.envs.kernels.compilation import all_kernels, missing, prepare
-    from leapnav.envs.kernels.decorator import kernel_cache
+    from leapnav.envs.kernels.compilation import prepare
+    from leapnav.envs.kernels.decorator import kernel_cache, kernels_of
 
     start = perf_counter()
-    before = _cached()
-    prepare(*missing(all_kernels()), jobs=jobs, advise=False)
+    for package in ("leapnav.envs", "leapnav.experts"):
+        for module in walk_packages(import_module(package).__path__, f"{package}."):
+            import_module(module.name)
+    count = prepare(*kernels_of("leapnav"), jobs=jobs)
     _compile_unicycle_flow()
-    compiled: defaultdict[str, list[str]] = defaultdict(list)
-    for path in sorted(_cached() - before):
-        compiled[path.parent.name.rpartition("-")[0]].append(path.name.partition(".py")[0])
-    summary = CompilationSummary(dict(compiled), kernel_cache(), perf_counter() - start)
-    if summary.count:
-        for module, names in compiled.items():
-            print(f"{module}: {', '.join(names)}")
-        print(f"compiled {summary.count} kernels in {summary.seconds:.1f} s", flush=True)
-    return summary
+    return {"compiled": count, "cache": kernel_cache(), "seconds": perf_counter() - start}
 
 
 def _compile_unicycle_flow() -> None:
@@ -92,10 +66,3 @@ def _compile_unicycle_flow() -> None:
 
     scenario = Scenario(arena=(0, 0, 2, 2), start=(0.5, 1, 0), goal=(1.5, 1, 0), horizon=2)
     OptimalControlProblem.from_scenario(scenario).arrays  # noqa: B018 (the property compiles)
-
-
-def _cached() -> set[Path]:
-    """The index files of all kernels in the cache, named MODULE-STAMP/KERNEL.pyVERSION.nbi."""
-    from leapnav.envs.kernels.decorator import kernel_cache
-
-    return set(kernel_cache().glob("*/*.nbi"))

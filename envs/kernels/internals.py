@@ -1,0 +1,97 @@
+"""What has no equivalent in Numba's public interface, with the time that it saves.
+
+Views: a slice counts references, atomically. With slices instead of views, a search takes 1.1 of the time.
+Function pointers: Numba accepts a kernel as an argument of another kernel, but resolves its type in every call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import (
+    carray,  # pyright: ignore[reportPrivateImportUsage] (it is public)
+    float64,
+    int64,
+    types,
+)
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
+
+__all__ = ["FunctionPointer", "carray", "matrix_of", "part_of", "scratch_buffer", "vector_at"]
+
+
+class FunctionPointer:
+    """A kernel as the argument of another kernel: its type and its address."""
+
+    def __init__(self, kernel: Any, kind: types.FunctionType) -> None:
+        self._numba_type_ = kind
+        kernel.compile(kind.signature.args)
+        result = kernel.get_compile_result(kind.signature)
+        self._address = types.CompileResultWAP(result).__wrapper_address__()
+        self._kernel: Callable[..., Any] = kernel  # keeps the code alive
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function from Python."""
+        return self._kernel(*arguments)
+
+
+def _view(context: Any, builder: Any, array: Any, data: Any, shape: list[Any]) -> Any:
+    """Return an array of floats in C order that does not own its memory."""
+    view = context.make_array(array)(context, builder)
+    itemsize = ir.Constant(ir.IntType(64), 8)
+    strides = [itemsize]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    populate_array(view, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None)
+    return view._getvalue()
+
+
+def _typed_view(array: Any, n_dimensions: int) -> tuple[Any, Any]:
+    """Return signature and code of a view: (array in C order, index of its first element, shape) -> view."""
+    view = types.Array(float64, n_dimensions, "C", readonly=not array.mutable)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = context.make_array(array)(context, builder, arguments[0])
+        return _view(context, builder, view, builder.gep(whole.data, [arguments[1]]), list(arguments[2:]))
+
+    return view(array, *[int64] * (1 + n_dimensions)), generate
+
+
+def _typed_part_of(context: Any, array: Any, start: Any, count: Any) -> Any:
+    return _typed_view(array, 1)
+
+
+def _typed_matrix_of(context: Any, array: Any, start: Any, rows: Any, columns: Any) -> Any:
+    return _typed_view(array, 2)
+
+
+def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
+    array = types.Array(float64, 1, "C", readonly=True)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
+        return _view(context, builder, array, data, [arguments[1]])
+
+    return array(int64, int64), generate
+
+
+def _typed_scratch_buffer(context: Any, count: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        buffer = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), count.literal_value))
+        return builder.bitcast(buffer, ir.DoubleType().as_pointer())
+
+    return types.CPointer(float64)(count), generate
+
+
+# In kernels: the vector (count,), or the matrix (rows, columns), of an array's elements in C order from `start`; the
+# vector of floats at an address that the caller keeps alive; a buffer of floats on the stack, of a literal length.
+part_of: Any = intrinsic(_typed_part_of)
+matrix_of: Any = intrinsic(_typed_matrix_of)
+vector_at: Any = intrinsic(_typed_vector_at)
+scratch_buffer: Any = intrinsic(prefer_literal=True)(_typed_scratch_buffer)
