@@ -306,11 +306,11 @@ def test_only_certified_optima_without_doubts_are_admitted():
 
 
 def test_a_cheaper_path_without_a_certificate_is_a_doubt():
-    """The first scenario that the training bank of the polygons rejected."""
-    bank = ScenarioBank.shipped("polygons", "train")
+    """The scenario that the training bank of the clutter rejected."""
+    bank = ScenarioBank.shipped("clutter", "train")
     missing = sorted(set(range(bank.drawn)) - set(bank.draws.tolist()))
     assert len(missing) == sum(bank.rejected.values())
-    scenario = sample_scenario("polygons", np.random.default_rng([bank.seed, missing[0]]))
+    scenario = sample_scenario("clutter", np.random.default_rng([bank.seed, missing[0]]))
     optimum = find_optimum(scenario)
     assert judge(optimum) is Rejection.UNRESOLVED
     doubt = optimum.doubts[0]

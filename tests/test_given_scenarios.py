@@ -87,7 +87,7 @@ def test_a_data_card_says_where_the_scenarios_come_from(tmp_path, capsys):
 
 def test_doubtful_optima_are_admitted_on_request(tmp_path):
     # A draw of the included training bank, which does not contain it.
-    stalled = sample_scenario("polygons", np.random.default_rng([0, 52])).model_copy(update={"name": "stalled"})
+    stalled = sample_scenario("clutter", np.random.default_rng([0, 391])).model_copy(update={"name": "stalled"})
     strict = build_bank_of([stalled], tmp_path / "strict.bank", progress=False)
     assert len(strict) == 0 and strict.given["rejected"] == {"stalled": "a cheaper solution was not certified"}
     bank = build_bank_of([stalled], tmp_path / "all.bank", doubtful=True, progress=False)

@@ -181,7 +181,8 @@ def test_actions_are_validated(actions, message, ask):
 def test_lessons_are_served(ask):
     for name in ("methods", "conjugate"):
         status, lesson = ask("/lesson", {"lesson": name})
-        assert status == 200 and all(step["title"] and step["text"] for step in lesson["steps"])
+        assert status == 200, lesson
+        assert all(step["title"] and step["text"] for step in lesson["steps"])
     assert ask("/lesson", {"lesson": "x"}) == (400, {"error": "lesson: expected one of methods, conjugate, got 'x'"})
 
 

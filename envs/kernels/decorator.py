@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numba
 import platformdirs
 from numba import types
+from numba.extending import typeof_impl
 
 
 class Declaration(NamedTuple):
@@ -77,7 +78,9 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any
 def record_type(record: type[NamedTuple], **fields: types.Type) -> Any:
     """Return the Numba type of a `NamedTuple` whose fields have these types, in the order of the class."""
     assert tuple(fields) == record._fields, (record, fields)
-    return types.BaseTuple.from_types(tuple(fields.values()), record)
+    declared = types.BaseTuple.from_types(tuple(fields.values()), record)
+    typeof_impl.register(record)(lambda *_: declared)  # Numba would derive the types of the members in every call
+    return declared
 
 
 def kernels_of(*modules: str) -> list[Any]:

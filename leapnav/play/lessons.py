@@ -35,8 +35,8 @@ METHODS_SCENARIO = Scenario(
     start=(1, 2.2, 0),
     goal=(7, 2.1, 0),
     horizon=7,
-    obstacles=({"circle": {"center": (2.5, 3.9), "radius": 0.6}}, {"circle": {"center": (4.6, 2.8), "radius": 0.8}}),
-    cost={"proximity_scale": 0.15},
+    obstacles=({"circle": {"center": (2.5, 3.9), "radius": 0.6}}, {"circle": {"center": (4.6, 3.15), "radius": 0.8}}),
+    cost={"proximity_scale": 0.3},
 )
 SEGMENTS = 8  # of multiple shooting and of Leapfrog's first path
 TOLERANCE, ACCURACY = 1e-9, 1e-13  # of Newton's method and of its integrator
