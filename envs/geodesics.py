@@ -12,16 +12,15 @@ large, but finite.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from threading import Lock
+from functools import lru_cache
 
 import numpy as np
-from numba import float32, float64
+from numba import float32, float64, from_dtype
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.field import ARENA
+from leapnav.envs.shapes.field import header_of, read_header
 from leapnav.envs.shapes.proximity import proximity_value
 
 SPACING = 0.1  # m, of the grid; larger in an arena in which the grid would have more than MAX_POINTS points
@@ -31,17 +30,15 @@ OBSTACLE_METRIC = 20.0  # lower bound of the metric in obstacles
 SOURCE_RADIUS = 2.5  # spacings around the goal in which the distance is that of a straight line
 TOLERANCE = 1e-3  # m; largest change in the last iteration of the sweeps
 MAX_SWEEPS = 60
+FAR = 1e6
 BEAM_STEP = 0.25  # m between the points of a beam at which a detour is evaluated
 MAX_BEAM = 5.0  # m; more distant points are not evaluated
 MAX_DETOUR = 3.0  # m; upper bound of an observed detour
 CACHE_SIZE = 512  # maps; each has 41 kB in an arena of 10 m x 10 m
 
-# Layout of a packed map: the first point (m), spacing (m), number of points in x and in y, then the distances.
-X_MIN, Y_MIN, STEP, NX, NY, VALUES = range(6)
-FAR = 1e6
-
-_cache: OrderedDict[tuple[bytes, float, float], np.ndarray] = OrderedDict()
-_cache_lock = Lock()
+# The beginning of a packed map, before the distances: first point, spacing (m), numbers of points in x and y.
+MAP_HEADER = np.dtype([("x_min", "f4"), ("y_min", "f4"), ("spacing", "f4"), ("nx", "i4"), ("ny", "i4")])
+MAP_ENTRIES = MAP_HEADER.itemsize // 4
 
 
 def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
@@ -54,36 +51,37 @@ def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
         goal_x, goal_y: position of the goal (m).
 
     """
-    key = field.tobytes(), goal_x, goal_y
-    with _cache_lock:
-        found = _cache.get(key)
-        if found is not None:
-            _cache.move_to_end(key)
-    if found is None:
-        width, height = field[ARENA + 2] - field[ARENA], field[ARENA + 3] - field[ARENA + 1]
-        spacing = max(SPACING, math.sqrt(width * height / MAX_POINTS))
-        size = math.ceil(width / spacing - 1e-9) + 1, math.ceil(height / spacing - 1e-9) + 1
-        distances = np.empty(size)
-        solve_eikonal(field, goal_x, goal_y, spacing, distances)
-        header = field[ARENA], field[ARENA + 1], spacing, *size
-        found = np.concatenate([header, distances.ravel()]).astype(np.float32)
-        with _cache_lock:
-            _cache[key] = found
-            if len(_cache) > CACHE_SIZE:
-                _cache.popitem(last=False)
-    return found
+    return _solve(field.tobytes(), goal_x, goal_y)
+
+
+@lru_cache(CACHE_SIZE)
+def _solve(content: bytes, goal_x: float, goal_y: float) -> np.ndarray:
+    field = np.frombuffer(content)
+    x_min, y_min, x_max, y_max = read_header(field)["arena"].tolist()
+    spacing = max(SPACING, math.sqrt((x_max - x_min) * (y_max - y_min) / MAX_POINTS))
+    nx, ny = (math.ceil(side / spacing - 1e-9) + 1 for side in (x_max - x_min, y_max - y_min))
+    distances = np.empty((nx, ny))
+    solve_eikonal(field, goal_x, goal_y, spacing, distances)
+    header = np.array([(x_min, y_min, spacing, nx, ny)], MAP_HEADER)
+    return np.concatenate([header.view(np.float32), distances.ravel().astype(np.float32)])
+
+
+@kernel(from_dtype(MAP_HEADER)(float32[::1]))
+def map_header_of(packed):
+    """Return the `MAP_HEADER` of a packed map."""
+    return packed[:MAP_ENTRIES].view(MAP_HEADER)[0]
 
 
 @kernel(NOTHING(CONSTANT, float64, float64, float64, MATRIX))
 def solve_eikonal(field, goal_x, goal_y, spacing, distances):
     """Write the distances to a goal (nx, ny) on a grid that starts at the lower left corner of the arena."""
-    nx, ny = distances.shape
+    header, (nx, ny) = header_of(field), distances.shape
     metric = np.empty((nx, ny))
     energy = 0.5 * REFERENCE_SPEED**2
     for i in range(nx):
         for j in range(ny):
-            x, y = field[ARENA] + spacing * i, field[ARENA + 1] + spacing * j
-            factor = math.sqrt(1.0 + proximity_value(x, y, field[2], field) / energy)
+            x, y = header.arena[0] + spacing * i, header.arena[1] + spacing * j
+            factor = math.sqrt(1.0 + proximity_value(x, y, header.radius, field) / energy)
             if clearance(x, y, field)[0] <= 0.0:
                 factor = OBSTACLE_METRIC
             metric[i, j] = spacing * min(factor, OBSTACLE_METRIC)
@@ -114,12 +112,13 @@ def solve_eikonal(field, goal_x, goal_y, spacing, distances):
 @kernel(float64(float64, float64, float32[::1]))
 def geodesic_distance(x, y, packed):
     """Return the distance (m) from a point to the goal, by bilinear interpolation in a packed map."""
-    nx, ny = int(packed[NX]), int(packed[NY])
-    u = min(max((x - packed[X_MIN]) / packed[STEP], 0.0), nx - 1.0)
-    v = min(max((y - packed[Y_MIN]) / packed[STEP], 0.0), ny - 1.0)
+    header = map_header_of(packed)
+    nx, ny = header.nx, header.ny
+    u = min(max((x - header.x_min) / header.spacing, 0.0), nx - 1.0)
+    v = min(max((y - header.y_min) / header.spacing, 0.0), ny - 1.0)
     i, j = min(int(u), nx - 2), min(int(v), ny - 2)
     a, b = u - i, v - j
-    at = VALUES + i * ny + j
+    at = MAP_ENTRIES + i * ny + j
     near = (1.0 - b) * packed[at] + b * packed[at + 1]
     return (1.0 - a) * near + a * ((1.0 - b) * packed[at + ny] + b * packed[at + ny + 1])
 

@@ -15,6 +15,7 @@ from leapnav.cli import main
 from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.field import read_header
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts import LowerBound, Optimum, Proof, ProofError, check_proof, find_optimum, lower_bound, plot_tube
 from leapnav.experts.proofs.cells import BLOCK, CellSet, Grid, gather, make_layout, scatter
@@ -340,7 +341,9 @@ def test_the_functions_bound_the_cost_of_random_paths(bound: LowerBound, rng: np
         slots = [cells.layout.slots[k // BLOCK, i // BLOCK, j // BLOCK] for k, i, j in places]
         if not all(required[s, k % BLOCK, i % BLOCK, j % BLOCK] for s, (k, i, j) in zip(slots, places, strict=True)):
             continue
-        slowness = [math.sqrt(2 * (energy + proximity_value(*pose[:2], field[2], field))) for pose in poses]
+        slowness = [
+            math.sqrt(2 * (energy + proximity_value(*pose[:2], read_header(field)["radius"], field))) for pose in poses
+        ]
         length = float(np.mean(slowness)) * math.sqrt(r_v * v * v + r_w * omega * omega)
         gain = spline.scale * (
             spline_value(spline.values, cells, poses[-1]) - spline_value(spline.values, cells, poses[0])

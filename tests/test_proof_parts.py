@@ -157,7 +157,7 @@ def test_the_running_cost_is_bounded_where_squares_are_small_in_proximity_scales
     for x, y in rng.uniform(0.2, 4.8, (4000, 2)):
         if clearance(x, y, scenario.field)[0] > 0:
             lowest = cost.lowest[int((x - grid.x) / 0.1), int((y - grid.y) / 0.1)]
-            assert 0.0 < lowest <= proximity_value(x, y, scenario.field[2], scenario.field)
+            assert 0.0 < lowest <= proximity_value(x, y, scenario.robot.radius, scenario.field)
 
 
 def test_control_points_bound_the_gradient(rng: np.random.Generator):

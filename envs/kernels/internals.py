@@ -20,7 +20,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
-__all__ = ["FunctionPointer", "carray", "matrix_of", "part_of", "scratch_buffer", "vector_at"]
+__all__ = ["FunctionPointer", "carray", "matrix_of", "part_of", "records_of", "scratch_buffer", "vector_at"]
 
 
 class FunctionPointer:
@@ -42,33 +42,40 @@ class FunctionPointer:
 
 
 def _view(context: Any, builder: Any, array: Any, data: Any, shape: list[Any]) -> Any:
-    """Return an array of floats in C order that does not own its memory."""
+    """Return an array in C order that does not own its memory."""
     view = context.make_array(array)(context, builder)
-    itemsize = ir.Constant(ir.IntType(64), 8)
+    item = context.get_data_type(array.dtype)
+    itemsize = context.get_constant(types.intp, context.get_abi_sizeof(item))
     strides = [itemsize]
     for length in reversed(shape[1:]):
         strides.insert(0, builder.mul(strides[0], length))
+    data = builder.bitcast(data, item.as_pointer())
     populate_array(view, data=data, shape=shape, strides=strides, itemsize=itemsize, meminfo=None)
     return view._getvalue()
 
 
-def _typed_view(array: Any, n_dimensions: int) -> tuple[Any, Any]:
+def _typed_view(array: Any, dtype: Any, lengths: int, *others: Any) -> tuple[Any, Any]:
     """Return signature and code of a view: (array in C order, index of its first element, shape) -> view."""
-    view = types.Array(float64, n_dimensions, "C", readonly=not array.mutable)
+    view = types.Array(dtype, lengths, "C", readonly=not array.mutable)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         whole = context.make_array(array)(context, builder, arguments[0])
-        return _view(context, builder, view, builder.gep(whole.data, [arguments[1]]), list(arguments[2:]))
+        data = builder.gep(whole.data, [arguments[1]])
+        return _view(context, builder, view, data, list(arguments[2 : 2 + lengths]))
 
-    return view(array, *[int64] * (1 + n_dimensions)), generate
+    return view(array, *[int64] * (1 + lengths), *others), generate
 
 
 def _typed_part_of(context: Any, array: Any, start: Any, count: Any) -> Any:
-    return _typed_view(array, 1)
+    return _typed_view(array, array.dtype, 1)
+
+
+def _typed_records_of(context: Any, array: Any, start: Any, count: Any, dtype: Any) -> Any:
+    return _typed_view(array, dtype.dtype, 1, dtype)
 
 
 def _typed_matrix_of(context: Any, array: Any, start: Any, rows: Any, columns: Any) -> Any:
-    return _typed_view(array, 2)
+    return _typed_view(array, array.dtype, 2)
 
 
 def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
@@ -90,8 +97,10 @@ def _typed_scratch_buffer(context: Any, count: Any) -> Any:
 
 
 # In kernels: the vector (count,), or the matrix (rows, columns), of an array's elements in C order from `start`; the
-# vector of floats at an address that the caller keeps alive; a buffer of floats on the stack, of a literal length.
+# records of a NumPy dtype in the memory of an array, from the index `start` of its elements; the vector of floats at an
+# address that the caller keeps alive; a buffer of floats on the stack, of a literal length.
 part_of: Any = intrinsic(_typed_part_of)
+records_of: Any = intrinsic(_typed_records_of)
 matrix_of: Any = intrinsic(_typed_matrix_of)
 vector_at: Any = intrinsic(_typed_vector_at)
 scratch_buffer: Any = intrinsic(prefer_literal=True)(_typed_scratch_buffer)

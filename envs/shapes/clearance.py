@@ -9,8 +9,8 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.distance import polygon_geometry, wall_distance
-from leapnav.envs.shapes.field import CENTRE, CIRCLES, COLUMNS, GRID, POLYGON_HEAD, POLYGONS, RIM, SHAPES
+from leapnav.envs.shapes.distance import shape_geometry, wall_distance
+from leapnav.envs.shapes.field import header_of, shapes_of
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
@@ -19,28 +19,18 @@ def obstacle_distance(x, y, field):
 
     Negative inside. The wall has the index -1.
     """
-    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
-    indices = int(field[GRID]) - circles - polygons
+    header = header_of(field)
     best = min(
-        min(wall_distance(x, y, field, 0), wall_distance(x, y, field, 2)),
-        min(wall_distance(x, y, field, 1), wall_distance(x, y, field, 3)),
+        min(wall_distance(x, y, header, 0), wall_distance(x, y, header, 2)),
+        min(wall_distance(x, y, header, 1), wall_distance(x, y, header, 3)),
     )
     nearest = -1
-    at = SHAPES
-    for i in range(circles):
-        dx, dy, rim = x - field[at], y - field[at + 1], field[at + 2]
-        at += 3
-        if dx * dx + dy * dy < max(best + rim, 0.0) ** 2:  # compares squares, since most obstacles are farther away
-            distance = math.sqrt(dx * dx + dy * dy) - rim
+    for shape in shapes_of(field):
+        dx, dy = x - shape.x, y - shape.y
+        if dx * dx + dy * dy < max(best + shape.rim, 0.0) ** 2:  # compares squares, since most shapes are farther away
+            distance = shape_geometry(x, y, 0.0, field, shape)[0]
             if distance < best:
-                best, nearest = distance, int(field[indices + i])
-    for i in range(polygons):
-        dx, dy, rim = x - field[at + CENTRE], y - field[at + CENTRE + 1], field[at + RIM]
-        if dx * dx + dy * dy < max(best + rim, 0.0) ** 2:
-            distance = polygon_geometry(x, y, field, at)[0]
-            if distance < best:
-                best, nearest = distance, int(field[indices + circles + i])
-        at += POLYGON_HEAD + COLUMNS * int(field[at])
+                best, nearest = distance, shape.obstacle
     return best, nearest
 
 
@@ -51,7 +41,7 @@ def clearance(x, y, field):
     See `obstacle_distance`.
     """
     distance, nearest = obstacle_distance(x, y, field)
-    return distance - field[2], nearest
+    return distance - header_of(field).radius, nearest
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, float64, CONSTANT_MATRIX, CONSTANT))

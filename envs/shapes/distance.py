@@ -1,7 +1,7 @@
-"""Exact distances from a point to walls, circles and rounded convex polygons (kernels).
+"""Exact distances from a disc to walls and to the shapes of a packed field (kernels).
 
-Each shape has one kernel: (x, y) -> signed distance, outward unit normal, curvature of its level line. The gradient of
-the distance is the normal, and its Hessian is the curvature times t t' with the tangent t.
+The gradient of a distance is the outward unit normal, and its Hessian is the curvature of the level line times t t'
+with the tangent t.
 """
 
 from __future__ import annotations
@@ -13,85 +13,76 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
-from leapnav.envs.shapes.field import ARENA, COLUMNS, POLYGON_HEAD, ROUNDING
+from leapnav.envs.shapes.field import HEADER_TYPE, SHAPE_TYPE, edges_of
 
 # Smallest distance (m) from a point, the centre of a circle or a vertex, with which normal and curvature are computed;
 # only guesses deep in an obstacle come closer.
 MIN_DISTANCE = 1e-3
 
 
-@kernel(float64(float64, float64, CONSTANT, int64), inline="always")
-def wall_distance(x, y, field, side):
+@kernel(float64(float64, float64, HEADER_TYPE, int64), inline="always")
+def wall_distance(x, y, header, side):
     """Distance (m) to a wall, positive inside the arena; `side` is 0 to 3 for x_min, y_min, x_max, y_max."""
     sign = 1.0 if side < 2 else -1.0
-    return sign * ((x if side % 2 == 0 else y) - field[ARENA + side])
+    return sign * ((x if side % 2 == 0 else y) - header.arena[side])
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, float64), inline="always")
-def circle_geometry(dx, dy, radius):
-    """Signed distance (m), normal (2) and curvature (1/m) for a circle.
-
-    Args:
-        dx, dy: position relative to the centre (m).
-        radius: of the circle (m).
-
-    """
-    distance = math.sqrt(dx * dx + dy * dy)
-    curvature = 1.0 / (distance if distance > MIN_DISTANCE else MIN_DISTANCE)
-    return distance - radius, dx * curvature, dy * curvature, curvature
-
-
-@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, int64), inline="always")
-def _nearest_edge(x, y, field, at):
-    """Edge of a polygon whose line is farthest away: (signed distance of the line (m), index of the edge, beyond).
+@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, SHAPE_TYPE), inline="always")
+def _nearest_edge(x, y, field, shape):
+    """Edge of a polygon whose line is farthest away: (signed distance of the line (m), number of the edge, beyond).
 
     `beyond` is the coordinate (m) along the line beyond the ends of the edge: negative before its first vertex,
     positive after its second, zero between them.
     """
-    largest, nearest = -np.inf, at + POLYGON_HEAD
-    row = at + POLYGON_HEAD
-    for _ in range(int(field[at])):
-        height = field[row] * x + field[row + 1] * y - field[row + 2]
+    edges = edges_of(field, shape)
+    largest, nearest = -np.inf, 0
+    for k in range(shape.edges):
+        height = edges[k].nx * x + edges[k].ny * y - edges[k].offset
         if height > largest:
-            largest, nearest = height, row
-        row += COLUMNS
-    along = field[nearest] * (y - field[nearest + 4]) - field[nearest + 1] * (x - field[nearest + 3])
-    return largest, nearest, min(along, max(along - field[nearest + 5], 0.0))
+            largest, nearest = height, k
+    edge = edges[nearest]
+    along = edge.nx * (y - edge.y) - edge.ny * (x - edge.x)
+    return largest, nearest, min(along, max(along - edge.length, 0.0))
 
 
-@kernel(int64(float64, float64, CONSTANT, int64, float64), inline="always")
-def closest_feature(x, y, field, at, reach):
-    """Index in the field of the edge or of the vertex of a rounded polygon that is closest to a point outside.
+@kernel(int64(float64, float64, CONSTANT, SHAPE_TYPE, float64), inline="always")
+def closest_feature(x, y, field, shape, reach):
+    """Number of the edge or of the vertex of a rounded polygon that is closest to a point outside.
 
-    A vertex has the index of the edge that begins there, plus 1. The curvature of the distance is continuous where the
-    feature does not change. Beyond the distance `reach` (m) the result is 0.
+    Edges have even numbers, and vertices odd ones. The curvature of the distance is continuous where the feature does
+    not change. Beyond the distance `reach` (m) the result is 0.
     """
-    largest, nearest, beyond = _nearest_edge(x, y, field, at)
-    if math.sqrt(largest * largest + beyond * beyond) - field[at + ROUNDING] >= reach:
+    largest, nearest, beyond = _nearest_edge(x, y, field, shape)
+    if math.sqrt(largest * largest + beyond * beyond) - shape.rounding >= reach:
         return 0
-    if beyond <= 0.0:
-        return nearest if beyond == 0.0 else nearest + 1
-    following = nearest + COLUMNS
-    return following + 1 if following < at + POLYGON_HEAD + COLUMNS * int(field[at]) else at + POLYGON_HEAD + 1
+    if beyond > 0.0:
+        nearest = (nearest + 1) % shape.edges  # which begins at the vertex
+    return 2 * (1 + shape.first + nearest) + (1 if beyond != 0.0 else 0)
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, CONSTANT, int64), inline="always")
-def polygon_geometry(x, y, field, at):
-    """Signed distance (m), normal (2) and curvature (1/m) for a rounded convex polygon.
+@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, CONSTANT, SHAPE_TYPE), inline="always")
+def shape_geometry(x, y, radius, field, shape):
+    """Signed distance (m) from a disc to a shape, its gradient (2), and the curvature (1/m) of its level line.
 
-    The nearest point of the polygon is on the edge whose line is farthest away, or one of its ends.
+    The nearest point of a polygon is on the edge whose line is farthest away, or one of its ends.
 
     Args:
-        x, y: the point (m).
+        x, y, radius: the disc (m).
         field: packed obstacle field.
-        at: index at which the polygon begins in the field.
+        shape: one of its shapes.
 
     """
-    largest, nearest, beyond = _nearest_edge(x, y, field, at)
-    nx, ny, rounding = field[nearest], field[nearest + 1], field[at + ROUNDING]
+    if shape.edges == 0:
+        dx, dy = x - shape.x, y - shape.y
+        distance = math.sqrt(dx * dx + dy * dy)
+        curvature = 1.0 / (distance if distance > MIN_DISTANCE else MIN_DISTANCE)
+        return distance - (shape.rounding + radius), dx * curvature, dy * curvature, curvature
+    largest, nearest, beyond = _nearest_edge(x, y, field, shape)
+    edge = edges_of(field, shape)[nearest]
     if beyond == 0.0:  # everywhere inside
-        return largest - rounding, nx, ny, 0.0
+        return largest - shape.rounding - radius, edge.nx, edge.ny, 0.0
     distance = math.sqrt(largest * largest + beyond * beyond)
     curvature = 1.0 / (distance if distance > MIN_DISTANCE else MIN_DISTANCE)
     across, beside = largest * curvature, beyond * curvature
-    return distance - rounding, across * nx - beside * ny, across * ny + beside * nx, curvature
+    nx, ny = across * edge.nx - beside * edge.ny, across * edge.ny + beside * edge.nx
+    return distance - shape.rounding - radius, nx, ny, curvature

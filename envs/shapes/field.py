@@ -1,63 +1,125 @@
-"""The packed field: obstacles, walls and proximity cost of a scenario as one flat array for compiled kernels.
+"""The packed field: obstacles, walls and proximity cost of a scenario as one array for compiled kernels.
 
-The entries of the array are, by index:
-
-    [0] proximity weight k   [1] proximity scale sigma   [2] largest radius of a disc of the robot's footprint
-    [3] circles   [4] polygons
-    [5:9] arena (x_min, y_min, x_max, y_max)   [9] index at which the grid begins
-    [10] distance (scales) below which the barrier is a quadratic polynomial
-    then per circle:   x, y, r
-    then per rounded convex polygon: number of edges m, radius by which the polygon is enlarged, x, y, r of a circle
-                       that contains it, then m rows (n_x, n_y, c, x, y, l): outward normal, offset, first vertex and
-                       length. A capsule has two edges.
-    then the index in the scenario of the obstacle to which each circle and polygon belongs
-    then the grid:     x, y, cell size, columns, lines, then the offset of each cell in the grid, then the
-                       cells: number of circles n, of polygons p; then the indices of these circles and polygons in
-                       the field
-
-A cell lists the obstacles that contribute to the proximity cost somewhere in it, so that the work at a point does not
-depend on the number of distant obstacles. With at most MAX_OBSTACLES_WITHOUT_GRID obstacles there is no grid, and
-columns and lines are 0.
+The array contains, one after the other, a `HEADER`, the `SHAPE` of each disc and rounded convex polygon, the `EDGE` of
+each edge of a polygon, and a grid: for each cell the index at which its list begins, then the end of the last list,
+then the lists. A cell lists the shapes that contribute to the proximity cost somewhere in it, so that the work at a
+point does not depend on the number of distant obstacles. The array has no addresses: it can be copied and pickled.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 from weakref import WeakValueDictionary
 
 import numpy as np
+from numba import from_dtype, int64, types
 
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.internals import records_of
+from leapnav.envs.kernels.types import CONSTANT
 from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.base import Shape
 from leapnav.envs.shapes.polygon import edge_rows
 
+HEADER = np.dtype(
+    [
+        ("weight", "f8"),  # proximity weight
+        ("scale", "f8"),  # proximity scale (m)
+        ("radius", "f8"),  # largest radius (m) of a disc of the robot's footprint
+        ("least_distance", "f8"),  # distance (scales) below which the barrier is a quadratic polynomial
+        ("arena", "f8", (4,)),  # x_min, y_min, x_max, y_max (m)
+        ("grid_x", "f8"),  # corner (m) of the grid
+        ("grid_y", "f8"),
+        ("cell_size", "f8"),  # m
+        ("columns", "i8"),  # cells of the grid in x and y
+        ("lines", "i8"),
+        ("shapes", "i8"),  # number of shapes
+        ("edges", "i8"),  # number of edges of all shapes
+    ]
+)
+SHAPE = np.dtype(
+    [
+        ("x", "f8"),  # centre and radius (m) of a circle that contains the shape
+        ("y", "f8"),
+        ("rim", "f8"),
+        ("rounding", "f8"),  # radius (m) by which the polygon is enlarged, or that of the disc
+        ("first", "i8"),  # number of the first edge
+        ("edges", "i8"),  # number of edges: 0 for a disc, 2 for a capsule
+        ("obstacle", "i8"),  # index in the scenario of the obstacle to which the shape belongs
+    ]
+)
+EDGE = np.dtype(
+    [
+        ("nx", "f8"),  # outward normal
+        ("ny", "f8"),
+        ("offset", "f8"),  # of the line n . p = offset (m)
+        ("x", "f8"),  # first vertex (m)
+        ("y", "f8"),
+        ("length", "f8"),  # m
+    ]
+)
+HEADER_SIZE, SHAPE_SIZE, EDGE_SIZE = (kind.itemsize // 8 for kind in (HEADER, SHAPE, EDGE))
+HEADER_TYPE, SHAPE_TYPE, EDGE_TYPE = from_dtype(HEADER), from_dtype(SHAPE), from_dtype(EDGE)
+SHAPES_TYPE, EDGES_TYPE, NUMBERS = (types.Array(kind, 1, "C", readonly=True) for kind in (SHAPE_TYPE, EDGE_TYPE, int64))
+COUNT = np.dtype("i8")
+
 # Terms of obstacles farther away than 30 sigma are skipped: they are below 1e-13 k, 1/10 of the integrator's tolerance.
 CUTOFF = 30.0
-CIRCLES, POLYGONS, ARENA, GRID, LEAST_DISTANCE, SHAPES = 3, 4, 5, 9, 10, 11  # indices into the packed field
-# Indices into a polygon, number of entries before its edges, and of an edge.
-ROUNDING, CENTRE, RIM, POLYGON_HEAD, COLUMNS = 1, 2, 4, 5, 6
-MAX_OBSTACLES_WITHOUT_GRID = 16  # fewer obstacles are evaluated faster one by one
+MAX_SHAPES_WITHOUT_GRID = 16  # fewer shapes are evaluated faster one by one
 # Smallest and largest number of cells per axis. Between them, a cell is as large as this multiple of the reach of an
 # obstacle.
 MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
-FAR_AWAY = 1e30  # m, at which an obstacle does not contribute
 
 
-class FieldParts(NamedTuple):
-    """The obstacles of a packed field.
+@kernel(HEADER_TYPE(CONSTANT))
+def header_of(field):
+    """Return the `HEADER` of a packed field."""
+    return records_of(field, 0, 1, HEADER)[0]
+
+
+@kernel(SHAPES_TYPE(CONSTANT))
+def shapes_of(field):
+    """Return the `SHAPE` of each disc and polygon of a packed field; the discs are first."""
+    return records_of(field, HEADER_SIZE, header_of(field).shapes, SHAPE)
+
+
+@kernel(EDGES_TYPE(CONSTANT, SHAPE_TYPE))
+def edges_of(field, shape):
+    """Return the `EDGE` of each edge of a shape of a packed field; none for a disc."""
+    start = HEADER_SIZE + SHAPE_SIZE * header_of(field).shapes + EDGE_SIZE * shape.first
+    return records_of(field, start, shape.edges, EDGE)
+
+
+@kernel(NUMBERS(types.float64, types.float64, CONSTANT))
+def shapes_near(x, y, field):
+    """Return the numbers of the shapes that contribute to the proximity cost at a point, and perhaps of others.
+
+    A point outside the grid uses the nearest cell. That lists all shapes that contribute at the point: its projection
+    onto the grid, which is convex and contains the obstacles, is not farther away from any of them.
+    """
+    head = header_of(field)
+    start = HEADER_SIZE + SHAPE_SIZE * head.shapes + EDGE_SIZE * head.edges
+    column = min(max(int((x - head.grid_x) / head.cell_size), 0), head.columns - 1)
+    line = min(max(int((y - head.grid_y) / head.cell_size), 0), head.lines - 1)
+    bounds = records_of(field, start + column * head.lines + line, 2, COUNT)
+    return records_of(field, start + bounds[0], bounds[1] - bounds[0], COUNT)
+
+
+class Part(NamedTuple):
+    """A disc or a rounded convex polygon of a packed field.
 
     Attributes:
-        circles (count, 3): x, y and radius (m).
-        polygons: vertices (m, 2) and radius (m) of each rounded polygon.
-        indices (count,): index in the scenario of the obstacle to which each circle and then each polygon belongs.
+        vertices (m, 2): vertices (m); one for a disc.
+        rounding: radius (m) by which they are enlarged.
+        obstacle: index in the scenario of the obstacle to which the part belongs.
 
     """
 
-    circles: np.ndarray
-    polygons: list[tuple[np.ndarray, float]]
-    indices: np.ndarray
+    vertices: np.ndarray
+    rounding: float
+    obstacle: int
 
 
 def pack_field(
@@ -69,7 +131,7 @@ def pack_field(
     *,
     grid: bool = True,
 ) -> np.ndarray:
-    """Pack obstacles, walls and proximity cost into the flat array that the kernels read.
+    """Pack obstacles, walls and proximity cost into the array that the kernels read.
 
     Args:
         shapes: the obstacles.
@@ -79,39 +141,105 @@ def pack_field(
         grid: whether to compute the grid, which takes most of the time; clearances do not need it.
 
     """
-    circles: list[tuple[float, float, float]] = []
-    polygons: list[tuple[np.ndarray, float]] = []
-    owners: tuple[list[int], list[int]] = [], []
+    parts = []
     for index, shape in enumerate(shapes):
         for part in shape.parts():
             vertices, rounding = part.rounded_polygon()
-            if (vertices[1:] == vertices[:1]).all():  # a disc, or a capsule of length zero
-                circles.append((*vertices[0].tolist(), rounding))
-                owners[0].append(index)
-            else:
-                polygons.append((vertices, rounding))
-                owners[1].append(index)
-    parts = FieldParts(np.reshape(circles, (-1, 3)), polygons, np.array([*owners[0], *owners[1]], dtype=float))
-    packed = _assemble((weight, scale, radius), arena, parts)
-    return _with_grid(packed) if grid else packed
+            # A capsule of length zero is a disc.
+            parts.append(Part(vertices[:1] if (vertices == vertices[0]).all() else vertices, rounding, index))
+    return _pack(parts, arena, (weight, scale, radius), grid=grid)
 
 
-def _assemble(header: Sequence[float], arena: Sequence[float], parts: FieldParts) -> np.ndarray:
-    """Return the packed field without its grid."""
-    polygons = [_pack_polygon(vertices, rounding) for vertices, rounding in parts.polygons]
-    obstacles = np.concatenate([np.ravel(parts.circles), *polygons, parts.indices])
-    counts = float(len(parts.circles)), float(len(polygons))
-    field = np.concatenate([[*header, *counts, *arena, float(SHAPES + len(obstacles)), CONTACT], obstacles])
+def _pack(parts: Sequence[Part], arena: Any, costs: Sequence[float], *, grid: bool = True) -> np.ndarray:
+    """Return the packed field of parts, an arena, and proximity weight, proximity scale and radius."""
+    header = np.zeros(1, HEADER)
+    header["weight"], header["scale"], header["radius"] = costs
+    header["least_distance"], header["arena"] = CONTACT, arena
+    parts = sorted(parts, key=lambda part: len(part.vertices) > 1)
+    edges = [edge_rows(part.vertices) if len(part.vertices) > 1 else np.empty((0, EDGE_SIZE)) for part in parts]
+    centres = np.array([part.vertices.mean(axis=0) for part in parts]).reshape(-1, 2)
+    shapes = np.zeros(len(parts), SHAPE)
+    shapes["x"], shapes["y"] = centres.T
+    shapes["rounding"] = [part.rounding for part in parts]
+    rims = [float(np.hypot(*(part.vertices - centre).T).max()) for part, centre in zip(parts, centres, strict=True)]
+    shapes["rim"] = rims + shapes["rounding"]
+    shapes["obstacle"] = [part.obstacle for part in parts]
+    shapes["edges"] = [len(rows) for rows in edges]
+    shapes["first"] = np.cumsum(shapes["edges"]) - shapes["edges"]
+    header["shapes"], header["edges"] = len(shapes), shapes["edges"].sum()
+    lists: list[Sequence[int]] = [range(len(parts))]
+    header["columns"] = header["lines"] = header["cell_size"] = 1
+    if grid and len(parts) > MAX_SHAPES_WITHOUT_GRID:
+        lists = _grid_lists(parts, edges, header[0])
+    starts = len(lists) + 1 + np.cumsum([0, *map(len, lists)])
+    numbers = np.concatenate([starts, *lists]).astype(COUNT)
+    whole = (header, shapes, np.concatenate([np.empty((0, EDGE_SIZE)), *edges]), numbers)
+    field = np.concatenate([np.ascontiguousarray(one).view(np.float64).ravel() for one in whole])
     field.flags.writeable = False
     return field
 
 
-def _pack_polygon(vertices: np.ndarray, rounding: float) -> np.ndarray:
-    """Return the entries of a rounded polygon."""
-    rows = edge_rows(vertices)
-    x, y = centre = vertices.mean(axis=0)
-    rim = float(np.hypot(*(vertices - centre).T).max()) + rounding
-    return np.concatenate([[len(rows), rounding, x, y, rim], rows.ravel()])
+def _grid_lists(parts: Sequence[Part], edges: Sequence[np.ndarray], header: Any) -> list[Sequence[int]]:
+    """Return the shapes that contribute in each cell of a grid, which is written to the header.
+
+    Obstacles contribute up to CUTOFF proximity scales from the robot's rim. They may extend beyond the arena.
+    """
+    reach = float(header["radius"] + CUTOFF * header["scale"])
+    corners = [header["arena"].reshape(2, 2)]
+    corners += [part.vertices + side * part.rounding for part in parts for side in (-1.0, 1.0)]
+    low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+    side = float(np.max(high - low))
+    size = side / min(max(math.ceil(side / (REACHES_PER_CELL * reach)), MIN_GRID_CELLS), MAX_GRID_CELLS)
+    counts = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
+    (header["grid_x"], header["grid_y"]), header["cell_size"] = low, size
+    header["columns"], header["lines"] = counts
+    first = low + size * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 2)
+    near: list[list[int]] = [[] for _ in first]
+    for number, (part, rows) in enumerate(zip(parts, edges, strict=True)):
+        distance = reach + part.rounding
+        cells = _cells_in(np.concatenate([part.vertices - distance, part.vertices + distance]), low, size, counts)
+        if len(rows):
+            # The minimum over the cell of the distance to each half-plane; the maximum of these is a lower bound for
+            # the distance to the polygon.
+            lowest = np.minimum(rows[:, :2] * size, 0.0).sum(axis=1) - rows[:, 2]
+            bounds = (first[cells] @ rows[:, :2].T + lowest).max(axis=1)
+        else:
+            nearest = np.clip(part.vertices[0], first[cells], first[cells] + size)
+            bounds = np.linalg.norm(nearest - part.vertices[0], axis=1)
+        for cell in cells[bounds < distance].tolist():
+            near[cell].append(number)
+    return list(near)
+
+
+def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarray) -> np.ndarray:
+    """Return the indices of the cells that the bounding box of points (n, 2) meets, or of the closest cells."""
+    first = np.clip(((points.min(axis=0) - low) / size).astype(int), 0, shape - 1)
+    last = np.clip(((points.max(axis=0) - low) / size).astype(int), 0, shape - 1)
+    columns, lines = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
+    return (columns[:, None] * shape[1] + lines).ravel()
+
+
+def read_header(field: np.ndarray) -> Any:
+    """Return the `HEADER` of a packed field, a record of NumPy that shares its memory."""
+    return field[:HEADER_SIZE].view(HEADER)[0]
+
+
+def _unpack(field: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Return the header, the shapes and the edges of a packed field, which share its memory."""
+    header = read_header(field)
+    middle = HEADER_SIZE + SHAPE_SIZE * int(header["shapes"])
+    end = middle + EDGE_SIZE * int(header["edges"])
+    return header, field[HEADER_SIZE:middle].view(SHAPE), field[middle:end].view(EDGE)
+
+
+def field_parts(field: np.ndarray) -> list[Part]:
+    """Return the parts of a packed field."""
+    _, shapes, edges = _unpack(field)
+    parts = []
+    for x, y, _, rounding, first, count, obstacle in shapes.tolist():
+        rows = edges[first : first + count]
+        parts.append(Part(np.stack([rows["x"], rows["y"]], 1) if count else np.array([[x, y]]), rounding, obstacle))
+    return parts
 
 
 def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.ndarray:
@@ -125,17 +253,20 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
         ValueError: the fields do not contain the same kinds of obstacles.
 
     """
-    a, b = unpack_field(first), unpack_field(second)
-    if len(a.circles) != len(b.circles) or [len(one) for one, _ in a.polygons] != [len(one) for one, _ in b.polygons]:
+
+    def blend(a: Any, b: Any) -> Any:
+        return (1.0 - fraction) * a + fraction * b
+
+    a, b = field_parts(first), field_parts(second)
+    if [len(part.vertices) for part in a] != [len(part.vertices) for part in b]:
         raise ValueError("obstacles: two fields can be blended only if they contain the same kinds of obstacles")
-    header = (1.0 - fraction) * first[:GRID] + fraction * second[:GRID]
-    polygons = [
-        ((1.0 - fraction) * one + fraction * other, (1.0 - fraction) * radius + fraction * rounding)
-        for (one, radius), (other, rounding) in zip(a.polygons, b.polygons, strict=True)
+    parts = [
+        Part(blend(one.vertices, other.vertices), blend(one.rounding, other.rounding), one.obstacle)
+        for one, other in zip(a, b, strict=True)
     ]
-    circles = (1.0 - fraction) * a.circles + fraction * b.circles
-    blended = FieldParts(circles, polygons, a.indices)
-    return _with_grid(_assemble(header[:CIRCLES].tolist(), header[ARENA:].tolist(), blended))
+    one, other = read_header(first), read_header(second)
+    costs = [float(blend(one[name], other[name])) for name in ("weight", "scale", "radius")]
+    return _pack(parts, blend(one["arena"], other["arena"]), costs)
 
 
 def with_weight(packed: np.ndarray, weight: float, least_distance: float = CONTACT) -> np.ndarray:
@@ -147,31 +278,14 @@ def with_weight(packed: np.ndarray, weight: float, least_distance: float = CONTA
         least_distance: distance (proximity scales) below which the barrier is a quadratic polynomial.
 
     """
-    if packed[0] == weight and packed[LEAST_DISTANCE] == least_distance:
+    header = read_header(packed)
+    if header["weight"] == weight and header["least_distance"] == least_distance:
         return packed
     field = packed.copy()
-    field[0], field[LEAST_DISTANCE] = weight, least_distance
+    header = read_header(field)
+    header["weight"], header["least_distance"] = weight, least_distance
     field.flags.writeable = False
     return field
-
-
-def _with_grid(packed: np.ndarray) -> np.ndarray:
-    """Return a packed field with its grid."""
-    field = np.concatenate([packed, _pack_grid(packed)])
-    field.flags.writeable = False
-    return field
-
-
-def unpack_field(packed: np.ndarray) -> FieldParts:
-    """Return the obstacles of a packed field."""
-    at = SHAPES + 3 * int(packed[CIRCLES])
-    circles, polygons = packed[SHAPES:at].reshape(-1, 3), []
-    for _ in range(int(packed[POLYGONS])):
-        end = at + POLYGON_HEAD + COLUMNS * int(packed[at])
-        rows = packed[at + POLYGON_HEAD : end].reshape(-1, COLUMNS)
-        polygons.append((rows[:, 3:5], float(packed[at + ROUNDING])))
-        at = end
-    return FieldParts(circles, polygons, packed[at : at + len(circles) + len(polygons)])
 
 
 # Fields that `check_field` has accepted, by their identity; the check takes as long as a short search.
@@ -193,98 +307,57 @@ def check_field(packed: np.ndarray) -> np.ndarray:
         raise ValueError(f"field: expected a vector of float64 (Scenario.field), got {packed!r}")
     try:
         with np.errstate(all="ignore"):
-            _check_counts(packed)
-            field = _with_grid(_assemble(packed[:CIRCLES].tolist(), packed[ARENA:GRID].tolist(), unpack_field(packed)))
+            fields = [_pack_again(packed, grid=grid) for grid in (True, False)]
     except (IndexError, OverflowError, ValueError) as error:
         raise ValueError(f"field: not a packed field (Scenario.field): {error}") from None
-    # Another processor may round the edges of polygons differently.
-    is_whole = len(packed) in (int(packed[GRID]), len(field))  # without a grid, or with all of it
-    if not is_whole or not np.allclose(field[: len(packed)], packed, rtol=1e-9, atol=1e-9):
+    if not any(_equals(packed, field) for field in fields):
         raise ValueError("field: not a packed field (Scenario.field): its entries contradict each other")
-    _checked[id(field)] = field
-    return field
+    _checked[id(fields[0])] = fields[0]
+    return fields[0]
 
 
-def _check_counts(packed: np.ndarray) -> None:
-    """Raise IndexError unless the counts of a field agree with its length, and its first entries are valid."""
-    weight, scale, radius = packed[:CIRCLES].tolist()
-    if not (np.isfinite(packed).all() and weight >= 0 and scale > 0 and radius > 0):
-        raise IndexError("its first entries are invalid")
-    count, polygons, end = (_count_at(packed, index) for index in (CIRCLES, POLYGONS, GRID))
-    at = SHAPES + 3 * count
-    for _ in range(polygons):
-        if _count_at(packed, at) < 2:
-            raise IndexError("a polygon has fewer than 2 edges")
-        at += POLYGON_HEAD + COLUMNS * int(packed[at])
-    if at + count + polygons != end or end > len(packed):
-        raise IndexError("its length is invalid")
-    if not (packed[at:end] % 1 == 0).all() or (packed[at:end] < 0).any() or (packed[at:end] > end).any():
-        raise IndexError("an index of an obstacle is invalid")
-
-
-def _count_at(packed: np.ndarray, index: int) -> int:
-    """Return a count of a packed field.
+def _pack_again(packed: np.ndarray, *, grid: bool) -> np.ndarray:
+    """Return the packed field of the parts of a field.
 
     Raises:
-        IndexError: it is not one.
+        IndexError, ValueError: the vector is not a packed field.
 
     """
-    value = float(packed[index])
-    if not (value.is_integer() and 0 <= value <= len(packed)):
-        raise IndexError(f"entry {index}: expected a count, got {value!r}")
-    return int(value)
+    if len(packed) < HEADER_SIZE or not np.isfinite(packed).all():
+        raise IndexError("expected a header and finite numbers")
+    header, n = read_header(packed), len(packed)
+    if not (header["weight"] >= 0 and header["scale"] > 0 and header["radius"] > 0):
+        raise IndexError("weight, scale or radius is invalid")
+    if not (0 <= header["shapes"] <= n and 0 <= header["edges"] <= n):
+        raise IndexError("a number of shapes or edges is invalid")
+    _, shapes, edges = _unpack(packed)
+    ends = shapes["first"] + shapes["edges"]
+    if len(edges) != header["edges"] or (shapes["first"] < 0).any() or (ends > len(edges)).any():
+        raise IndexError("its length is invalid")
+    if ((shapes["edges"] < 0) | (shapes["edges"] == 1)).any():
+        raise IndexError("a polygon has fewer than 2 edges")
+    if (shapes["obstacle"] < 0).any() or (shapes["obstacle"] > n).any():
+        raise IndexError("an index of an obstacle is invalid")
+    costs = [float(header[name]) for name in ("weight", "scale", "radius")]
+    return _pack(field_parts(packed), header["arena"], costs, grid=grid)
+
+
+def _equals(packed: np.ndarray, field: np.ndarray) -> bool:
+    """Return whether a vector is a packed field up to the rounding of edges, which depends on the processor."""
+    if len(packed) != len(field) or not np.allclose(packed, field, rtol=1e-9, atol=1e-9):
+        return False
+    (header, shapes, edges), (expected, others, _) = _unpack(packed), _unpack(field)
+    end = HEADER_SIZE + SHAPE_SIZE * len(shapes) + EDGE_SIZE * len(edges)
+    integers = [name for name in SHAPE.names or () if SHAPE[name] == COUNT]
+    return (
+        all(np.array_equal(shapes[name], others[name]) for name in integers)
+        and (header["columns"], header["lines"]) == (expected["columns"], expected["lines"])
+        and np.array_equal(packed[end:].view(COUNT), field[end:].view(COUNT))
+    )
 
 
 def obstacle_centres(packed: np.ndarray) -> np.ndarray:
     """Return a point inside each obstacle in the scenario's order, (n, 2): the centre of its first part."""
-    circles, polygons, indices = unpack_field(packed)
-    centres = np.array([*circles[:, :2], *(vertices.mean(axis=0) for vertices, _ in polygons)]).reshape(-1, 2)
-    return centres[np.unique(indices, return_index=True)[1]]
-
-
-def _pack_grid(packed: np.ndarray) -> np.ndarray:
-    """Return the grid of a field. Obstacles contribute up to CUTOFF proximity scales from the robot's rim."""
-    circles, polygons, indices = unpack_field(packed)
-    if len(indices) <= MAX_OBSTACLES_WITHOUT_GRID:
-        return np.zeros(5)
-    reach = packed[2] + CUTOFF * packed[1]
-    # Obstacles may extend beyond the arena. A point outside the grid uses the nearest cell, which lists all obstacles
-    # that contribute at the point: its projection onto the convex grid is not farther from any obstacle in the grid.
-    corners = [packed[ARENA : ARENA + 4].reshape(2, 2)]
-    corners += [circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]]
-    corners += [vertices + side * rounding for vertices, rounding in polygons for side in (-1.0, 1.0)]
-    low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-    side = float(np.max(high - low))
-    count = min(max(math.ceil(side / (REACHES_PER_CELL * reach)), MIN_GRID_CELLS), MAX_GRID_CELLS)
-    size = side / count
-    shape = np.ceil((high - low) / size - 1e-9).astype(int).clip(1)
-    first = low + size * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
-    near: list[tuple[list[int], list[int]]] = [([], []) for _ in first]
-    for k, (x, y, radius) in enumerate(circles.tolist()):
-        box = np.array([[x, y]]) + (radius + reach) * np.array([[-1.0], [1.0]])
-        cells = _cells_in(box, low, size, shape)
-        nearest = np.clip((x, y), first[cells], first[cells] + size)
-        for cell in cells[np.linalg.norm(nearest - (x, y), axis=1) - radius < reach].tolist():
-            near[cell][0].append(SHAPES + 3 * k)
-    at = SHAPES + circles.size
-    for vertices, rounding in polygons:
-        rows = edge_rows(vertices)
-        distance = reach + rounding
-        cells = _cells_in(np.concatenate([vertices - distance, vertices + distance]), low, size, shape)
-        # The minimum over the cell of the distance to each half-plane; the maximum of these is a lower bound for the
-        # distance to the polygon.
-        lowest = np.minimum(rows[:, :2] * size, 0.0).sum(axis=1) - rows[:, 2]
-        for cell in cells[(first[cells] @ rows[:, :2].T + lowest).max(axis=1) < distance].tolist():
-            near[cell][1].append(at)
-        at += POLYGON_HEAD + rows.size
-    cells = [[len(some), len(others), *some, *others] for some, others in near]
-    offsets = 5 + len(first) + np.cumsum([0, *map(len, cells[:-1])])
-    return np.concatenate([low, [size], shape, offsets, *cells])
-
-
-def _cells_in(points: np.ndarray, low: np.ndarray, size: float, shape: np.ndarray) -> np.ndarray:
-    """Return the indices of the cells that the bounding box of points (n, 2) meets, or of the closest cells."""
-    first = np.clip(((points.min(axis=0) - low) / size).astype(int), 0, shape - 1)
-    last = np.clip(((points.max(axis=0) - low) / size).astype(int), 0, shape - 1)
-    columns, lines = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
-    return (columns[:, None] * shape[1] + lines).ravel()
+    _, shapes, _ = _unpack(packed)
+    first = np.unique(shapes["obstacle"], return_index=True)[1]
+    return np.stack([shapes["x"], shapes["y"]], axis=1)[first]

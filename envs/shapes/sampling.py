@@ -10,8 +10,8 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, tuple_of
 from leapnav.envs.shapes.barrier import CONTACT, barrier
-from leapnav.envs.shapes.distance import circle_geometry, polygon_geometry, wall_distance
-from leapnav.envs.shapes.field import CENTRE, CIRCLES, COLUMNS, POLYGON_HEAD, POLYGONS, RIM, SHAPES
+from leapnav.envs.shapes.distance import shape_geometry, wall_distance
+from leapnav.envs.shapes.field import header_of, shapes_of
 
 # Added to the distances of the points, relative to the spacing. With 0 (and at least half the spacing), 3 optima of
 # 2,000 scenarios of the unicycle are missed, by 3 to 36 %; for other robots, 7 of 800 results differ from those of the
@@ -47,7 +47,8 @@ def sample_grid(field, radius, grid, band):
     so Phi is computed for a distance that is larger by OFFSET; otherwise a path through a passage that is hardly wider
     than the spacing would cost far too much.
     """
-    weight, steepness = field[0], 1.0 / field[1]
+    header = header_of(field)
+    weight, steepness = header.weight, 1.0 / header.scale
     x0, y0, spacing, columns, lines = grid.x0, grid.y0, grid.spacing, grid.columns, grid.lines
     offset = OFFSET * spacing
     phi = np.empty((columns, lines))
@@ -57,32 +58,18 @@ def sample_grid(field, radius, grid, band):
             x, y = x0 + i * spacing, y0 + j * spacing
             phi[i, j], closest[i, j] = 0.0, band
             for side in range(4):
-                distance = wall_distance(x, y, field, side) - radius
+                distance = wall_distance(x, y, header, side) - radius
                 if distance < band:
                     phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
-    reach = band + radius
-    at = SHAPES
-    for _ in range(int(field[CIRCLES])):
-        cx, cy, r = field[at], field[at + 1], field[at + 2]
-        at += 3
-        first, last = _index_range(cx - r - reach, cx + r + reach, x0, spacing, columns)
-        bottom, top = _index_range(cy - r - reach, cy + r + reach, y0, spacing, lines)
+    for shape in shapes_of(field):
+        reach = shape.rim + band + radius
+        first, last = _index_range(shape.x - reach, shape.x + reach, x0, spacing, columns)
+        bottom, top = _index_range(shape.y - reach, shape.y + reach, y0, spacing, lines)
         for i in range(first, last):
             for j in range(bottom, top):
-                distance = circle_geometry(x0 + i * spacing - cx, y0 + j * spacing - cy, r + radius)[0]
+                distance = shape_geometry(x0 + i * spacing, y0 + j * spacing, radius, field, shape)[0]
                 if distance < band:
                     phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
-    for _ in range(int(field[POLYGONS])):
-        cx, cy, r = field[at + CENTRE], field[at + CENTRE + 1], field[at + RIM]
-        first, last = _index_range(cx - r - reach, cx + r + reach, x0, spacing, columns)
-        bottom, top = _index_range(cy - r - reach, cy + r + reach, y0, spacing, lines)
-        for i in range(first, last):
-            for j in range(bottom, top):
-                distance = polygon_geometry(x0 + i * spacing, y0 + j * spacing, field, at)[0] - radius
-                if distance < band:
-                    phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
-                    closest[i, j] = min(closest[i, j], distance)
-        at += POLYGON_HEAD + COLUMNS * int(field[at])
     return phi, closest

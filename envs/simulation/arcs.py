@@ -14,6 +14,7 @@ from leapnav.envs.kernels.types import CONSTANT
 from leapnav.envs.robots.arcs import sinc
 from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.shapes.field import header_of
 from leapnav.envs.shapes.proximity import proximity_values
 
 PANEL_LENGTH, MAX_PANELS = 1.5, 1000  # length (proximity scales) and number of the panels of an integral of Phi
@@ -105,7 +106,7 @@ def _panel(x, y, heading, distance, turn, start, width, field):
     xa, ya = arc_point(x, y, heading, distance, turn, middle - offset)
     xb, yb = arc_point(x, y, heading, distance, turn, middle)
     xc, yc = arc_point(x, y, heading, distance, turn, middle + offset)
-    first, second, third = proximity_values(xa, ya, xb, yb, xc, yc, field[2], field)
+    first, second, third = proximity_values(xa, ya, xb, yb, xc, yc, header_of(field).radius, field)
     return (5.0 * first + 8.0 * second + 5.0 * third) / 18.0 * width
 
 
@@ -123,13 +124,13 @@ def arc_proximity(x, y, heading, distance, turn, lowest, field):
 
     """
     length = abs(distance)
-    panels = min(max(math.ceil(length / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
+    panels = min(max(math.ceil(length / (PANEL_LENGTH * header_of(field).scale)), 1.0), MAX_PANELS)
     largest, total = 1.0 / panels, 0.0
     if lowest >= largest * length:
         for k in range(int(panels)):
             total += _panel(x, y, heading, distance, turn, k * largest, largest, field)
         return total
-    shortest = CONTACT * field[1] / length
+    shortest = CONTACT * header_of(field).scale / length
     start, width = 0.0, largest
     whole = _panel(x, y, heading, distance, turn, start, width, field)
     while True:

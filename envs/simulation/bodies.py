@@ -20,7 +20,7 @@ from numba import float64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
 from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import ARENA, unpack_field
+from leapnav.envs.shapes.field import field_parts, read_header
 from leapnav.envs.shapes.proximity import proximity_value
 
 WALL_THICKNESS = 1.0  # m, outside the arena
@@ -105,15 +105,16 @@ class ContactWorld:
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
-        circles, polygons, _ = unpack_field(field)
-        shapes: list[pymunk.Shape] = [pymunk.Circle(static, r, (x, y)) for x, y, r in circles.tolist()]
-        for vertices, radius in polygons:
+        shapes: list[pymunk.Shape] = []
+        for vertices, radius, _ in field_parts(field):
             points = vertices.tolist()
-            if len(points) == 2:
+            if len(points) == 1:
+                shapes.append(pymunk.Circle(static, radius, points[0]))
+            elif len(points) == 2:
                 shapes.append(pymunk.Segment(static, points[0], points[1], radius))
             else:
                 shapes.append(pymunk.Poly(static, points, radius=radius))
-        x_min, y_min, x_max, y_max = field[ARENA : ARENA + 4].tolist()
+        x_min, y_min, x_max, y_max = read_header(field)["arena"].tolist()
         t = WALL_THICKNESS
         for left, below, right, above in (
             (x_min - t, y_min - t, x_min, y_max + t),

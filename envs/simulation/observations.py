@@ -28,6 +28,7 @@ from leapnav.envs.settings import (
     VERTICES,
     EnvironmentSettings,
 )
+from leapnav.envs.shapes.field import header_of
 from leapnav.envs.simulation.sensing import WALL_ENTRIES, map_surroundings, scan
 from leapnav.envs.simulation.state import PACKED_STATE, SPIN, TIME, VX, VY, SimulationState, field_of
 from leapnav.envs.utils.records import MAX_MAGNITUDE
@@ -292,7 +293,16 @@ def observe_robots(robots, packed, packed_buffers, out):
                     row[at + k] += deviation * noise[i, sim.noise_rows[i], sensing + 3 + k]
             at += count
         if has_geodesics:
-            geodesic_detours(x, y, heading, sim.maps[i], field_of(sim.fields, i)[2], beams, scratch[2], buffers.detours)
+            geodesic_detours(
+                x,
+                y,
+                heading,
+                sim.maps[i],
+                header_of(field_of(sim.fields, i)).radius,
+                beams,
+                scratch[2],
+                buffers.detours,
+            )
             for k in range(count):
                 row[at + k] = buffers.detours[k]
             row[at + count] = geodesic_distance(x, y, sim.maps[i])

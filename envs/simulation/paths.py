@@ -18,6 +18,7 @@ from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
 from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.shapes.field import header_of
 from leapnav.envs.shapes.proximity import proximity_values
 from leapnav.envs.simulation.arcs import (
     CLEARANCE_TOLERANCE,
@@ -216,7 +217,7 @@ def path_costs(path, duration, field, total, lowest, samples, poses):
         poses (3, 4): overwritten.
 
     """
-    panels = min(max(math.ceil(total / (PANEL_LENGTH * field[1])), 1.0), MAX_PANELS)
+    panels = min(max(math.ceil(total / (PANEL_LENGTH * header_of(field).scale)), 1.0), MAX_PANELS)
     largest, proximity, state_cost = 1.0 / panels, 0.0, 0.0
     poses[:, 2:] = 0.0
     if lowest >= largest * total:
@@ -224,7 +225,7 @@ def path_costs(path, duration, field, total, lowest, samples, poses):
             phi, cost = _panel_costs(path, duration, k * largest, largest, field, samples, poses)
             proximity, state_cost = proximity + phi, state_cost + cost
         return proximity, state_cost
-    shortest = CONTACT * field[1] / total
+    shortest = CONTACT * header_of(field).scale / total
     start, width = 0.0, largest
     whole, _ = _panel_costs(path, duration, start, width, field, samples, poses)
     while True:

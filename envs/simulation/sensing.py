@@ -10,18 +10,8 @@ from numba import float64, int64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
-from leapnav.envs.shapes.distance import polygon_geometry
-from leapnav.envs.shapes.field import (
-    ARENA,
-    CENTRE,
-    CIRCLES,
-    COLUMNS,
-    POLYGON_HEAD,
-    POLYGONS,
-    RIM,
-    ROUNDING,
-    SHAPES,
-)
+from leapnav.envs.shapes.distance import shape_geometry
+from leapnav.envs.shapes.field import SHAPE_TYPE, edges_of, field_parts, header_of, shapes_of
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
 # Up to this number of beams it takes less time to intersect a circle with all of them, in vector instructions, than to
@@ -62,39 +52,39 @@ def _range_to_circle(dx, dy, cx, cy, r):
     return along - math.sqrt(square) if square > 0.0 and along > 0.0 else np.inf
 
 
-@kernel(float64(float64, float64, float64, float64, CONSTANT, int64))
-def _range_to_polygon(x, y, dx, dy, field, at):
+@kernel(float64(float64, float64, float64, float64, CONSTANT, SHAPE_TYPE))
+def _range_to_polygon(x, y, dx, dy, field, shape):
     """Return the distance (m) from (x, y) in the direction (dx, dy) to a rounded polygon, infinite if there is no hit.
 
     If (x, y) is inside a polygon without rounding, the distance is negative; a rounded one must not contain (x, y).
     """
-    rounding = field[at + ROUNDING]
+    edges, rounding = edges_of(field, shape), shape.rounding
     # Between `enter` and `leave`, the ray is inside the half-planes of all edges, moved outwards by the rounding.
-    enter, leave, entered = -np.inf, np.inf, at
-    row = at + POLYGON_HEAD
-    for _ in range(int(field[at])):
-        height = field[row] * x + field[row + 1] * y - field[row + 2] - rounding
-        rate = field[row] * dx + field[row + 1] * dy
+    enter, leave, entered = -np.inf, np.inf, 0
+    for k in range(shape.edges):
+        edge = edges[k]
+        height = edge.nx * x + edge.ny * y - edge.offset - rounding
+        rate = edge.nx * dx + edge.ny * dy
         if rate < 0.0:
             if -height / rate > enter:
-                enter, entered = -height / rate, row
+                enter, entered = -height / rate, k
         elif rate > 0.0:
             leave = min(leave, -height / rate)
         elif height > 0.0:  # a ray parallel to an edge is entirely inside or outside its half-plane
             return np.inf
-        row += COLUMNS
     if enter > leave or leave <= 0.0:
         return np.inf
     if rounding == 0.0:
         return enter
     if enter >= 0.0:
-        px, py = x + enter * dx - field[entered + 3], y + enter * dy - field[entered + 4]
-        if 0.0 <= field[entered] * py - field[entered + 1] * px <= field[entered + 5]:
+        edge = edges[entered]
+        px, py = x + enter * dx - edge.x, y + enter * dy - edge.y
+        if 0.0 <= edge.nx * py - edge.ny * px <= edge.length:
             return enter
     # The half-planes extend beyond the circles around the vertices, which round the corners.
     nearest = np.inf
-    for vertex in range(at + POLYGON_HEAD, row, COLUMNS):
-        nearest = min(nearest, _range_to_circle(dx, dy, field[vertex + 3] - x, field[vertex + 4] - y, rounding))
+    for edge in edges:
+        nearest = min(nearest, _range_to_circle(dx, dy, edge.x - x, edge.y - y, rounding))
     return nearest
 
 
@@ -128,8 +118,8 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
     """
     count = beams.shape[1]
     dxs, dys, nearest = scratch[0], scratch[1], scratch[2]
-    to_right, to_top = field[ARENA + 2] - x, field[ARENA + 3] - y
-    to_left, to_bottom = field[ARENA] - x, field[ARENA + 1] - y
+    shapes, arena = shapes_of(field), header_of(field).arena
+    to_right, to_top, to_left, to_bottom = arena[2] - x, arena[3] - y, arena[0] - x, arena[1] - y
     for k in range(count):
         dx = cos * beams[0, k] - sin * beams[1, k]
         dy = sin * beams[0, k] + cos * beams[1, k]
@@ -139,48 +129,35 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         dxs[k], dys[k] = dx, dy
         nearest[k] = first if first < reach else reach
     # The beams that may meet an obstacle are consecutive, if beam count + k is beam k.
-    selects, at = count > MAX_VECTORISED_BEAMS or field[POLYGONS] > 0.0, SHAPES
+    selects = count > MAX_VECTORISED_BEAMS or (len(shapes) > 0 and shapes[-1].edges > 0)
     if selects:
         for k in range(count):
             dxs[count + k], dys[count + k], nearest[count + k] = dxs[k], dys[k], nearest[k]
-    for _ in range(int(field[CIRCLES])):
-        cx, cy, r = field[at] - x, field[at + 1] - y, field[at + 2]
-        at += 3
-        if cx * cx + cy * cy >= (r + reach) ** 2:
+    for shape in shapes:
+        cx, cy = shape.x - x, shape.y - y
+        if cx * cx + cy * cy >= (shape.rim + reach) ** 2:
             continue
-        first, last = 0, count
-        if count > MAX_VECTORISED_BEAMS:
-            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
-        size = last - first
-        _shorten(cx, cy, r, reach, part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size))
-    for _ in range(int(field[POLYGONS])):
-        cx, cy, r = field[at + CENTRE] - x, field[at + CENTRE + 1] - y, field[at + RIM]
-        if cx * cx + cy * cy < (r + reach) ** 2:
-            is_inside = field[at + ROUNDING] > 0.0 and polygon_geometry(x, y, field, at)[0] <= 0.0
-            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, r, count)
-            for k in range(first, last):
-                hit = 0.0 if is_inside else _range_to_polygon(x, y, dxs[k], dys[k], field, at)
-                nearest[k] = min(nearest[k], hit)
-        at += POLYGON_HEAD + COLUMNS * int(field[at])
+        first, size = 0, count
+        if shape.edges > 0 or count > MAX_VECTORISED_BEAMS:
+            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, shape.rim, count)
+            size = last - first
+        if shape.edges == 0:
+            rays = part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size)
+            _shorten(cx, cy, shape.rim, reach, rays[0], rays[1], rays[2])
+            continue
+        is_inside = shape.rounding > 0.0 and shape_geometry(x, y, 0.0, field, shape)[0] <= 0.0
+        for k in range(first, first + size):
+            hit = 0.0 if is_inside else _range_to_polygon(x, y, dxs[k], dys[k], field, shape)
+            nearest[k] = min(nearest[k], hit)
     for k in range(count):
         hit = min(nearest[k], nearest[count + k]) if selects else nearest[k]
         nearest[k] = hit if hit > 0.0 else 0.0
 
 
-@kernel(int64(CONSTANT))
-def max_vertices(field):
-    """Return the maximum number of vertices of an obstacle in the field, 0 if all are circles."""
-    at = SHAPES + 3 * int(field[CIRCLES])
-    largest = 0
-    for _ in range(int(field[POLYGONS])):
-        largest = max(largest, int(field[at]))
-        at += POLYGON_HEAD + COLUMNS * int(field[at])
-    return largest
-
-
 def check_map(field: np.ndarray, map_vertices: int) -> None:
     """Raise ValueError if an obstacle in the field has more vertices than each row of the map."""
-    if (vertices := max_vertices(field)) > map_vertices:
+    vertices = max((len(part.vertices) for part in field_parts(field)), default=0)
+    if vertices > map_vertices:
         raise ValueError(
             f"map_vertices: expected at least {vertices}, the number of vertices of an obstacle in the scenario, "
             f"got {map_vertices}"
@@ -205,46 +182,31 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
         out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten.
 
     """
-    out[0], out[1] = x - field[ARENA], y - field[ARENA + 1]
-    out[2], out[3] = field[ARENA + 2] - x, field[ARENA + 3] - y
+    shapes, arena = shapes_of(field), header_of(field).arena
+    out[0], out[1], out[2], out[3] = x - arena[0], y - arena[1], arena[2] - x, arena[3] - y
     out[4], out[5] = cos, sin
-    width = 2 + 2 * vertices
-    for k in range(WALL_ENTRIES, WALL_ENTRIES + obstacles * width):
-        out[k] = 0.0
-    circles, polygons = int(field[CIRCLES]), int(field[POLYGONS])
-    # Insertion sort into a list of the nearest parts; one that is not a circle has a negative index into the field.
+    out[WALL_ENTRIES:] = 0.0
+    # Insertion sort into a list of the nearest shapes.
     distances = np.full(obstacles, np.inf)
-    indices = np.zeros(obstacles, np.int64)
-    at = SHAPES
-    for i in range(circles + polygons):
-        if i < circles:
-            distance = math.sqrt((field[at] - x) ** 2 + (field[at + 1] - y) ** 2) - field[at + 2]
-            size = 3
-        else:
-            distance = polygon_geometry(x, y, field, at)[0]
-            size = POLYGON_HEAD + COLUMNS * int(field[at])
+    numbers = np.zeros(obstacles, np.int64)
+    for number in range(len(shapes)):
+        distance = shape_geometry(x, y, 0.0, field, shapes[number])[0]
         rank = obstacles
         while rank > 0 and distance < distances[rank - 1]:
             rank -= 1
         if rank < obstacles:
             for k in range(obstacles - 1, rank, -1):
-                distances[k], indices[k] = distances[k - 1], indices[k - 1]
-            distances[rank], indices[rank] = distance, (at if i < circles else -at)
-        at += size
-    for k in range(obstacles):
-        if distances[k] == np.inf:
-            break
-        row = WALL_ENTRIES + k * width
-        at = abs(indices[k])
-        disc = indices[k] > 0
-        out[row] = 1.0
-        if disc:
-            first, stride, edges, rounding = at, 0, 1, field[at + 2]
-        else:
-            first, stride, edges, rounding = at + POLYGON_HEAD + 3, COLUMNS, int(field[at]), field[at + ROUNDING]
-        out[row + 1] = rounding
+                distances[k], numbers[k] = distances[k - 1], numbers[k - 1]
+            distances[rank], numbers[rank] = distance, number
+    for k in range(min(obstacles, len(shapes))):
+        shape = shapes[numbers[k]]
+        edges = edges_of(field, shape)
+        row = WALL_ENTRIES + k * (2 + 2 * vertices)
+        out[row], out[row + 1] = 1.0, shape.rounding
         for j in range(vertices):
-            vertex = first + stride * (j % edges)
-            dx, dy = field[vertex] - x, field[vertex + 1] - y
+            dx, dy = shape.x - x, shape.y - y
+            if shape.edges > 0:
+                edge = edges[j % shape.edges]
+                dx, dy = edge.x - x, edge.y - y
             out[row + 2 + 2 * j] = cos * dx + sin * dy
             out[row + 3 + 2 * j] = cos * dy - sin * dx

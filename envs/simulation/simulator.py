@@ -22,7 +22,7 @@ from leapnav.envs.simulation import stepping
 from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
 from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, RobotMotion, no_state_cost
-from leapnav.envs.simulation.sensing import check_map, max_vertices
+from leapnav.envs.simulation.sensing import check_map
 from leapnav.envs.simulation.state import (
     CLEARANCE,
     COLUMNS,
@@ -394,7 +394,7 @@ def _required_discs(discs: np.ndarray) -> int:
 
 
 # Kernels that only some observations need.
-OBSERVING = {"map": max_vertices, "geodesic": solve_eikonal}
+OBSERVING = {"geodesic": solve_eikonal}
 
 
 def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:

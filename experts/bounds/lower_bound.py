@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.field import read_header
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.bounds.distance import Distance, Medium
@@ -193,7 +194,8 @@ class _Producer:
     ) -> None:
         self.scenario, self.ends, self.cost, self.threads = scenario, ends, optimum.cost, threads
         states, controls = np.asarray(optimum.states, dtype=float), np.asarray(optimum.controls, dtype=float)
-        proximity = np.array([proximity_value(x, y, scenario.field[2], scenario.field) for x, y in states[:, :2]])
+        radius = float(read_header(scenario.field)["radius"])
+        proximity = np.array([proximity_value(x, y, radius, scenario.field) for x, y in states[:, :2]])
         self.duality_gap = 0.0
         if scenario.horizon is None:
             self.energy = scenario.cost.time_weight

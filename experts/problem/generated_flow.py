@@ -174,7 +174,10 @@ def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[st
 def _call(name: str, at: Sequence[int], first: int) -> str:
     """Return the call of a function of a disc or of a footprint, whose discs begin at an index of the data."""
     states = ", ".join(f"q{i}" for i in at)
-    disc, footprint = f"disc_{name}({states}, field[2], field)", f"footprint_{name}({states}, data, {first}, field)"
+    disc, footprint = (
+        f"disc_{name}({states}, header_of(field).radius, field)",
+        f"footprint_{name}({states}, data, {first}, field)",
+    )
     return disc if len(at) == 2 else footprint
 
 
@@ -182,7 +185,11 @@ def import_costs(limited: Sequence[int]) -> list[str]:
     """Return the lines that import what the lines of `call_costs` call."""
     limits = ["from leapnav.experts.numerics.state_bounds import limit_cost"] if limited else []
     names = "disc_features, disc_proximity, footprint_features, footprint_proximity"
-    return [f"from leapnav.envs.shapes.proximity import {names}", *limits]
+    return [
+        "from leapnav.envs.shapes.field import header_of",
+        f"from leapnav.envs.shapes.proximity import {names}",
+        *limits,
+    ]
 
 
 def _render(

@@ -13,7 +13,7 @@ import numpy as np
 
 from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import check_field, with_weight
+from leapnav.envs.shapes.field import check_field, read_header, with_weight
 from leapnav.envs.shapes.proximity import footprint_proximities
 from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
@@ -241,12 +241,12 @@ class OptimalControlProblem:
     @property
     def proximity_weight(self) -> float:
         """The weight of the proximity cost that the solvers use; 0 without obstacles."""
-        return 0.0 if self.field is None else max(float(self.field[0]), self.barrier_weight)
+        return 0.0 if self.field is None else max(float(read_header(self.field)["weight"]), self.barrier_weight)
 
     @property
     def has_hard_limits(self) -> bool:
         """Whether the cost of an optimum excludes the barrier: state bounds, or obstacles with proximity weight 0."""
-        return bool(self.state_limits) or (self.field is not None and float(self.field[0]) == 0.0)
+        return bool(self.state_limits) or (self.field is not None and read_header(self.field)["weight"] == 0.0)
 
     @cached_property
     def state_limits(self) -> tuple[StateLimit, ...]:
@@ -264,7 +264,7 @@ class OptimalControlProblem:
             cost += limit_costs(states[:, state].copy(), _constant([bound, slope, self.barrier_weight]))
         if self.field is None or self.proximity_weight == 0.0:
             return cost
-        added = 1.0 - float(self.field[0]) / self.proximity_weight
+        added = 1.0 - float(read_header(self.field)["weight"]) / self.proximity_weight
         return cost + added * footprint_proximities(states, self.discs, self.arrays.field)
 
     @property
@@ -300,7 +300,7 @@ class OptimalControlProblem:
         """The discs of the robot (D, 2), offset along its heading and radius (m); (0, 2) without obstacles."""
         if self.field is None:
             return _constant(()).reshape(-1, 2)
-        return _constant(self.footprint or ((0.0, self.field[2]),))
+        return _constant(self.footprint or ((0.0, float(read_header(self.field)["radius"])),))
 
     @cached_property
     def compiled_dynamics(self) -> CompiledDynamics:

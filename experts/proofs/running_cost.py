@@ -34,7 +34,7 @@ from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.barrier import CONTACT, barrier
 from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.field import with_weight
+from leapnav.envs.shapes.field import header_of, with_weight
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts.proofs.cells import GEOMETRY, Grid
 
@@ -84,7 +84,8 @@ def _bound(field, weight, geometry, needed, cost):
     """Fill the bounds of a grid for a proximity weight; that of the field is 1."""
     n, spacing = cost.squares.shape[2], geometry.spacing
     reach = 0.5 * math.sqrt(2.0) * spacing / n + ROUNDING
-    growth = math.exp(reach / field[1])
+    header = header_of(field)
+    growth = math.exp(reach / header.scale)
     highest = barrier(CONTACT, CONTACT)[0]
     for i in range(needed.shape[0]):
         for j in range(needed.shape[1]):
@@ -93,7 +94,7 @@ def _bound(field, weight, geometry, needed, cost):
             cx, cy = geometry.x + (i + 0.5) * spacing, geometry.y + (j + 0.5) * spacing
             middle = clearance(cx, cy, field)[0]
             cost.clearance[i, j] = middle
-            cost.centre[i, j] = weight * proximity_value(cx, cy, field[2], field)
+            cost.centre[i, j] = weight * proximity_value(cx, cy, header.radius, field)
             if middle < -spacing:
                 continue
             for a in range(n):
@@ -101,7 +102,7 @@ def _bound(field, weight, geometry, needed, cost):
                     px, py = cx + ((a + 0.5) / n - 0.5) * spacing, cy + ((b + 0.5) / n - 0.5) * spacing
                     if middle < spacing and clearance(px, py, field)[0] + reach < 0.0:
                         continue
-                    total, value = proximity_value(px, py, field[2], field), 0.0
+                    total, value = proximity_value(px, py, header.radius, field), 0.0
                     if 0.0 < total < np.inf:  # otherwise far away, or deep in an obstacle where the barrier overflows
                         bound = min(1.0 / (growth / total + (growth - 1.0)), highest)
                         value = weight * bound * (1.0 - RELATIVE_ROUNDING)
