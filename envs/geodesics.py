@@ -18,6 +18,7 @@ import numpy as np
 from numba import float32, float64, from_dtype
 
 from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.internals import records_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.shapes.field import header_of, read_header
@@ -69,7 +70,7 @@ def _solve(content: bytes, goal_x: float, goal_y: float) -> np.ndarray:
 @kernel(from_dtype(MAP_HEADER)(float32[::1]))
 def map_header_of(packed):
     """Return the `MAP_HEADER` of a packed map."""
-    return packed[:MAP_ENTRIES].view(MAP_HEADER)[0]
+    return records_of(packed, 0, 1, MAP_HEADER)[0]
 
 
 @kernel(NOTHING(CONSTANT, float64, float64, float64, MATRIX))

@@ -43,6 +43,7 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Hold an action for one control period, see `NavigateEnv.step`; the reward is that of `compute_reward`."""
         observation, _, terminated, truncated, info = super().step(action)
-        info["terminated"], info["at_horizon"] = terminated, self._simulator.at_horizon(0)
+        episode = self._simulator.episode(0)
+        info["terminated"], info["at_horizon"] = terminated, episode.steps >= episode.last_step
         reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info))
         return observation, reward, terminated, truncated, info

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from leapnav.envs.robots.base import WHEELS, RobotModel
+from leapnav.envs.robots.base import RobotModel
 
 KEY_ACTION = 0.5  # fraction of the limits of the controls
 
@@ -16,9 +16,7 @@ def keys_to_action(model: type[RobotModel]) -> dict[str | tuple[str | int, ...],
     import pygame
 
     m = model.sizes()[1]
-    forwards, left = np.eye(2, m, dtype=np.float32)
-    if model.drive == WHEELS:
-        forwards, left = np.array([[1, 1], [-1, 1]], dtype=np.float32)
+    forwards, left = np.asarray(model.key_controls or np.eye(2, m), dtype=np.float32)
     # Gymnasium takes the empty text for "no key"; an empty tuple is an error.
     actions: dict[str | tuple[str | int, ...], np.ndarray] = {"": np.zeros(m, np.float32)}
     for keys in (("w", "s", "a", "d"), (pygame.K_UP, pygame.K_DOWN, pygame.K_LEFT, pygame.K_RIGHT)):

@@ -16,8 +16,8 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import ScenarioSource, WithSpec, get_scenario
 from leapnav.envs.settings import Disturbance, EnvironmentSettings, Motor
-from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
+from leapnav.envs.simulation.state import Episode
 
 if TYPE_CHECKING:
     from leapnav.envs.simulation.rendering import Window
@@ -41,8 +41,8 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     `"dynamic_unicycle"` or one's own, see `leapnav.envs.RobotModel`. The tables of this page describe the unicycle; for
     other robots the action and the part `motion` of the observation differ.
 
-    The motion is simulated with pymunk. With `actuation="velocity"` and without contact, the robot follows the exact
-    path of each action, for the unicycle a circular arc.
+    With `actuation="velocity"`, the robot follows the exact path of each action, for the unicycle a circular arc.
+    pymunk simulates robots with `actuation="motor"`, and contacts after which an episode continues.
 
     `gym.make_vec("leapnav/Navigate-v0", num_envs=1024)` simulates many robots in one process, see `NavigateVectorEnv`.
     `leapnav/NavigateGoal-v0` is the same task for goal-conditioned learners, see `NavigateGoalEnv`.
@@ -255,7 +255,6 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         self.observation_space = self._simulator.layout.space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._source.robot.sizes()[1],), np.float32)
         self._action_shape = self._source.robot.sizes()[1:]
-        self._has_motion = bool(self._simulator.motion.shape[1])
         self._simulator.check(self._source.scenario, self.bank)
         self._choice: Scenario | int | None = None
         self._playing = np.zeros(1, dtype=bool)
@@ -291,7 +290,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         self._choice = choice
         self._playing[0] = True
         self._trail = [self.pose]
-        info = self._info(self._simulator.state[0].tolist())
+        info = self._info(self._simulator.episode(0))
         info["scenario"] = self.scenario
         if isinstance(choice, int) and self.bank is not None:
             info["index"], info["reference_cost"] = choice, float(self.bank.costs[choice])
@@ -317,13 +316,13 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         self._simulator.step(values.reshape(1, -1), self._playing)
         if self.render_mode is not None:
             self._trail.append(self.pose)
-        row = self._simulator.state[0].tolist()
-        observation, info = self._observe(), self._info(row)
-        terminated, truncated = row[columns.TERMINATED] != 0.0, row[columns.TRUNCATED] != 0.0
+        episode = self._simulator.episode(0)
+        observation, info = self._observe(), self._info(episode)
+        terminated, truncated = episode.terminated, episode.truncated
         self._playing[0] = not (terminated or truncated)
         if self.render_mode == "human":
             self.render()
-        return observation, row[columns.REWARD], terminated, truncated, info
+        return observation, episode.reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Render the scene.
@@ -394,18 +393,18 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     @property
     def pose(self) -> tuple[float, float, float]:
         """The robot's x, y (m) and heading (rad, unwrapped)."""
-        x, y, heading = self._simulator.poses[0].tolist()
+        x, y, heading = self._simulator.states[0, :3].tolist()
         return x, y, heading
 
     @property
     def state(self) -> np.ndarray:
         """The robot's state (n,): the pose and the further states of its model."""
-        return np.concatenate([self._simulator.poses[0], self._simulator.motion[0]])
+        return self._simulator.states[0].copy()
 
     @property
     def time(self) -> float:
         """Time since the start of the episode (s)."""
-        return float(self._simulator.state[0, columns.TIME])
+        return float(self._simulator.episodes["time"][0])
 
     @property
     def window_closed(self) -> bool:
@@ -422,17 +421,24 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         self._simulator.observe(out)
         return self._simulator.layout.divide(out[0])
 
-    def _info(self, row: list[float]) -> dict[str, Any]:
-        """Return the info of a step, from the robot's row of the state."""
-        parts = {name: -row[column] for name, column in columns.parts(self.settings.free_horizon).items()}
-        if self.settings.reward == "shaped":
-            parts["shaping"] = row[columns.SHAPING]
-        info: dict[str, Any] = {name: row[column] for name, column in columns.INFOS.items()}
-        for name, column in columns.FLAGS.items():
-            info[name] = row[column] != 0.0
-        info["pose"], info["reward_parts"] = self.pose, parts
-        if self._has_motion:
-            info["motion"] = self._simulator.motion[0].copy()
+    def _info(self, episode: Episode) -> dict[str, Any]:
+        """Return the info of a step."""
+        parts = {name: -getattr(episode, name) for name in ("effort", "proximity", "collision", "miss")}
+        if self.settings.free_horizon:
+            parts["time"] = -episode.time_cost
+        if self.settings.shaped:
+            parts["shaping"] = episode.shaping
+        info: dict[str, Any] = {
+            "cost": episode.cost,
+            "clearance": episode.clearance,
+            "time": episode.time,
+            "collision": episode.collided,
+            "is_success": episode.success,
+            "pose": self.pose,
+            "reward_parts": parts,
+        }
+        if self._simulator.states.shape[1] > 3:
+            info["motion"] = self._simulator.states[0, 3:].copy()
         return info
 
     def __getstate__(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numba import from_dtype
 
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.robots.base import MODELS
@@ -29,39 +30,6 @@ OBSTACLE_KINDS = "cost", "hard"  # see `Cost.obstacles`
 SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")
 MIN_PERIOD = 1e-4  # s
 MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
-
-# Indices into the packed settings, the array that the kernels read.
-(
-    PERIOD,
-    POSITION_TOLERANCE,
-    HEADING_TOLERANCE,
-    COLLISION_PENALTY,
-    MISS_PENALTY,
-    TERMINATE_ON_COLLISION,
-    LIDAR_RANGE,
-    SHAPED,
-    DISCOUNT,
-    MOTORS,
-    MASS,
-    MOMENT,
-    TRACK,
-    WHEEL_FORCE,
-    RESPONSE,
-    GRIP,
-    ACTUATION_NOISE,
-    SLIP,
-    SENSING_NOISE,
-    OBSERVATION,
-    GOAL_CONDITIONED,
-    OBSTACLES,
-    VERTICES,
-    DRIVE,
-    MOTION_TOLERANCE,
-    N_MOTION,
-    N_CONTROLS,
-    FREE_HORIZON,
-    PACKED,
-) = range(29)
 
 
 @dataclass(frozen=True)
@@ -215,26 +183,36 @@ class EnvironmentSettings:
         """Whether the robot is driven by forces."""
         return self.actuation == "motor"
 
+    @property
+    def shaped(self) -> bool:
+        """Whether the reward is shaped."""
+        return self.reward == "shaped"
+
+    @property
+    def commands_motion(self) -> bool:
+        """Whether the controls are speed and turn rate."""
+        return self.model.control_names == ("speed", "turn_rate")
+
     def packed(self) -> np.ndarray:
-        """Return the settings as the array that the kernels read."""
-        values = np.zeros(PACKED)
-        values[PERIOD] = self.control_period
-        values[POSITION_TOLERANCE], values[HEADING_TOLERANCE] = self.position_tolerance, self.heading_tolerance
-        values[COLLISION_PENALTY], values[MISS_PENALTY] = self.collision_penalty, self.miss_penalty
-        values[TERMINATE_ON_COLLISION], values[LIDAR_RANGE] = self.terminate_on_collision, self.lidar_range
-        values[SHAPED], values[DISCOUNT] = self.reward == "shaped", self.discount
-        motor, noise = self.motor, self.disturbance
-        values[MOTORS], values[MASS], values[MOMENT], values[TRACK] = self.motors, motor.mass, motor.moment, motor.track
-        values[WHEEL_FORCE], values[RESPONSE], values[GRIP] = motor.wheel_force, motor.response, motor.grip
-        values[ACTUATION_NOISE], values[SLIP], values[SENSING_NOISE] = noise.actuation, noise.slip, noise.sensing
-        values[OBSERVATION], values[GOAL_CONDITIONED] = OBSERVATIONS.index(self.observation), self.goal_conditioned
-        values[OBSTACLES], values[VERTICES] = self.map_obstacles, self.map_vertices
-        values[DRIVE] = self.model.drive
-        values[MOTION_TOLERANCE] = self.motion_tolerance
-        n, m = self.model.sizes()
-        values[N_MOTION], values[N_CONTROLS] = n - 3, m
-        values[FREE_HORIZON] = self.free_horizon
-        return values
+        """Return the settings as an array of one record of SETTINGS, which the kernels read."""
+        return np.array([_values(self, SETTINGS)], SETTINGS)
+
+
+def _values(record: Any, dtype: np.dtype) -> tuple[Any, ...]:
+    """Return the values of an object's attributes that a dtype names."""
+    values = ((getattr(record, name), dtype[name]) for name in dtype.names or ())
+    return tuple(_values(value, kind) if kind.names else value for value, kind in values)
+
+
+MOTOR, DISTURBANCE = (np.dtype([(f.name, "f8") for f in fields(kind)]) for kind in (Motor, Disturbance))
+# The numbers and flags of the settings.
+SETTINGS = np.dtype(
+    [(f.name, f.type) for f in fields(EnvironmentSettings) if f.type in ("int", "float", "bool")]
+    + [(name, "bool") for name in ("free_horizon", "motors", "shaped", "commands_motion")]
+    + [("motor", MOTOR), ("disturbance", DISTURBANCE)],
+    align=True,
+)
+MOTOR_TYPE = from_dtype(MOTOR)
 
 
 def _as_disturbance(value: Any) -> Disturbance:

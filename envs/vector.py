@@ -28,7 +28,6 @@ from leapnav.envs.scenarios.sources import (
     get_scenario,
 )
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.utils.validation import check_integer, is_integer
 
@@ -120,7 +119,6 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._simulator.check(self._source.scenario, self.bank)
-        self._truncates = self.settings.free_horizon
         self._choices: list[Scenario | int | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
@@ -211,7 +209,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         self._ended[robots] = False
         if self.render_mode is not None:
             for i in indices:
-                self._trails[i] = [tuple(self._simulator.poses[i].tolist())]
+                self._trails[i] = [tuple(self._simulator.states[i, :3].tolist())]
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold each robot's action for one control period.
@@ -227,18 +225,17 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         restarting = self._ended.copy()
         if self.autoreset_mode is AutoresetMode.DISABLED and restarting.any():
             raise gym.error.ResetNeeded(f"robot {int(np.argmax(restarting))}: its episode has ended; reset it first")
-        simulator, state = self._simulator, self._simulator.state
+        simulator, episodes = self._simulator, self._simulator.episodes
         simulator.step(values, ~restarting)
         if self.render_mode is not None:
             for i in np.flatnonzero(~restarting).tolist():
-                self._trails[i].append(tuple(simulator.poses[i].tolist()))
+                self._trails[i].append(tuple(simulator.states[i, :3].tolist()))
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and restarting.any():
             self._start(np.flatnonzero(restarting))
         else:
             restarting = self._no_robots
-        terminated = state[:, columns.TERMINATED] > 0
-        truncated = state[:, columns.TRUNCATED] > 0 if self._truncates else self._no_robots.copy()
-        ended = terminated | truncated if self._truncates else terminated
+        terminated, truncated = episodes["terminated"].copy(), episodes["truncated"].copy()
+        ended = terminated | truncated
         if self._sampler is not None:
             self._record_outcomes(self._sampler, ended & ~restarting)
         flat = self._flat_observations()
@@ -260,17 +257,17 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
 
     def _record_outcomes(self, sampler: LevelSampler, ended: np.ndarray) -> None:
         """Tell the sampler the outcomes of the episodes that have ended."""
-        state, bank, settings = self._simulator.state, self.bank, self.settings
+        bank, settings = self.bank, self.settings
         assert bank is not None  # required for a sampler
         for i in np.flatnonzero(ended).tolist():
-            index, row = self._choices[i], state[i]
+            index, episode = self._choices[i], self._simulator.episode(i)
             if not isinstance(index, int):  # selected by a reset
                 continue
-            collision, missed = bool(row[columns.COLLIDED]), bool(row[columns.TERMINATED]) and not row[columns.SUCCESS]
+            collision, missed = episode.collided, episode.terminated and not episode.success
             penalties = settings.collision_penalty * collision + settings.miss_penalty * missed
-            value = -float(row[columns.COST]) - penalties
+            value = -episode.cost - penalties
             regret = -float(bank.costs[index]) - value
-            sampler.record(LevelOutcome(index, bool(row[columns.SUCCESS]), collision, value, regret))
+            sampler.record(LevelOutcome(index, episode.success, collision, value, regret))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a frame of each robot, see `NavigateEnv.render`."""
@@ -326,17 +323,17 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
     @property
     def times(self) -> np.ndarray:
         """Time since the start of each robot's episode (num_envs,) (s)."""
-        return self._simulator.state[:, columns.TIME].copy()
+        return self._simulator.episodes["time"].copy()
 
     @property
     def poses(self) -> np.ndarray:
         """x, y (m) and heading (rad, unwrapped) of each robot, (num_envs, 3)."""
-        return self._simulator.poses.copy()
+        return self._simulator.states[:, :3].copy()
 
     @property
     def states(self) -> np.ndarray:
         """The state of each robot (num_envs, n): the pose and the further states of its model."""
-        return np.concatenate([self._simulator.poses, self._simulator.motion], axis=1)
+        return self._simulator.states.copy()
 
     @property
     def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override] (the same in Gymnasium)
@@ -354,20 +351,22 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         return flat
 
     def _rewards(self, flat: np.ndarray, ended: np.ndarray, restarted: np.ndarray) -> np.ndarray:
-        return self._simulator.state[:, columns.REWARD].copy()
+        return self._simulator.episodes["reward"].copy()
 
     def _infos(self, mask: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
         """Return the infos of the robots in `mask`, with the infos of a reset for those in `restarted`."""
-        state = self._simulator.state
-        values: dict[str, Any] = {name: state[:, column].copy() for name, column in columns.INFOS.items()}
-        for name, column in columns.FLAGS.items():
-            values[name] = state[:, column] != 0.0
-        values["pose"] = self._simulator.poses.copy()
-        if self._simulator.motion.shape[1]:
-            values["motion"] = self._simulator.motion.copy()
-        parts = {name: -state[:, column] for name, column in columns.parts(self._truncates).items()}
-        if self.settings.reward == "shaped":
-            parts["shaping"] = state[:, columns.SHAPING].copy()
+        episodes, states = self._simulator.episodes, self._simulator.states
+        names = {"cost": "cost", "clearance": "clearance", "time": "time"}
+        names |= {"collision": "collided", "is_success": "success"}
+        values: dict[str, Any] = {name: episodes[field].copy() for name, field in names.items()}
+        values["pose"] = states[:, :3].copy()
+        if states.shape[1] > 3:
+            values["motion"] = states[:, 3:].copy()
+        parts = {name: -episodes[name] for name in ("effort", "proximity", "collision", "miss")}
+        if self.settings.free_horizon:
+            parts["time"] = -episodes["time_cost"]
+        if self.settings.shaped:
+            parts["shaping"] = episodes["shaping"].copy()
         values["reward_parts"] = _add_masks(parts, mask)
         infos = _add_masks(values, mask)
         if restarted is not None and restarted.any():
@@ -416,10 +415,10 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
         return np.where(restarted, 0.0, rewards)
 
     def _infos(self, mask: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
-        state = self._simulator.state
+        episodes = self._simulator.episodes
         ends = {
-            "terminated": state[:, columns.TERMINATED] > 0,
-            "at_horizon": state[:, columns.STEPS] >= state[:, columns.LAST_STEP],
+            "terminated": episodes["terminated"].copy(),
+            "at_horizon": episodes["steps"] >= episodes["last_step"],
         }
         stepped = mask if restarted is None else mask & ~restarted
         infos = super()._infos(mask, restarted)

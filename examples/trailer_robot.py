@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 from leapnav.envs.kernels import kernel
 from leapnav.envs.robots import Dynamics, Symmetry, Unicycle, register
 from leapnav.envs.robots.arcs import advance_arc
-from leapnav.envs.robots.base import ADVANCE_SIGNATURE, GENERAL, POSE
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, POSE
 
 STEPS = 8  # Runge-Kutta steps per control period of 0.05 s; the error of the trailer's heading is below 1e-9 rad
 
@@ -37,7 +37,6 @@ class Trailer(Unicycle):
     mirror: ClassVar = Symmetry(motion=(-1,), controls=((1, 0), (0, -1)))
     reversal: ClassVar = None  # the trailer is not at the other end of the robot
     advance: ClassVar = advance
-    drive: ClassVar = GENERAL
     is_kinematic: ClassVar = False
 
     model: Literal["trailer"] = "trailer"

@@ -12,8 +12,7 @@ from leapnav.cli import main
 from leapnav.envs import NavigateEnv, NavigateGoalEnv, Scenario, ScenarioBank, ScenarioError, sample_scenario
 from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.scenarios.families import ALL_FAMILIES
-from leapnav.envs.simulation.entries import observation_entries
-from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, has_time_left
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, observation_entries, parts_of
 from leapnav.experts import ExpertPolicy, build_bank, find_optimum, find_reached_optimum
 from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
@@ -92,8 +91,10 @@ def test_the_observation_has_no_time_left():
     later = env.step(STAY)[0]
     assert (first == later).all()
     assert first[:FREE_GOAL_ENTRIES] == pytest.approx([2, 0, 1, 0])
-    assert len(first) == FREE_GOAL_ENTRIES + 32 and not has_time_left(env.observation_space.high)
-    assert has_time_left(NavigateEnv(split="fresh").observation_space.high)
+    assert len(first) == FREE_GOAL_ENTRIES + 32 and parts_of(env.observation_space)["goal"] == slice(
+        0, FREE_GOAL_ENTRIES
+    )
+    assert parts_of(NavigateEnv(split="fresh").observation_space)["goal"] == slice(0, GOAL_ENTRIES)
     names = [entry.name for entry in observation_entries(env.settings)]
     assert names[:5] == [
         "goal.ahead",
@@ -153,7 +154,7 @@ def test_included_banks_hold_certified_optima(family):
         assert len(bank) == count and bank.horizon == "free"
         limits = [scenario.time_limit for scenario in bank]
         assert np.allclose(limits, 3 * bank.horizons, atol=0.051)
-        assert all(scenario.task[-1] == 0.5 for scenario in bank)
+        assert all(scenario.cost.time_weight == 0.5 for scenario in bank)
     index = 11
     optimum, reference = find_optimum(bank[index]), bank.reference(index)
     assert reference.cost == pytest.approx(optimum.cost, rel=1e-6)
@@ -354,7 +355,7 @@ def test_old_banks_and_policies_are_fixed():
     assert ScenarioBank.shipped("open", "test").horizon == "fixed"
     assert Scenario.from_dict(scenario_fields()).horizon_kind == "fixed"
     policy = load_policy("open", NavigateEnv("open", split="fresh"))
-    assert has_time_left(policy.observation_space.high)
+    assert parts_of(policy.observation_space)["goal"] == slice(0, GOAL_ENTRIES)
 
 
 def test_momentum_leaves_decided_actions_unchanged():

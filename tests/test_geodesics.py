@@ -10,7 +10,7 @@ import torch as th
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.geodesics import MAX_DETOUR, geodesic_distance, geodesic_map
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.entries import observation_entries
+from leapnav.envs.simulation.observations import observation_entries
 from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import find_optimum
 from leapnav.training import CloningConfig, Dataset, NavigationFeatures, load_policy, make_policy, policy_environment

@@ -83,7 +83,7 @@ def test_what_a_kernel_uses_must_be_known_when_it_is_declared(name, tmp_path):
     """Otherwise a change would not be noticed: a module as a whole, or a kernel that is defined below."""
     below = "\n@kernel(float64(float64))\ndef below(x):\n    return x\n"
     code = f"""
-from leapnav.envs.simulation import arcs as beside
+from leapnav.envs.robots import arcs as beside
 from numba import float64
 from numba import float64
 from leapnav.envs.kernels import kernel
@@ -104,21 +104,21 @@ def test_importing_compiles_nothing(tmp_path):
 
 
 def test_a_kernel_is_compiled_with_those_it_calls(tmp_path):
-    code = "from leapnav.envs.simulation.arcs import arc_point; arc_point(0.0, 0.0, 0.0, 1.0, 0.0, 0.5)"
+    code = "from leapnav.envs.robots.arcs import advance_arc; advance_arc(0.0, 0.0, 0.0, 1.0, 0.0)"
     assert run(code, LEAPNAV_CACHE_DIR=str(tmp_path)).stderr == ""
-    assert {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")} == {"arcs.arc_point", "arcs.sinc"}
+    assert {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")} == {"arcs.advance_arc", "arcs.sinc"}
 
 
 PREPARED = """
 from leapnav.envs.kernels import compilation, prepare
-from leapnav.envs.simulation.arcs import arc_point, sinc
+from leapnav.envs.robots.arcs import advance_arc, sinc
 compilation.MIN_KERNELS = 1
 if {fail}:
     compilation.WORK = "import sys; sys.exit(1)"
-print(*(one.py_func.__name__ for one in compilation.missing([arc_point])))
-print(prepare(arc_point, jobs=2), len(arc_point.signatures))
-print(arc_point(1.0, 2.0, 0.0, 2.0, 0.0, 0.5), compilation.missing([arc_point]))
-print(sum(arc_point.stats.cache_hits.values()))
+print(*(one.py_func.__name__ for one in compilation.missing([advance_arc])))
+print(prepare(advance_arc, jobs=2), len(advance_arc.signatures))
+print(advance_arc(1.0, 2.0, 0.0, 2.0, 0.0), compilation.missing([advance_arc]))
+print(sum(advance_arc.stats.cache_hits.values()))
 """
 
 
@@ -126,7 +126,7 @@ print(sum(arc_point.stats.cache_hits.values()))
 def test_many_kernels_are_compiled_by_several_processes(fail, tmp_path):
     """Kernels that these did not compile are compiled by the process that asked."""
     found = run(PREPARED.format(fail=fail), LEAPNAV_CACHE_DIR=str(tmp_path))
-    assert found.stdout.splitlines() == ["sinc arc_point", f"2 {int(fail)}", "(2.0, 2.0) []", str(int(not fail))]
+    assert found.stdout.splitlines() == ["sinc advance_arc", f"2 {int(fail)}", "(3.0, 2.0, 0.0) []", str(int(not fail))]
     assert "Compiling, once per installation" in found.stderr
 
 
@@ -144,8 +144,11 @@ USED = """
 import gymnasium as gym
 import leapnav
 from leapnav.envs import sample_scenario
+from leapnav.envs.kernels import compilation
 from leapnav.envs.kernels.decorator import DECLARATIONS
 from leapnav.experts import find_optimum
+
+compilation.MIN_KERNELS = 1  # all kernels are compiled by other processes
 
 for robot in ("unicycle", "car"):
     env = gym.make("leapnav/Navigate-v0", family="clutter", split="fresh", robot=robot)

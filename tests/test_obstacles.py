@@ -6,6 +6,7 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Circle, Obstacle, Polygon, Scenario, Unicycle
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.shapes.barrier import CONTACT, barrier
 from leapnav.envs.shapes.clearance import clearance, clearances
 from leapnav.envs.shapes.proximity import (
@@ -15,7 +16,7 @@ from leapnav.envs.shapes.proximity import (
     proximity_value,
     proximity_values,
 )
-from leapnav.envs.simulation.arcs import arc_point, arc_proximity, follow_arc
+from leapnav.envs.simulation import paths
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom
 
@@ -200,18 +201,35 @@ def test_clearance_names_the_nearest_obstacle():
     assert clearance(0.0, 5.0, scenario.field)[1] == -1  # the wall
 
 
+UNICYCLE = paths.RobotMotion(
+    FunctionPointer(Unicycle.advance, paths.ADVANCE_FUNCTION),
+    FunctionPointer(paths.no_state_cost, paths.STATE_COST_FUNCTION),
+)
+
+
+def drive_arc(scenario, x, y, heading, distance, turn):
+    """Drive along an arc in one second; see `drive_path`, without the state cost."""
+    q, u, discs = np.array([x, y, heading]), np.array([distance, turn]), scenario.robot.discs().copy()
+    path = paths.Path(UNICYCLE, q, u, np.zeros(0), discs, scenario.field, 1.0, np.zeros((5, 3)))
+    return paths.drive_path(path, clearance(x, y, scenario.field)[0], np.zeros(3))[:4]
+
+
+def arc_points(x, y, heading, distance, turn, fractions):
+    chord = distance * fractions * np.sinc(turn * fractions / (2 * np.pi))
+    middle = heading + turn * fractions / 2
+    return np.stack([x + chord * np.cos(middle), y + chord * np.sin(middle)], axis=-1)
+
+
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_the_clearance_of_an_arc_is_the_smallest_of_its_points(scenario):
     rng = np.random.default_rng(3)
     fraction = np.linspace(0, 1, 5001)
     for x, y in points(scenario, 40, seed=1):
         heading, distance, turn = rng.uniform(-3, 3), rng.uniform(-1, 1), rng.uniform(-2, 2)
-        chord = distance * fraction * np.sinc(turn * fraction / (2 * np.pi))
-        middle = heading + turn * fraction / 2
-        arc = np.stack([x + chord * np.cos(middle), y + chord * np.sin(middle)], axis=1)
+        arc = arc_points(x, y, heading, distance, turn, fraction)
         lowest = clearances(arc, scenario.field).min()
         before = clearance(x, y, scenario.field)[0]
-        found, driven, after = follow_arc(x, y, heading, distance, turn, before, scenario.field)
+        found, driven, after, _ = drive_arc(scenario, x, y, heading, distance, turn)
         free = clearances(arc, scenario.field) > 0
         if driven == 1.0:
             assert free.mean() > 0.99  # the rest overlaps by less than a millimetre
@@ -228,14 +246,14 @@ def accurate_mean(scenario, arc):
     """Mean of Phi along an arc, by Gauss rules over panels graded towards both ends and the smallest clearance."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     trial = np.linspace(0, 1, 2001)
-    clearances_ = [clearance(*arc_point(*arc, s), scenario.field)[0] for s in trial]
+    clearances_ = clearances(arc_points(*arc, trial), scenario.field)
     steps = np.concatenate([[0.0], 1.5 ** -np.arange(45.0)])
     centres = 0.0, trial[np.argmin(clearances_)], 1.0
     ends = np.unique(np.clip([c + sign * steps for c in centres for sign in (-1, 1)], 0, 1))
     total = 0.0
     for a, b in pairwise(ends):
         for node, weight in zip(nodes, weights, strict=True):
-            point = arc_point(*arc, (a + b) / 2 + (b - a) / 2 * node)
+            point = arc_points(*arc, (a + b) / 2 + (b - a) / 2 * node)
             total += (b - a) / 2 * weight * proximity(*point, scenario.field)[0]
     return total
 
@@ -255,10 +273,9 @@ def test_the_proximity_cost_of_an_arc_is_accurate_near_obstacles_and_up_to_a_con
         distance, turn = 0.75 + 10 ** rng.uniform(-4, -0.5), rng.uniform(0.8, 5.5)
         x, y = 5 + distance * math.cos(turn), 5 + distance * math.sin(turn)
         arc = x, y, rng.uniform(-np.pi, np.pi), rng.uniform(0.01, 0.15), rng.uniform(-0.4, 0.4)
-        lowest, fraction, _ = follow_arc(*arc, clearance(x, y, scenario.field)[0], scenario.field)
+        _, fraction, _, found = drive_arc(scenario, *arc)
         arc = *arc[:3], arc[3] * fraction, arc[4] * fraction
-        found = arc_proximity(*arc, lowest, scenario.field)
-        errors[fraction < 1].append(abs(found / accurate_mean(scenario, arc) - 1))
+        errors[fraction < 1].append(abs(found / fraction / accurate_mean(scenario, arc) - 1))
     assert min(map(len, errors.values())) > 60
     assert max(errors[False]) < 1e-4
     assert max(errors[True]) < 2e-3
@@ -266,7 +283,7 @@ def test_the_proximity_cost_of_an_arc_is_accurate_near_obstacles_and_up_to_a_con
 
 
 def test_a_very_long_arc_through_a_wall_terminates():
-    lowest, driven, _ = follow_arc(5.0, 5.0, 0.3, 1e9, 0.0, 1.0, SCENARIOS[0].field)
+    lowest, driven, _, _ = drive_arc(SCENARIOS[0], 5.0, 5.0, 0.3, 1e9, 0.0)
     assert lowest <= 0
     assert driven < 1e-8
 
@@ -279,7 +296,7 @@ def test_an_arc_does_not_jump_a_thin_obstacle():
         horizon=1.0,
         obstacles=({"polygon": {"vertices": ((5.0, 0.0), (5.01, 0.0), (5.01, 10.0), (5.0, 10.0))}},),
     )
-    lowest, driven, _ = follow_arc(1.0, 5.0, 0.0, 8.0, 0.0, 0.75, scenario.field)
+    lowest, driven, _, _ = drive_arc(scenario, 1.0, 5.0, 0.0, 8.0, 0.0)
     assert lowest <= 0
     assert 8.0 * driven == pytest.approx(4.0 - 0.25, abs=1e-4)
 

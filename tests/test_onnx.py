@@ -11,8 +11,7 @@ from stable_baselines3 import PPO, SAC
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.entries import observation_entries
-from leapnav.envs.simulation.observations import ObservationLayout
+from leapnav.envs.simulation.observations import ObservationLayout, observation_entries
 from leapnav.training import load_policy, network, policy_environment
 from leapnav.training.policies.onnx_export import export_onnx
 

@@ -23,7 +23,8 @@ from leapnav.envs import (
     Scenario,
     ScenarioBank,
 )
-from leapnav.envs.simulation.observations import GOAL_ENTRIES, MOTION_ENTRIES, WALL_ENTRIES
+from leapnav.envs.simulation.observations import GOAL_ENTRIES, MOTION_ENTRIES
+from leapnav.envs.simulation.sensing import WALL_ENTRIES
 
 ID, GOAL_ID = "leapnav/Navigate-v0", "leapnav/NavigateGoal-v0"
 EMPTY = {"start": [5.0, 5.0, 0.3], "goal": [6.0, 5.0, 0.0], "obstacles": []}

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import sympy as sp
 from helpers import best_known
 
-from leapnav.envs import NavigateVectorEnv, ScenarioBank, ScenarioError, geodesics
+from leapnav.envs import NavigateVectorEnv, ScenarioBank, ScenarioError
 from leapnav.envs.geodesics import geodesic_map
 from leapnav.envs.utils.caching import computed_once
 from leapnav.experts import ControlAffineSystem, ExpertPolicy, Trajectory, find_optimum
@@ -154,21 +153,10 @@ def test_threads_get_the_same_scenarios_of_a_bank():
         assert all(other == first for other in others)
 
 
-class InterruptedCache(OrderedDict):
-    """A cache in which another thread runs after each look-up."""
-
-    def get(self, key):
-        found = super().get(key)
-        time.sleep(1e-4)
-        return found
-
-
-def test_geodesic_maps_are_shared_by_threads(monkeypatch):
+def test_geodesic_maps_are_shared_by_threads():
     scenario, _ = best_known()[0]
     goals = [(0.5 + 0.2 * k, 1.0) for k in range(3)]
     expected = [geodesic_map(scenario.field, *goal) for goal in goals]
-    monkeypatch.setattr(geodesics, "CACHE_SIZE", 1)
-    monkeypatch.setattr(geodesics, "_cache", InterruptedCache())
 
     def read(number):
         order = np.random.default_rng(number).integers(len(goals), size=40)

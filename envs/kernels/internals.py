@@ -20,7 +20,16 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
-__all__ = ["FunctionPointer", "carray", "matrix_of", "part_of", "records_of", "scratch_buffer", "vector_at"]
+__all__ = [
+    "FunctionPointer",
+    "carray",
+    "function_at",
+    "matrix_of",
+    "part_of",
+    "records_of",
+    "scratch_buffer",
+    "vector_at",
+]
 
 
 class FunctionPointer:
@@ -30,11 +39,11 @@ class FunctionPointer:
         self._numba_type_ = kind
         kernel.compile(kind.signature.args)
         result = kernel.get_compile_result(kind.signature)
-        self._address = types.CompileResultWAP(result).__wrapper_address__()
+        self.address: int = types.CompileResultWAP(result).__wrapper_address__()
         self._kernel: Callable[..., Any] = kernel  # keeps the code alive
 
     def __wrapper_address__(self) -> int:
-        return self._address
+        return self.address
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function from Python."""
@@ -88,6 +97,17 @@ def _typed_vector_at(context: Any, address: Any, length: Any) -> Any:
     return array(int64, int64), generate
 
 
+def _typed_function_at(context: Any, address: Any, kind: Any) -> Any:
+    function = kind.instance_type
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = cgutils.create_struct_proxy(function)(context, builder)  # its other members are null
+        pointer.c_addr = builder.inttoptr(arguments[0], cgutils.voidptr_t)
+        return pointer._getvalue()
+
+    return function(int64, kind), generate
+
+
 def _typed_scratch_buffer(context: Any, count: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         buffer = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), count.literal_value))
@@ -98,9 +118,11 @@ def _typed_scratch_buffer(context: Any, count: Any) -> Any:
 
 # In kernels: the vector (count,), or the matrix (rows, columns), of an array's elements in C order from `start`; the
 # records of a NumPy dtype in the memory of an array, from the index `start` of its elements; the vector of floats at an
-# address that the caller keeps alive; a buffer of floats on the stack, of a literal length.
+# address that the caller keeps alive; the function of a type at the address of a `FunctionPointer`; a buffer of floats
+# on the stack, of a literal length.
 part_of: Any = intrinsic(_typed_part_of)
 records_of: Any = intrinsic(_typed_records_of)
 matrix_of: Any = intrinsic(_typed_matrix_of)
 vector_at: Any = intrinsic(_typed_vector_at)
+function_at: Any = intrinsic(_typed_function_at)
 scratch_buffer: Any = intrinsic(prefer_literal=True)(_typed_scratch_buffer)

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 ADVANCE_SIGNATURE = NOTHING(VECTOR, VECTOR, types.float64, CONSTANT, VECTOR)
 # state_cost(q, parameters) -> the part of the running cost that depends on the state, without the proximity cost.
 STATE_COST_SIGNATURE = types.float64(VECTOR, CONSTANT)
-# How the simulation moves a robot: along circular arcs, by speed and turn rate or by wheel speeds, or by `advance`.
-ARCS, WHEELS, GENERAL = range(3)
 POSE = ("x", "y", "heading")  # the first states of every robot
 
 
@@ -111,7 +109,8 @@ class RobotModel(Frozen):
         reversal: the same for all headings rotated by 180 degrees: the robot follows the same path backwards.
         velocity_states: names of the further states that are the speed and the turn rate, which a contact changes, or
             None.
-        drive: ARCS, WHEELS or GENERAL.
+        key_controls: the two controls, relative to their limits, with which a person drives ahead and turns left; None
+            for the first two.
         is_kinematic: whether a shortest path in the metric of the control weights, on the lattice of `lattice_moves`,
             approximates an optimum. Otherwise candidates are optimised for a unicycle first, and then lifted.
 
@@ -129,7 +128,7 @@ class RobotModel(Frozen):
     mirror: ClassVar[Symmetry | None] = None
     reversal: ClassVar[Symmetry | None] = None
     velocity_states: ClassVar[tuple[str, str] | None] = None
-    drive: ClassVar[int] = GENERAL
+    key_controls: ClassVar[tuple[tuple[float, ...], tuple[float, ...]] | None] = None
     is_kinematic: ClassVar[bool] = False
 
     model: Any = ""  # a literal in each model

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.robots.arcs import advance_arc
-from leapnav.envs.robots.base import ADVANCE_SIGNATURE, WHEELS, CostWeights, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, CostWeights, Dynamics, RobotModel, Symmetry, register
 from leapnav.envs.robots.unicycle import POSE_LABELS
 from leapnav.envs.utils.records import Positive
 
@@ -40,7 +40,7 @@ class DifferentialDrive(RobotModel):
     advance: ClassVar = advance
     mirror: ClassVar[Symmetry | None] = Symmetry((), ((0, 1), (1, 0)))
     reversal: ClassVar[Symmetry | None] = Symmetry((), ((0, -1), (-1, 0)))
-    drive: ClassVar[int] = WHEELS
+    key_controls: ClassVar[tuple[tuple[float, ...], tuple[float, ...]] | None] = ((1, 1), (-1, 1))
     is_kinematic: ClassVar[bool] = True
 
     model: Literal["differential_drive"] = "differential_drive"

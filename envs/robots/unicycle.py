@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.robots.arcs import advance_arc
-from leapnav.envs.robots.base import ADVANCE_SIGNATURE, ARCS, CostWeights, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.robots.base import ADVANCE_SIGNATURE, CostWeights, Dynamics, RobotModel, Symmetry, register
 from leapnav.envs.utils.records import Positive
 
 POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
@@ -37,7 +37,6 @@ class Unicycle(RobotModel):
     advance: ClassVar = advance
     mirror: ClassVar[Symmetry | None] = Symmetry((), ((1, 0), (0, -1)))
     reversal: ClassVar[Symmetry | None] = Symmetry((), ((-1, 0), (0, 1)))
-    drive: ClassVar[int] = ARCS
     is_kinematic: ClassVar[bool] = True
 
     model: Literal["unicycle"] = "unicycle"

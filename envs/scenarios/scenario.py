@@ -12,7 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
@@ -30,12 +30,24 @@ from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.records import Finite, Frozen, Positive, as_tuples
 from leapnav.envs.utils.validation import as_vector, check_positive
 
-# Columns of a packed task of a robot with n states, m controls and k parameters: start and goal (x, y, heading; the
-# goal heading NaN if free), the horizon, the limits (m) and weights (m) of the controls, the further states (n - 3) at
-# the start and at the goal (NaN if free), and the parameters (k). If the horizon is free, its column contains the time
-# limit, and a last column the time weight.
-START, GOAL, HORIZON, LIMITS = 0, 3, 6, 7
 TIME_LIMIT_FACTOR = 3.0  # time limit of an episode, as a multiple of the duration of the optimum
+
+
+class Task(NamedTuple):
+    """What the simulation reads of a scenario for a robot with n states, m controls and p parameters, besides the time.
+
+    Attributes:
+        start, goal (n,): states at time 0 and at the end; NaN for a state that is free at the goal.
+        limits, weights (m,): limits of the controls, and weights of their squares in the running cost.
+        parameters (p,): parameters of the robot's model.
+
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    limits: np.ndarray
+    weights: np.ndarray
+    parameters: np.ndarray
 
 
 class Scenario(Frozen):
@@ -178,8 +190,8 @@ class Scenario(Frozen):
         return TIME_LIMIT_FACTOR * (x_max - x_min + y_max - y_min) / self.cruise_speed
 
     @cached_property
-    def task(self) -> np.ndarray:
-        """The packed task for the simulation and for banks, see the constants of this module (read-only).
+    def task(self) -> Task:
+        """The task as arrays for the simulation and for banks.
 
         Raises:
             ScenarioError: the horizon is fixed, and the time has a weight.
@@ -190,12 +202,8 @@ class Scenario(Frozen):
             message = f"cost.time_weight: environments and banks with a fixed horizon need 0, got {cost.time_weight:g}"
             raise ScenarioError(one_line(self.name, [message]))
         goal = [math.nan if value is None else value for value in self.goal_state]
-        controls = (*robot.limits(), *robot.control_weight(cost))
-        further = (*self.start_state[3:], *goal[3:], *robot.parameters(cost))
-        time_weight = () if self.horizon is not None else (cost.time_weight,)
-        task = np.array([*self.start, *goal[:3], self.episode_limit, *controls, *further, *time_weight])
-        task.flags.writeable = False
-        return task
+        vectors = self.start_state, goal, robot.limits(), robot.control_weight(cost), robot.parameters(cost)
+        return Task(*(np.array(vector, dtype=float) for vector in vectors))
 
     def from_state(self, state: Sequence[float] | np.ndarray, time: float) -> Self:
         """Return the rest of the scenario from a state (n,) of the robot at a time (s).

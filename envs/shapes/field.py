@@ -72,6 +72,8 @@ MAX_SHAPES_WITHOUT_GRID = 16  # fewer shapes are evaluated faster one by one
 # obstacle.
 MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
 
+_NO_EDGES = np.empty((0, EDGE_SIZE))
+
 
 @kernel(HEADER_TYPE(CONSTANT))
 def header_of(field):
@@ -155,25 +157,25 @@ def _pack(parts: Sequence[Part], arena: Any, costs: Sequence[float], *, grid: bo
     header = np.zeros(1, HEADER)
     header["weight"], header["scale"], header["radius"] = costs
     header["least_distance"], header["arena"] = CONTACT, arena
-    parts = sorted(parts, key=lambda part: len(part.vertices) > 1)
-    edges = [edge_rows(part.vertices) if len(part.vertices) > 1 else np.empty((0, EDGE_SIZE)) for part in parts]
-    centres = np.array([part.vertices.mean(axis=0) for part in parts]).reshape(-1, 2)
-    shapes = np.zeros(len(parts), SHAPE)
-    shapes["x"], shapes["y"] = centres.T
-    shapes["rounding"] = [part.rounding for part in parts]
-    rims = [float(np.hypot(*(part.vertices - centre).T).max()) for part, centre in zip(parts, centres, strict=True)]
-    shapes["rim"] = rims + shapes["rounding"]
-    shapes["obstacle"] = [part.obstacle for part in parts]
-    shapes["edges"] = [len(rows) for rows in edges]
-    shapes["first"] = np.cumsum(shapes["edges"]) - shapes["edges"]
-    header["shapes"], header["edges"] = len(shapes), shapes["edges"].sum()
+    discs = [part for part in parts if len(part.vertices) == 1]
+    polygons = [part for part in parts if len(part.vertices) > 1]
+    edges = [edge_rows(part.vertices) for part in polygons]
+    rows = [(*part.vertices[0].tolist(), part.rounding, part.rounding, 0, 0, part.obstacle) for part in discs]
+    first = 0
+    for part, lines in zip(polygons, edges, strict=True):
+        x, y = centre = part.vertices.mean(axis=0)
+        rim = float(np.hypot(*(part.vertices - centre).T).max()) + part.rounding
+        rows.append((x, y, rim, part.rounding, first, len(lines), part.obstacle))
+        first += len(lines)
+    shapes = np.array(rows, SHAPE)
+    header["shapes"], header["edges"] = len(rows), first
     lists: list[Sequence[int]] = [range(len(parts))]
     header["columns"] = header["lines"] = header["cell_size"] = 1
     if grid and len(parts) > MAX_SHAPES_WITHOUT_GRID:
-        lists = _grid_lists(parts, edges, header[0])
+        lists = _grid_lists([*discs, *polygons], [*[_NO_EDGES] * len(discs), *edges], header[0])
     starts = len(lists) + 1 + np.cumsum([0, *map(len, lists)])
     numbers = np.concatenate([starts, *lists]).astype(COUNT)
-    whole = (header, shapes, np.concatenate([np.empty((0, EDGE_SIZE)), *edges]), numbers)
+    whole = (header, shapes, np.concatenate([_NO_EDGES, *edges]), numbers)
     field = np.concatenate([np.ascontiguousarray(one).view(np.float64).ravel() for one in whole])
     field.flags.writeable = False
     return field
@@ -305,6 +307,7 @@ def check_field(packed: np.ndarray) -> np.ndarray:
         return packed
     if not isinstance(cast(object, packed), np.ndarray) or packed.dtype != np.float64 or packed.ndim != 1:
         raise ValueError(f"field: expected a vector of float64 (Scenario.field), got {packed!r}")
+    packed = np.ascontiguousarray(packed)
     try:
         with np.errstate(all="ignore"):
             fields = [_pack_again(packed, grid=grid) for grid in (True, False)]

@@ -1,9 +1,10 @@
-"""The robots' bodies in pymunk: one Space shared by the robots without contact, and one Space per robot in contact.
+"""What pymunk simulates: robots with motors, and robots in contact with obstacles.
 
-Without contacts, obstacles have no effect in Chipmunk. The shared Space therefore contains no obstacles, which makes it
-fast: a broad phase over 1000 arenas takes 20 times as long as moving the bodies. A robot that continues after a
-collision gets its own Space with the obstacles of its arena. Contacts in one Space depend, in the last bits, on its
-other contents and on its history, and an episode must not depend on either.
+Robots without motors and without contact follow the exact path of their model, see `leapnav.envs.simulation.paths`.
+Robots with motors share one Space without obstacles while they are not in contact: a broad phase over 1000 arenas takes
+20 times as long as moving the bodies. A robot that continues after a collision gets its own Space with the obstacles of
+its arena. Contacts in one Space depend, in the last bits, on its other contents and on its history, and an episode must
+not depend on either.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numba import float64, types
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
+from leapnav.envs.settings import Motor
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import field_parts, read_header
 from leapnav.envs.shapes.proximity import proximity_value
@@ -37,52 +39,41 @@ _KINEMATICS = (
 _FORCES = _KINEMATICS | pymunk.batch.BodyFields.FORCE | pymunk.batch.BodyFields.TORQUE
 
 
-class FreeBodies:
-    """The robots without contact in one Space, written and read as one buffer.
+class MotorBodies:
+    """The robots with motors, while they are not in contact, in one Space that is written and read as one buffer.
 
     Args:
         count: number of robots.
-        mass, moment: mass (kg) and moment of inertia (kg m^2) of each.
-        forces: whether the robots are driven by forces; otherwise by velocities.
+        motor: mass and moment of inertia of each.
 
     Attributes:
-        rows (count, 6), with forces (count, 9): x, y, angle; velocity (2) and angular velocity; force (2) and torque.
-            Time is measured in steps, so a velocity is a displacement. Each robot can have its own step length.
+        rows (count, 9): x, y, angle; velocity (2) and angular velocity; force (2) and torque. Time is measured in
+            steps, so a velocity is a displacement. Each robot can have its own step length.
 
     """
 
-    def __init__(self, count: int, mass: float, moment: float, *, forces: bool) -> None:
-        self._arguments = count, mass, moment, forces
-        self._build(np.zeros((count, 9 if forces else 6)))
-
-    def _build(self, rows: np.ndarray) -> None:
-        self.rows = rows
-        count, mass, moment, forces = self._arguments
+    def __init__(self, count: int, motor: Motor) -> None:
+        self._arguments = count, motor
+        self.rows = np.zeros((count, 9))
         self._space = pymunk.Space()
-        self._space.add(*(pymunk.Body(mass, moment) for _ in range(count)))
-        self._fields = _FORCES if forces else _KINEMATICS
+        self._space.add(*(pymunk.Body(motor.mass, motor.moment) for _ in range(count)))
         self._written, self._read = pymunk.batch.Buffer(), pymunk.batch.Buffer()
         self._written.set_float_buf(self.rows)
         # The buffer never changes its size, so its memory is not reallocated and the view stays valid.
         pymunk.batch.get_space_bodies(self._space, _KINEMATICS, self._read)
         self._arrived = np.frombuffer(self._read.float_buf()).reshape(-1, 6)
-        self._kinematics = self.rows[:, :6]
 
     def advance(self) -> None:
         """Take one step: each body moves by its velocity, which its force then changes."""
         # The whole state is written, so that the Space keeps nothing from earlier steps.
-        pymunk.batch.set_space_bodies(self._space, self._fields, self._written)
+        pymunk.batch.set_space_bodies(self._space, _FORCES, self._written)
         self._space.step(1.0)
         self._read.clear()
         pymunk.batch.get_space_bodies(self._space, _KINEMATICS, self._read)
-        self._kinematics[:] = self._arrived
+        self.rows[:, :6] = self._arrived
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"arguments": self._arguments, "rows": self.rows}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._arguments = state["arguments"]
-        self._build(state["rows"])
+    def __reduce__(self) -> tuple[Any, ...]:
+        return MotorBodies, self._arguments  # each step writes all rows
 
 
 Velocity = tuple[float, float, float]  # x, y, angular
@@ -94,14 +85,12 @@ class ContactWorld:
     Args:
         field: the packed field of the scenario.
         discs (D, 2): footprint of the robot, offset along its heading and radius (m).
-        mass, moment: mass (kg) and moment of inertia (kg m^2) of the robot.
-        friction: coefficient of friction between the robot and obstacles or walls.
+        motor: mass, moment of inertia and friction of the robot.
 
     """
 
-    def __init__(self, field: np.ndarray, discs: np.ndarray, mass: float, moment: float, friction: float) -> None:
-        self._field, self._discs = field, discs
-        self._robot = mass, moment, friction
+    def __init__(self, field: np.ndarray, discs: np.ndarray, motor: Motor) -> None:
+        self._field, self._discs, self._motor = field, discs, motor
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
@@ -156,13 +145,12 @@ class ContactWorld:
             body.angular_velocity = turn_rate
 
         # A new body in each period: the memory of bodies and contacts must not carry over to the next period.
-        mass, moment, friction = self._robot
-        body = pymunk.Body(mass, moment)
+        body = pymunk.Body(self._motor.mass, self._motor.moment)
         outline = [
             pymunk.Circle(body, radius + CONTACT_MARGIN, (offset, 0.0)) for offset, radius in self._discs.tolist()
         ]
         for disc in outline:
-            disc.friction = friction
+            disc.friction = self._motor.friction
         x, y, angle = row[:3].tolist()
         body.position, body.angle = (x, y), angle
         body.velocity, body.angular_velocity = (velocity[0], velocity[1]), velocity[2]

@@ -1,141 +1,184 @@
-"""Observations: their parts, the observation spaces, and the kernel that computes them for many robots."""
+"""Observations: their parts and entries, the observation spaces, and the kernel that computes them for many robots."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from numba import float32, types
+from numba import float32, from_dtype, types
 
 from leapnav.envs.geodesics import MAX_DETOUR, geodesic_detours, geodesic_distance
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
-from leapnav.envs.scenarios.scenario import GOAL, HORIZON
-from leapnav.envs.settings import (
-    FREE_HORIZON,
-    GOAL_CONDITIONED,
-    LIDAR_RANGE,
-    MOTORS,
-    N_CONTROLS,
-    OBSERVATION,
-    OBSERVATIONS,
-    OBSTACLES,
-    PERIOD,
-    SENSING_NOISE,
-    VERTICES,
-    EnvironmentSettings,
-)
+from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.shapes.field import header_of
-from leapnav.envs.simulation.sensing import WALL_ENTRIES, map_surroundings, scan
-from leapnav.envs.simulation.state import PACKED_STATE, SPIN, TIME, VX, VY, SimulationState, field_of
+from leapnav.envs.simulation.sensing import map_surroundings, scan
+from leapnav.envs.simulation.state import PACKED, Simulation, field_of, row_of
+from leapnav.envs.simulation.stepping import wrapped
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 
-# Number of entries of the parts, which are documented in `NavigateEnv`. If the horizon is free, the goal part has no
-# time left and nothing that depends on it.
-GOAL_ENTRIES, FREE_GOAL_ENTRIES, MOTION_ENTRIES, POSE_ENTRIES = 9, 4, 3, 4
-TIME_LEFT = 4  # index in the goal part of a fixed horizon
 # Bounds of the observation spaces (m, s, m/s or rad/s), which scenarios of realistic size do not reach.
-MAX_DISTANCE, MAX_TIME, MAX_RATE = 1000.0, 10_000.0, 20.0
-MAX_GEODESIC = 2000.0  # bound of the geodesic distance (m), by which the observation is recognised
-LIDAR, MAP, GEODESIC = (OBSERVATIONS.index(name) for name in ("lidar", "map", "geodesic"))
+MAX_DISTANCE, MAX_TIME, MAX_RATE, MAX_GEODESIC = 1000.0, 10_000.0, 20.0, 2000.0
 
 
 @dataclass(frozen=True)
-class Part:
-    """A named part of the observation, with its bounds."""
+class Entry:
+    """One number of an observation or an action.
+
+    Attributes:
+        name: part and meaning, such as "goal.ahead".
+        unit: unit, "1" for a number without one.
+        low, high: bounds; values outside are clipped.
+
+    """
 
     name: str
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    unit: str
+    low: float
+    high: float
 
 
-def _parts(settings: EnvironmentSettings) -> list[Part]:
-    parts = []
+ACTION = (Entry("speed / max_speed", "1", -1.0, 1.0), Entry("turn_rate / max_turn_rate", "1", -1.0, 1.0))
+_DISTANCE, _COSINE, _RATE = ("m", -MAX_DISTANCE, MAX_DISTANCE), ("1", -1.0, 1.0), (-MAX_RATE, MAX_RATE)
+_POSE = (("m", -MAX_MAGNITUDE, MAX_MAGNITUDE),) * 2 + (_COSINE,) * 2
+_GOAL = (
+    Entry("goal.ahead", *_DISTANCE),
+    Entry("goal.left", *_DISTANCE),
+    Entry("goal.cos_heading_error", *_COSINE),
+    Entry("goal.sin_heading_error", *_COSINE),
+)
+# With a fixed horizon, the part `goal` also contains the time left and what depends on it.
+_TIMED_GOAL = (
+    *_GOAL,
+    Entry("goal.time_left", "s", 0.0, MAX_TIME),
+    Entry("goal.needed_speed_ahead", "m/s", *_RATE),
+    Entry("goal.needed_speed_left", "m/s", *_RATE),
+    Entry("goal.needed_speed", "m/s", 0.0, MAX_RATE),
+    Entry("goal.needed_turn_rate", "rad/s", *_RATE),
+)
+_MOTION = (("speed_ahead", "m/s"), ("speed_left", "m/s"), ("turn_rate", "rad/s"))
+GOAL_ENTRIES, FREE_GOAL_ENTRIES, MOTION_ENTRIES = len(_TIMED_GOAL), len(_GOAL), len(_MOTION)
+TIME_LEFT = len(_GOAL)  # index in the goal part of a fixed horizon
+
+
+def _parts(settings: EnvironmentSettings) -> Iterator[tuple[str, list[Entry]]]:
+    """Yield the names and entries of the parts of an observation, which `NavigateEnv` documents, in order."""
     if settings.goal_conditioned:
         # Absolute positions must not be clipped, or distant poses would equal distant goals.
-        pose = (-MAX_MAGNITUDE, -MAX_MAGNITUDE, -1.0, -1.0), (MAX_MAGNITUDE, MAX_MAGNITUDE, 1.0, 1.0)
-        parts += [Part("achieved_goal", *pose), Part("desired_goal", *pose)]
+        for part in ("achieved_goal", "desired_goal"):
+            names = ("x", "y", "cos_heading", "sin_heading")
+            yield part, [Entry(f"{part}.{name}", *kind) for name, kind in zip(names, _POSE, strict=True)]
         if not settings.free_horizon:
-            parts.append(Part("time", (0.0,), (MAX_TIME,)))
+            yield "time", [Entry("time.time_left", "s", 0.0, MAX_TIME)]
     else:
-        low = (-MAX_DISTANCE, -MAX_DISTANCE, -1.0, -1.0, 0.0, -MAX_RATE, -MAX_RATE, 0.0, -MAX_RATE)
-        high = (MAX_DISTANCE, MAX_DISTANCE, 1.0, 1.0, MAX_TIME, *[MAX_RATE] * 4)
-        count = goal_entries(settings)
-        parts.append(Part("goal", low[:count], high[:count]))
-    entries = motion_entries(settings)
-    if entries:
-        parts.append(Part("motion", (-MAX_RATE,) * entries, (MAX_RATE,) * entries))
+        yield "goal", list(_GOAL if settings.free_horizon else _TIMED_GOAL)
+    model = settings.model
+    motion = _MOTION if settings.motors else tuple(zip(model.state_names[3:], model.state_units[3:], strict=True))
+    yield "motion", [Entry(f"motion.{name}", unit, *_RATE) for name, unit in motion]
+    beams = settings.lidar_beams
+    angles = [f"{360 * k / beams:g} deg counter-clockwise from ahead" for k in range(beams)]
     if settings.has_lidar:
-        beams = settings.lidar_beams
-        parts.append(Part("lidar", (0.0,) * beams, (settings.lidar_range,) * beams))
-        if settings.observation == "geodesic":
-            parts.append(Part("detours", (0.0,) * beams, (MAX_DETOUR,) * beams))
-            parts.append(Part("distance", (0.0,), (MAX_GEODESIC,)))
+        yield "lidar", [Entry(f"lidar[{k}], {at}", "m", 0.0, settings.lidar_range) for k, at in enumerate(angles)]
+    if settings.observation == "geodesic":
+        yield "detours", [Entry(f"detours[{k}], {at}", "m", 0.0, MAX_DETOUR) for k, at in enumerate(angles)]
+        yield "distance", [Entry("distance", "m", 0.0, MAX_GEODESIC)]
     elif settings.observation == "map":
-        low = (-MAX_DISTANCE,) * 4 + (-1.0, -1.0)
-        parts.append(Part("walls", low, (MAX_DISTANCE,) * 4 + (1.0, 1.0)))
-        vertices, count = 2 * settings.map_vertices, settings.map_obstacles
-        low, high = (0.0, 0.0) + (-MAX_DISTANCE,) * vertices, (1.0, MAX_DISTANCE) + (MAX_DISTANCE,) * vertices
-        parts.append(Part("obstacles", low * count, high * count))
-    return [part for part in parts if part.low]
+        sides = [Entry(f"walls.{side}", *_DISTANCE) for side in ("left", "bottom", "right", "top")]
+        yield "walls", [*sides, Entry("walls.cos_heading", *_COSINE), Entry("walls.sin_heading", *_COSINE)]
+        obstacles = []
+        for k in range(settings.map_obstacles):
+            obstacles.append(Entry(f"obstacles[{k}].exists", "1", 0.0, 1.0))
+            obstacles.append(Entry(f"obstacles[{k}].radius", "m", 0.0, MAX_DISTANCE))
+            for vertex in range(settings.map_vertices):
+                name = f"obstacles[{k}].vertices[{vertex}]"
+                obstacles += [Entry(f"{name}.{side}", *_DISTANCE) for side in ("ahead", "left")]
+        yield "obstacles", obstacles
 
 
-def goal_entries(settings: EnvironmentSettings) -> int:
-    """Return the number of entries of the part `goal`."""
-    return FREE_GOAL_ENTRIES if settings.free_horizon else GOAL_ENTRIES
+def observation_entries(settings: EnvironmentSettings) -> list[Entry]:
+    """Return the entries of a flat observation of `NavigateEnv`, in order.
+
+    Raises:
+        ValueError: the observations of these settings are dictionaries.
+
+    """
+    if settings.dict_observation or settings.goal_conditioned:
+        raise ValueError("environment: expected flat observations, got dict_observation or a goal-conditioned one")
+    return [entry for _, entries in _parts(settings) for entry in entries]
 
 
-def has_time_left(high: np.ndarray) -> bool:
-    """Return whether flat observations with the upper bounds `high` contain the time left, at the index TIME_LEFT."""
-    return len(high) >= GOAL_ENTRIES and tuple(high[TIME_LEFT : TIME_LEFT + 2].tolist()) == (MAX_TIME, MAX_RATE)
+def parts_of(space: spaces.Box) -> dict[str, slice]:
+    """Return the parts of the flat observations in a space of `NavigateEnv` with a lidar.
+
+    Stable-Baselines3 passes nothing but the space to a features extractor, so the bounds are compared with those of the
+    entries of each part.
+    """
+    bounds = list(zip(space.low.tolist(), space.high.tolist(), strict=True))
+    end = GOAL_ENTRIES if bounds[TIME_LEFT:GOAL_ENTRIES] == _bounds(_TIMED_GOAL[TIME_LEFT:]) else FREE_GOAL_ENTRIES
+    parts = {"goal": slice(0, end)}
+    first = end
+    while end < len(bounds) and bounds[end] == _RATE:
+        end += 1
+    parts["motion"], beams = slice(first, end), len(bounds) - end
+    if bounds[-1:] == [(0.0, MAX_GEODESIC)]:
+        middle = end + beams // 2
+        parts["detours"], parts["distance"] = slice(middle, len(bounds) - 1), slice(len(bounds) - 1, len(bounds))
+        beams //= 2
+    return {**parts, "lidar": slice(end, end + beams)}
 
 
-def has_geodesics(high: np.ndarray) -> bool:
-    """Return whether flat observations with the upper bounds `high` end with detours and the geodesic distance."""
-    return float(high[-1]) == MAX_GEODESIC
+def _bounds(entries: Sequence[Entry]) -> list[tuple[float, float]]:
+    return [(entry.low, entry.high) for entry in entries]
 
 
-def motion_entries(settings: EnvironmentSettings) -> int:
-    """Return the number of entries of the part `motion`."""
-    return MOTION_ENTRIES if settings.motors else settings.model.sizes()[0] - 3
+# Index of the first entry of each part of an observation, -1 for a part that it does not have.
+OFFSETS = np.dtype(
+    [
+        (name, "i8")
+        for name in (
+            *("achieved_goal", "desired_goal", "time", "goal", "motion"),
+            *("lidar", "detours", "distance", "walls", "obstacles"),
+        )
+    ]
+)
 
 
 class ObservationBuffers(NamedTuple):
     """Constants and working memory of `observe_robots`.
 
     Attributes:
+        offsets (1,): record of OFFSETS.
         beams (2, n), scratch (3, 2 n): see `leapnav.envs.simulation.sensing.scan`.
         detours (n,): output of `leapnav.envs.geodesics.geodesic_detours`.
-        surroundings: output of `leapnav.envs.simulation.sensing.map_surroundings`; empty without a map.
         row (size,): an observation before it is rounded to float32.
         bounds (2, size): lower and upper bounds, float32.
         is_heading (n - 3,): which further states of the robot are headings, bool.
 
     """
 
+    offsets: np.ndarray
     beams: np.ndarray
     scratch: np.ndarray
     detours: np.ndarray
-    surroundings: np.ndarray
     row: np.ndarray
     bounds: np.ndarray
     is_heading: np.ndarray
 
 
-OBSERVATION_BUFFERS = record_type(
+BUFFERS = record_type(
     ObservationBuffers,
+    offsets=from_dtype(OFFSETS)[::1],
     beams=MATRIX,
     scratch=MATRIX,
     detours=VECTOR,
-    surroundings=VECTOR,
     row=VECTOR,
     bounds=float32[:, ::1],
     is_heading=FLAGS,
 )
-PACKED_BUFFERS = types.Tuple(OBSERVATION_BUFFERS.types)
 
 
 class ObservationLayout:
@@ -147,44 +190,41 @@ class ObservationLayout:
     Attributes:
         space: observation space of one robot.
         size: number of entries of a flat observation.
-        bounds (2, size): lower and upper bounds, float32.
+        parts: the entries of each part of a flat observation.
 
     """
 
     def __init__(self, settings: EnvironmentSettings) -> None:
         self._settings = settings
-        parts = _parts(settings)
-        self.bounds = np.array(
-            [[v for part in parts for v in part.low], [v for part in parts for v in part.high]], dtype=np.float32
-        )
-        self.size = self.bounds.shape[1]
+        self.parts: dict[str, slice] = {}
+        entries: list[Entry] = []
+        for name, added in _parts(settings):
+            if added:
+                self.parts[name] = slice(len(entries), len(entries) + len(added))
+                entries += added
+        self.size = len(entries)
+        self._bounds = np.array([[one.low for one in entries], [one.high for one in entries]], np.float32)
         angles = 2 * math.pi * np.arange(settings.lidar_beams) / max(settings.lidar_beams, 1)
-        map_entries = WALL_ENTRIES + settings.map_obstacles * (2 + 2 * settings.map_vertices)
+        further = settings.model.state_names[3:]
+        offsets = [self.parts[name].start if name in self.parts else -1 for name in OFFSETS.names or ()]
         self._buffers = ObservationBuffers(
+            offsets=np.array([tuple(offsets)], OFFSETS),
             beams=np.stack([np.cos(angles), np.sin(angles)]),
             scratch=np.zeros((3, 2 * settings.lidar_beams)),
             detours=np.zeros(settings.lidar_beams),
-            surroundings=np.zeros(map_entries if settings.observation == "map" else 0),
             row=np.zeros(self.size),
-            bounds=self.bounds,
-            is_heading=np.array(
-                [name in settings.model.heading_states for name in settings.model.state_names[3:]], dtype=bool
-            ),
+            bounds=self._bounds,
+            is_heading=np.array([name in settings.model.heading_states for name in further], dtype=bool),
         )
         self._packed_buffers = tuple(self._buffers)
-        ends = np.cumsum([len(part.low) for part in parts]).tolist()
-        slices = {part.name: slice(end - len(part.low), end) for part, end in zip(parts, ends, strict=True)}
-        self._slices: dict[str, slice] | None = None
+        self._slices: dict[str, slice] | None = self.parts if settings.dict_observation else None
         if settings.goal_conditioned:  # the other parts form one box, as goal-conditioned learners expect
-            first = ends[1]
-            goals = {name: slices[name] for name in ("achieved_goal", "desired_goal")}
-            self._slices = {"observation": slice(first, self.size), **goals}
-        elif settings.dict_observation:
-            self._slices = slices
+            goals = {name: self.parts[name] for name in ("achieved_goal", "desired_goal")}
+            self._slices = {"observation": slice(goals["desired_goal"].stop, self.size), **goals}
         self.space: spaces.Space[Any] = self._space()
 
     def _space(self) -> spaces.Space[Any]:
-        low, high = self.bounds
+        low, high = self._bounds
         if self._slices is None:
             return spaces.Box(low, high, dtype=np.float32)
         boxes: dict[str, spaces.Space[Any]] = {}
@@ -208,12 +248,12 @@ class ObservationLayout:
         scan(x, y, cos, sin, field, self._settings.lidar_range, buffers.beams, buffers.scratch)
         return buffers.scratch[2, : self._settings.lidar_beams].copy()
 
-    def fill(self, robots: np.ndarray, sim: tuple[np.ndarray, ...], out: np.ndarray) -> None:
+    def fill(self, robots: np.ndarray, packed: tuple[np.ndarray, ...], out: np.ndarray) -> None:
         """Write the flat observations of robots, given by index, to their rows of `out`."""
-        observe_robots(robots, sim, self._packed_buffers, out)
+        observe_robots(robots, packed, self._packed_buffers, out)
 
 
-@kernel(NOTHING(INTEGERS, PACKED_STATE, PACKED_BUFFERS, float32[:, ::1]))
+@kernel(NOTHING(INTEGERS, PACKED, types.Tuple(BUFFERS.types), float32[:, ::1]))
 def observe_robots(robots, packed, packed_buffers, out):
     """Compute the flat observations of robots, see `NavigateEnv` and `NavigateGoalEnv`.
 
@@ -224,93 +264,68 @@ def observe_robots(robots, packed, packed_buffers, out):
         out (count, size): the rows of the robots are overwritten; float32.
 
     """
-    sim, buffers = SimulationState(*packed), ObservationBuffers(*packed_buffers)
-    bodies, state, tasks, settings, noise = sim.bodies, sim.state, sim.tasks, sim.settings, sim.noise
-    beams, scratch, surroundings = buffers.beams, buffers.scratch, buffers.surroundings
-    row, bounds = buffers.row, buffers.bounds
-    deviation = settings[SENSING_NOISE]
-    goal_conditioned, motors = settings[GOAL_CONDITIONED] != 0.0, settings[MOTORS] != 0.0
-    free_horizon = settings[FREE_HORIZON] != 0.0
-    has_map, has_geodesics = settings[OBSERVATION] == MAP, settings[OBSERVATION] == GEODESIC
-    has_lidar = settings[OBSERVATION] == LIDAR or has_geodesics
-    count = beams.shape[1]
-    sensing = 2 * int(settings[N_CONTROLS])  # first column of the sensing noise, after that of the actuation
+    sim, buffers = Simulation(*packed), ObservationBuffers(*packed_buffers)
+    settings, at = sim.settings[0], buffers.offsets[0]
+    beams, scratch, row, bounds = buffers.beams, buffers.scratch, buffers.row, buffers.bounds
+    deviation, n_beams = settings.disturbance.sensing, beams.shape[1]
+    sensing = 2 * sim.controls.shape[1]  # first column of the sensing noise, after that of the actuation
     for i in robots:
-        x, y, heading = bodies[i, 0], bodies[i, 1], bodies[i, 2]
+        episode, state, field = sim.episodes[i], row_of(sim.states, i), field_of(sim.fields, i)
+        x, y, heading = state[0], state[1], state[2]
         cos, sin = math.cos(heading), math.sin(heading)
-        if has_lidar and count > 0:  # from the true pose, not from the sensed one
-            scan(x, y, cos, sin, field_of(sim.fields, i), settings[LIDAR_RANGE], beams, scratch)
+        noise = sim.noise[i, episode.steps % sim.noise.shape[1]]
+        if at.lidar >= 0:  # from the true pose, not from the sensed one
+            scan(x, y, cos, sin, field, settings.lidar_range, beams, scratch)
         # Achieved goals are observed without noise, because they determine the reward.
-        if deviation != 0.0 and not goal_conditioned:
-            drawn = sim.noise_rows[i]
-            x += deviation * noise[i, drawn, sensing]
-            y += deviation * noise[i, drawn, sensing + 1]
-            heading += deviation * noise[i, drawn, sensing + 2]
+        if deviation != 0.0 and not settings.goal_conditioned:
+            x += deviation * noise[sensing]
+            y += deviation * noise[sensing + 1]
+            heading += deviation * noise[sensing + 2]
             cos, sin = math.cos(heading), math.sin(heading)
-        goal_x, goal_y, goal_heading = tasks[i, GOAL], tasks[i, GOAL + 1], tasks[i, GOAL + 2]
+        goal_x, goal_y, goal_heading = sim.goals[i, 0], sim.goals[i, 1], sim.goals[i, 2]
         free = math.isnan(goal_heading)
-        time_left = tasks[i, HORIZON] - state[i, TIME]
-        if goal_conditioned:
-            row[0], row[1], row[2], row[3] = x, y, cos, sin
-            row[4], row[5] = goal_x, goal_y
-            row[6] = 0.0 if free else math.cos(goal_heading)
-            row[7] = 0.0 if free else math.sin(goal_heading)
-            at = 2 * POSE_ENTRIES
-            if not free_horizon:
-                row[at] = time_left
-                at += 1
-        else:
-            dx, dy = goal_x - x, goal_y - y
+        time_left = episode.horizon - episode.time
+        if at.achieved_goal >= 0:
+            pose, goal = row[at.achieved_goal :], row[at.desired_goal :]
+            pose[0], pose[1], pose[2], pose[3] = x, y, cos, sin
+            goal[0], goal[1] = goal_x, goal_y
+            goal[2] = 0.0 if free else math.cos(goal_heading)
+            goal[3] = 0.0 if free else math.sin(goal_heading)
+        if at.time >= 0:
+            row[at.time] = time_left
+        if at.goal >= 0:
+            goal, dx, dy = row[at.goal :], goal_x - x, goal_y - y
             ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-            turn = 0.0 if free else (goal_heading - heading + math.pi) % (2 * math.pi) - math.pi
-            row[0], row[1] = ahead, left
-            row[2] = 0.0 if free else math.cos(turn)
-            row[3] = 0.0 if free else math.sin(turn)
-            at = FREE_GOAL_ENTRIES
-            if not free_horizon:
-                time = max(time_left, settings[PERIOD])
-                row[4] = time_left
-                row[5], row[6] = ahead / time, left / time
-                row[7] = math.sqrt(dx * dx + dy * dy) / time
-                row[8] = turn / time
-                at = GOAL_ENTRIES
-        if motors:
-            row[at] = cos * state[i, VX] + sin * state[i, VY]
-            row[at + 1] = cos * state[i, VY] - sin * state[i, VX]
-            row[at + 2] = state[i, SPIN]
-            at += MOTION_ENTRIES
+            turn = 0.0 if free else wrapped(goal_heading - heading)
+            goal[0], goal[1] = ahead, left
+            goal[2] = 0.0 if free else math.cos(turn)
+            goal[3] = 0.0 if free else math.sin(turn)
+            if not settings.free_horizon:
+                time = max(time_left, settings.control_period)
+                goal[TIME_LEFT] = time_left
+                goal[TIME_LEFT + 1], goal[TIME_LEFT + 2] = ahead / time, left / time
+                goal[TIME_LEFT + 3] = math.sqrt(dx * dx + dy * dy) / time
+                goal[TIME_LEFT + 4] = turn / time
+        if settings.motors:
+            row[at.motion] = cos * episode.vx + sin * episode.vy
+            row[at.motion + 1] = cos * episode.vy - sin * episode.vx
+            row[at.motion + 2] = episode.spin
         for k in range(len(buffers.is_heading)):
-            value = sim.robots[i, k]
-            if buffers.is_heading[k]:
-                value = (value - heading + math.pi) % (2 * math.pi) - math.pi
-            row[at] = value
-            at += 1
-        if has_lidar and count > 0:
-            for k in range(count):
-                row[at + k] = scratch[2, k]
-            if deviation != 0.0:
-                for k in range(count):
-                    row[at + k] += deviation * noise[i, sim.noise_rows[i], sensing + 3 + k]
-            at += count
-        if has_geodesics:
-            geodesic_detours(
-                x,
-                y,
-                heading,
-                sim.maps[i],
-                header_of(field_of(sim.fields, i)).radius,
-                beams,
-                scratch[2],
-                buffers.detours,
-            )
-            for k in range(count):
-                row[at + k] = buffers.detours[k]
-            row[at + count] = geodesic_distance(x, y, sim.maps[i])
-        elif has_map:
-            obstacles, vertices = int(settings[OBSTACLES]), int(settings[VERTICES])
-            map_surroundings(x, y, cos, sin, field_of(sim.fields, i), obstacles, vertices, surroundings)
-            for k in range(len(surroundings)):
-                row[at + k] = surroundings[k]
+            row[at.motion + k] = wrapped(state[3 + k] - heading) if buffers.is_heading[k] else state[3 + k]
+        if at.lidar >= 0:
+            for k in range(n_beams):
+                row[at.lidar + k] = scratch[2, k]
+                if deviation != 0.0:
+                    row[at.lidar + k] += deviation * noise[sensing + 3 + k]
+        if at.distance >= 0:
+            detours, radius = buffers.detours, header_of(field).radius
+            geodesic_detours(x, y, heading, sim.maps[i], radius, beams, scratch[2], detours)
+            for k in range(n_beams):
+                row[at.detours + k] = detours[k]
+            row[at.distance] = geodesic_distance(x, y, sim.maps[i])
+        if at.walls >= 0:
+            surroundings = row[at.walls :]
+            map_surroundings(x, y, cos, sin, field, settings.map_obstacles, settings.map_vertices, surroundings)
         for k in range(len(row)):
             value = np.float32(row[k])
             value = bounds[0, k] if value < bounds[0, k] else value

@@ -9,7 +9,6 @@ import numpy as np
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.simulator import BatchSimulator
-from leapnav.envs.simulation.state import TIME
 
 BATCH = 512  # states observed together
 
@@ -41,9 +40,8 @@ class Observer:
             part = slice(first, min(first + BATCH, count))
             robots = np.arange(part.stop - first)
             simulator.reset(robots, scenarios[part])
-            simulator.poses[robots] = states[part, :3]
-            simulator.motion[robots] = states[part, 3:]
-            simulator.state[robots, TIME] = times[part]
+            simulator.states[robots] = states[part]
+            simulator.episodes["time"][robots] = times[part]
             simulator.observe(rows, robots)
             observations[part] = rows[robots]
         return observations

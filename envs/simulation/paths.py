@@ -1,7 +1,7 @@
-"""Paths of any robot during a control period (kernels): first contact, clearance, proximity and state cost.
+"""The path of a robot during a control period (kernels): first contact, clearance, proximity and state cost.
 
-The path is that of the model's `advance` with held controls. `leapnav.envs.simulation.arcs` is the same for circular
-arcs of a disc, for which the distances are known in closed form.
+The path is that of the model's `advance` with held controls. The kernels are inlined: a call would pass the 60 words of
+a `Path`, and a period would take 1.5 of the time.
 """
 
 from __future__ import annotations
@@ -10,34 +10,33 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, types
+from numba import float64, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer, function_at
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
 from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import header_of
 from leapnav.envs.shapes.proximity import proximity_values
-from leapnav.envs.simulation.arcs import (
-    CLEARANCE_TOLERANCE,
-    CONTACT_TOLERANCE,
-    MAX_PANELS,
-    PANEL_LENGTH,
-    PANEL_TOLERANCE,
-    RELATIVE_CLEARANCE_TOLERANCE,
-    ROUNDED_UP,
-)
 
 ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
-# Fractions of the period at which a path is sampled: the nodes of Gauss's three-point rule, and the end.
-NODES = 3
-SAMPLED_FRACTIONS = np.array([0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6), 1.0])
-# The bound of the speed exceeds the largest mean speed between two samples by these fractions of itself, for the
-# curvature of the path, and of the spread of the mean speeds, for accelerations.
-CURVATURE_MARGIN, ACCELERATION_MARGIN = 0.01, 0.25
+NODES = 0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6)  # of Gauss's rule with three points on [0, 1]
+NODE_WEIGHTS = 5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0
+# The largest speed along a path is that at its start or its end, measured over this fraction of the path ...
+SHORT = 1e-3
+# ... and, for a maximum between them, this fraction of the difference of both is added.
+SPEED_MARGIN = 0.25
+PANEL_LENGTH, MAX_PANELS = 1.5, 1000  # length (proximity scales) and number of the panels of an integral of Phi
+# Near an obstacle, the integrals over both halves of a panel may differ from that over the whole by this relative
+# difference; the error of their sum is 1/10 of it or less.
+PANEL_TOLERANCE = 1e-4
+ROUNDED_UP = 1e-12  # of a sum of widths of panels
+CLEARANCE_TOLERANCE = 1e-3  # m, absolute ...
+RELATIVE_CLEARANCE_TOLERANCE = 0.02  # ... and relative error of the smallest clearance along a path
+CONTACT_TOLERANCE = 1e-5  # m: a path is cut at a clearance below this
 
 
 class RobotMotion(NamedTuple):
@@ -54,9 +53,16 @@ class RobotMotion(NamedTuple):
 
 
 MOTION = record_type(RobotMotion, advance=ADVANCE_FUNCTION, state_cost=STATE_COST_FUNCTION)
+ADDRESSES = types.UniTuple(int64, 2)  # of both kernels: Numba takes 4 us to receive a function from Python
 
 
-class HeldPath(NamedTuple):
+@kernel(MOTION(ADDRESSES), inline="always")
+def motion_at(addresses):
+    """Return the motion with the kernels at two addresses."""
+    return RobotMotion(function_at(addresses[0], ADVANCE_FUNCTION), function_at(addresses[1], STATE_COST_FUNCTION))
+
+
+class Path(NamedTuple):
     """The path of a robot with held controls.
 
     Attributes:
@@ -65,6 +71,9 @@ class HeldPath(NamedTuple):
         u (m,): held controls.
         parameters: parameters of the model.
         discs (D, 2): footprint.
+        field: packed obstacle field.
+        duration: s.
+        samples (5, n): working memory: the states at the nodes of a panel, and two other states.
 
     """
 
@@ -73,9 +82,22 @@ class HeldPath(NamedTuple):
     u: np.ndarray
     parameters: np.ndarray
     discs: np.ndarray
+    field: np.ndarray
+    duration: float
+    samples: np.ndarray
 
 
-HELD_PATH = record_type(HeldPath, motion=MOTION, q=VECTOR, u=VECTOR, parameters=VECTOR, discs=MATRIX)
+PATH = record_type(
+    Path,
+    motion=MOTION,
+    q=VECTOR,
+    u=VECTOR,
+    parameters=VECTOR,
+    discs=MATRIX,
+    field=CONSTANT,
+    duration=float64,
+    samples=MATRIX,
+)
 
 
 @kernel(STATE_COST_SIGNATURE)
@@ -84,55 +106,70 @@ def no_state_cost(q, parameters):
     return 0.0
 
 
-@kernel(NOTHING(HELD_PATH, float64, VECTOR))
-def state_after(path, duration, new):
-    """Overwrite new (n,) by the state of the path after a duration (s)."""
-    path.motion.advance(path.q, path.u, duration, path.parameters, new)
+@kernel(ADVANCE_SIGNATURE)
+def coast(q, u, h, parameters, new):
+    """Write the pose after a time with a constant velocity u = (vx, vy, spin)."""
+    new[0], new[1], new[2] = q[0] + u[0] * h, q[1] + u[1] * h, q[2] + u[2] * h
 
 
-@kernel(float64(HELD_PATH, float64, MATRIX))
-def sample_path(path, duration, samples):
-    """Fill the states (4, n) at the sampled fractions; return a bound of the distance (m) that a disc travels."""
-    q, discs, arm = path.q, path.discs, 0.0
-    for k in range(len(discs)):
-        arm = max(arm, abs(discs[k, 0]))
-    x, y, heading, before, smallest, largest = q[0], q[1], q[2], 0.0, np.inf, 0.0
-    for k in range(len(SAMPLED_FRACTIONS)):
-        fraction, new = SAMPLED_FRACTIONS[k], samples[k]
-        state_after(path, duration * fraction, new)
-        travelled = math.sqrt((new[0] - x) ** 2 + (new[1] - y) ** 2) + arm * abs(new[2] - heading)
-        mean = travelled / (fraction - before)
-        smallest, largest = min(smallest, mean), max(largest, mean)
-        x, y, heading, before = new[0], new[1], new[2], fraction
-    return (1.0 + CURVATURE_MARGIN) * largest + ACCELERATION_MARGIN * (largest - smallest)
+@kernel(NOTHING(PATH, float64, VECTOR), inline="always")
+def state_after(path, fraction, new):
+    """Write the state at a fraction of the path to new (n,)."""
+    path.motion.advance(path.q, path.u, path.duration * fraction, path.parameters, new)
 
 
-@kernel(types.UniTuple(float64, 3)(HELD_PATH, float64, CONSTANT, float64, float64, VECTOR))
-def follow_path(path, duration, field, before, total, new):
+@kernel(float64(PATH, VECTOR), inline="always")
+def clearance_at(path, q):
+    """Return the clearance (m) at a state of the path."""
+    return footprint_clearance(q[0], q[1], q[2], path.discs, path.field)[0]
+
+
+@kernel(float64(PATH, VECTOR), inline="always")
+def _speed_after(path, q):
+    """Return the largest speed (m/s) of the robot's position and discs at a state of the path."""
+    new, time = path.samples[4], SHORT * path.duration
+    path.motion.advance(q, path.u, time, path.parameters, new)
+    speed = math.sqrt((new[0] - q[0]) ** 2 + (new[1] - q[1]) ** 2) / time
+    turn_rate, arm = abs(new[2] - q[2]) / time, 0.0
+    for k in range(len(path.discs)):
+        arm = max(arm, abs(path.discs[k, 0]))
+    return speed + arm * turn_rate
+
+
+@kernel(float64(PATH, VECTOR), inline="always")
+def largest_distance(path, end):
+    """Return a bound of the distance (m) that a disc travels along the path to the state `end`."""
+    first, last = _speed_after(path, path.q), _speed_after(path, end)
+    return path.duration * (max(first, last) + SPEED_MARGIN * abs(first - last))
+
+
+@kernel(types.UniTuple(float64, 3)(PATH, float64, float64, VECTOR), inline="always")
+def follow_path(path, before, total, new):
     """Find the smallest clearance along a path, and the first contact.
 
     Args:
-        path: the robot's path.
-        duration: duration of the period (s), positive.
-        field: packed obstacle field.
+        path: the path, of a positive duration.
         before: clearance (m) at the start.
-        total: bound of the distance (m) that a disc of the footprint travels.
+        total: see `largest_distance`.
         new: the state at the end of the period; overwritten by that at the end of the path.
 
     Returns:
-        The smallest clearance (m), the fraction of the period before the first contact, and the clearance (m) at the
-        end, with the errors of `leapnav.envs.simulation.arcs.follow_arc`.
+        The smallest clearance (m), with an error of at most 1 mm or 2 %, whichever is larger; the fraction of the
+        duration before the first contact; and the clearance (m) at the end. Without contact the fraction is 1. With
+        contact, the smallest clearance is not positive, and the end is at this fraction, with a clearance of 0 to
+        0.01 mm.
 
     """
-    discs = path.discs
     if before <= 0.0:
         for i in range(len(new)):
             new[i] = path.q[i]
         return before, 0.0, before
-    # Clearance is Lipschitz continuous with constant 1 in the distance travelled, which is at most `total`.
+    # Along the path, clearance is Lipschitz continuous with constant 1 in the distance, so the values c0 and c1 at the
+    # distances s0 and s1 bound the values between.
+    state = path.samples[3]
     s0, c0 = 0.0, before
-    s1, c1 = total, footprint_clearance(new[0], new[1], new[2], discs, field)[0]
-    c_end, is_end = c1, True
+    s1, c1 = total, clearance_at(path, new)
+    c_end = c1
     lowest = min(before, c1)
     while s0 < total and lowest > 0.0:
         if (c0 + c1 - (s1 - s0)) / 2 >= lowest - max(CLEARANCE_TOLERANCE, RELATIVE_CLEARANCE_TOLERANCE * lowest):
@@ -140,105 +177,116 @@ def follow_path(path, duration, field, before, total, new):
             s1, c1 = total, c_end
         else:
             s1 = (s0 + s1) / 2
-            is_end = False
-            state_after(path, duration * s1 / total, new)
-            c1 = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+            state_after(path, s1 / total, state)
+            c1 = clearance_at(path, state)
             lowest = min(lowest, c1)
     if lowest > 0.0:
-        if not is_end:
-            state_after(path, duration, new)
         return lowest, 1.0, c_end
-    # As for arcs: steps of at most the clearance, then bisection.
+    # From a free point, the first contact is at least as far away as the clearance. Steps are slightly shorter, so that
+    # rounding cannot move the point across an obstacle.
     for _ in range(200):
         s = min(s0 + 0.999 * c0, total)
-        state_after(path, duration * s / total, new)
-        following = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+        state_after(path, s / total, state)
+        following = clearance_at(path, state)
         if following <= 0.0:
             break
         s0, c0 = s, following
         if c0 < CONTACT_TOLERANCE or s0 >= total:
             break
+    # Where the path is almost parallel to an outline, these steps converge slowly; bisection finds the rest.
     while c0 >= CONTACT_TOLERANCE and s1 - s0 > 1e-12 * total:
         middle = (s0 + s1) / 2
-        state_after(path, duration * middle / total, new)
-        following = footprint_clearance(new[0], new[1], new[2], discs, field)[0]
+        state_after(path, middle / total, state)
+        following = clearance_at(path, state)
         if following <= 0.0:
             s1 = middle
         else:
             s0, c0 = middle, following
     fraction = min(s0 / total, 1.0 - 1e-15)
-    state_after(path, duration * fraction, new)
+    state_after(path, fraction, new)
     return min(lowest, 0.0), fraction, c0
 
 
-@kernel(types.UniTuple(float64, 2)(HELD_PATH, float64, float64, float64, CONSTANT, MATRIX, MATRIX))
-def _panel_costs(path, duration, start, width, field, samples, poses):
-    """Return the integrals of the proximity cost and of the state cost over a panel of a path (Gauss rule).
+@kernel(types.UniTuple(float64, 2)(PATH, float64, float64), inline="always")
+def _panel_costs(path, start, width):
+    """Return the integrals of the proximity cost and of the state cost over a panel of a path (Gauss's rule).
 
-    The panel is from a fraction `start` to `start` + `width`. `samples` and `poses` are overwritten; for the panel of
-    width 1, `samples` are the states at its nodes.
+    The panel is from a fraction `start` to `start` + `width`.
     """
-    discs, proximity, state_cost = path.discs, 0.0, 0.0
-    has_arms = len(discs) > 1 or discs[0, 0] != 0.0
-    for k in range(NODES):
-        state = samples[k]
-        if width < 1.0:
-            state_after(path, duration * (start + SAMPLED_FRACTIONS[k] * width), state)
-        state_cost += (8.0 if k == 1 else 5.0) * path.motion.state_cost(state, path.parameters)
-        poses[k, 0], poses[k, 1] = state[0], state[1]
-        if has_arms:
-            poses[k, 2], poses[k, 3] = math.cos(state[2]), math.sin(state[2])
+    samples, discs, proximity, state_cost = path.samples, path.discs, 0.0, 0.0
+    for k in range(3):
+        state_after(path, start + NODES[k] * width, samples[k])
+        state_cost += NODE_WEIGHTS[k] * path.motion.state_cost(samples[k], path.parameters)
+    first, second, third = samples[0], samples[1], samples[2]
     for d in range(len(discs)):
         a, radius = discs[d, 0], discs[d, 1]
         if radius <= 0.0:
             continue
-        first, second, third = proximity_values(
-            poses[0, 0] + a * poses[0, 2],
-            poses[0, 1] + a * poses[0, 3],
-            poses[1, 0] + a * poses[1, 2],
-            poses[1, 1] + a * poses[1, 3],
-            poses[2, 0] + a * poses[2, 2],
-            poses[2, 1] + a * poses[2, 3],
-            radius,
-            field,
-        )
-        proximity += 5.0 * first + 8.0 * second + 5.0 * third
-    return proximity / 18.0 * width, state_cost / 18.0 * width
+        x0, y0, x1, y1, x2, y2 = first[0], first[1], second[0], second[1], third[0], third[1]
+        if a != 0.0:
+            x0, y0 = x0 + a * math.cos(first[2]), y0 + a * math.sin(first[2])
+            x1, y1 = x1 + a * math.cos(second[2]), y1 + a * math.sin(second[2])
+            x2, y2 = x2 + a * math.cos(third[2]), y2 + a * math.sin(third[2])
+        phi = proximity_values(x0, y0, x1, y1, x2, y2, radius, path.field)
+        proximity += NODE_WEIGHTS[0] * phi[0] + NODE_WEIGHTS[1] * phi[1] + NODE_WEIGHTS[2] * phi[2]
+    return proximity * width, state_cost * width
 
 
-@kernel(types.UniTuple(float64, 2)(HELD_PATH, float64, CONSTANT, float64, float64, MATRIX, MATRIX))
-def path_costs(path, duration, field, total, lowest, samples, poses):
-    """Return the means of the proximity cost and of the state cost over a path, with the panels of `arc_proximity`.
+@kernel(types.UniTuple(float64, 2)(PATH, float64, float64), inline="always")
+def path_costs(path, total, lowest):
+    """Return the means of the proximity cost and of the state cost over a path.
+
+    They are computed by three-point Gauss rules over panels of at most PANEL_LENGTH. If an obstacle is nearer than the
+    length of a panel, panels are halved until the halves agree with the whole. Measured on 1,500 random arcs of 1 to 15
+    cm that begin 0.1 mm to 0.3 m from an obstacle, the relative error is at most 1e-4 (median 1e-6); on arcs that end
+    in a collision it exceeded 1e-4 once in 550 arcs (1e-3).
 
     Args:
-        path, duration, field, total: see `follow_path`.
+        path: the path.
+        total: see `largest_distance`.
         lowest: smallest clearance (m) along the path.
-        samples (4, n): from `sample_path`; overwritten.
-        poses (3, 4): overwritten.
 
     """
-    panels = min(max(math.ceil(total / (PANEL_LENGTH * header_of(field).scale)), 1.0), MAX_PANELS)
+    scale = header_of(path.field).scale
+    panels = min(max(math.ceil(total / (PANEL_LENGTH * scale)), 1.0), MAX_PANELS)
     largest, proximity, state_cost = 1.0 / panels, 0.0, 0.0
-    poses[:, 2:] = 0.0
-    if lowest >= largest * total:
-        for k in range(int(panels)):
-            phi, cost = _panel_costs(path, duration, k * largest, largest, field, samples, poses)
-            proximity, state_cost = proximity + phi, state_cost + cost
-        return proximity, state_cost
-    shortest = CONTACT * header_of(field).scale / total
+    is_near, shortest = lowest < largest * total, CONTACT * scale / max(total, CONTACT * scale)
     start, width = 0.0, largest
-    whole, _ = _panel_costs(path, duration, start, width, field, samples, poses)
-    while True:
-        half = 0.5 * width
-        first, cost = _panel_costs(path, duration, start, half, field, samples, poses)
-        second, further = _panel_costs(path, duration, start + half, half, field, samples, poses)
-        both = first + second
-        if abs(both - whole) > PANEL_TOLERANCE * both and width > shortest:
+    while start < 1.0 - ROUNDED_UP:
+        whole, cost = _panel_costs(path, start, width)
+        while is_near:
+            half = 0.5 * width
+            first, cost = _panel_costs(path, start, half)
+            second, further = _panel_costs(path, start + half, half)
+            change = abs(first + second - whole)
+            if change <= PANEL_TOLERANCE * (first + second) or width <= shortest:
+                whole, cost = first + second, cost + further
+                break
             width, whole = half, first
-            continue
-        proximity, state_cost = proximity + both, state_cost + cost + further
-        start += width
-        if start >= 1.0 - ROUNDED_UP:
-            return proximity, state_cost
+        proximity, state_cost, start = proximity + whole, state_cost + cost, start + width
         width = min(2.0 * width, largest, 1.0 - start)
-        whole, _ = _panel_costs(path, duration, start, width, field, samples, poses)
+    return proximity, state_cost
+
+
+@kernel(types.UniTuple(float64, 5)(PATH, float64, VECTOR), inline="always")
+def drive_path(path, before, new):
+    """Follow a path up to the first contact.
+
+    Args:
+        path: the path, of a positive duration.
+        before: clearance (m) at the start.
+        new (n,): overwritten by the state at the end.
+
+    Returns:
+        See `follow_path`; then the integrals of the proximity cost and of the state cost.
+
+    """
+    state_after(path, 1.0, new)
+    total = largest_distance(path, new)
+    lowest, fraction, after = follow_path(path, before, total, new)
+    if fraction == 0.0:
+        return lowest, fraction, after, 0.0, 0.0
+    driven = path.duration * fraction
+    part = Path(path.motion, path.q, path.u, path.parameters, path.discs, path.field, driven, path.samples)
+    proximity, state_cost = path_costs(part, total * fraction, lowest)
+    return lowest, fraction, after, proximity * driven, state_cost * driven

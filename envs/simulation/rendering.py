@@ -14,7 +14,6 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.shapes import Circle
-from leapnav.envs.simulation import state as columns
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.utils.colors import EDGE, FAILURE, GOAL, OBSTACLE, OPTIMUM, POLICY, WALL
 
@@ -66,18 +65,18 @@ def make_scene(
     optimum, reference_cost = None, None
     if bank is not None and isinstance(choice, int):
         optimum, reference_cost = bank.states(choice), float(bank.costs[choice])
-    row = simulator.state[robot]
+    episode = simulator.episode(robot)
     return Scene(
         scenario=get_scenario(choice, bank),
-        pose=tuple(simulator.poses[robot].tolist()),
+        pose=tuple(simulator.states[robot, :3].tolist()),
         trail=trail,
         optimum=optimum,
         ranges=simulator.ranges(robot).tolist(),
         lidar_range=simulator.settings.lidar_range,
-        cost=float(row[columns.COST]),
+        cost=episode.cost,
         reference_cost=reference_cost,
-        time=float(row[columns.TIME]),
-        collided=bool(row[columns.COLLIDED]),
+        time=episode.time,
+        collided=episode.collided,
     )
 
 

@@ -11,34 +11,23 @@ import numpy as np
 from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
 from leapnav.envs.kernels.internals import FunctionPointer
-from leapnav.envs.robots.base import ARCS, GENERAL
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.scenario import GOAL, LIMITS, Scenario
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.shapes.clearance import clearances, footprint_clearance, footprint_clearances
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.envs.simulation import stepping
-from leapnav.envs.simulation.bodies import ContactWorld, FreeBodies, resolve_overlap
+from leapnav.envs.simulation.bodies import ContactWorld, MotorBodies, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
-from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, RobotMotion, no_state_cost
+from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, coast, no_state_cost
 from leapnav.envs.simulation.sensing import check_map
 from leapnav.envs.simulation.state import (
-    CLEARANCE,
-    COLUMNS,
-    EFFORT,
-    LAST_STEP,
+    EPISODE,
     N_GUIDE_POINTS,
-    POSE_CLEARANCE,
-    PROXIMITY,
-    REMAINING,
-    SPEED,
-    SPIN,
-    STEPS,
-    TURN_RATE,
-    VX,
+    Episode,
     SharedFields,
-    SimulationState,
+    Simulation,
     guide_points,
 )
 from leapnav.envs.utils.validation import in_words
@@ -58,10 +47,8 @@ class BatchSimulator:
     Attributes:
         settings: settings of the environment.
         layout: observation space, and the parts of an observation.
-        poses (count, 3): x, y (m) and heading (rad, unwrapped).
-        motion (count, n - 3): further states of the robots.
-        state (count, COLUMNS): see `leapnav.envs.simulation.state`.
-        tasks (count, K): see `leapnav.envs.scenarios.scenario`.
+        episodes (count,): records of `leapnav.envs.simulation.state.Episode`.
+        states (count, n): states of the robots.
         fields: the packed obstacle fields.
 
     """
@@ -70,63 +57,54 @@ class BatchSimulator:
         prepare(*_kernels(settings))
         self.settings = settings
         self.layout = ObservationLayout(settings)
-        self.state = np.zeros((count, COLUMNS))
         n, m = settings.model.sizes()
-        self._n_motion, self._n_controls = n - 3, m
-        self._robots = np.zeros((count, n - 3 + m + 3 + 2))
-        self.tasks = np.zeros((count, LIMITS + 2 * m + 2 * (n - 3)))
-        self._drive, self._drives_paths = settings.model.drive, settings.model.drive == GENERAL
-        self._pointers: tuple[FunctionPointer, FunctionPointer] | None = None
+        self.episodes, self.states = np.zeros(count, EPISODE), np.zeros((count, n))
         self.fields = SharedFields(count)
-        self._packed = settings.packed()
-        self._record: tuple[np.ndarray, ...] | None = None
-        self._free_horizon = settings.free_horizon
-        self._disturbed, self._motors = settings.disturbed, settings.motors
-        self._maps, self._geodesic = settings.observation == "map", settings.observation == "geodesic"
-        self._geodesic_maps = np.zeros((count, 0), np.float32)
-        self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
-        self._guides = np.zeros((count, N_GUIDE_POINTS, 3))
-        motor = settings.motor
-        self._free = FreeBodies(count, motor.mass, motor.moment, forces=settings.motors)
-        self._contacts: dict[int, ContactWorld] = {}
+        self._geodesic = settings.observation == "geodesic"
         width = 2 * m + 3 + settings.lidar_beams if settings.disturbed else 0
         self._noise = np.zeros((count, NOISE_ROWS if settings.disturbed else 1, width))
-        self._noise_rows = np.zeros(count, dtype=np.int64)
         self._generators: list[np.random.Generator | None] = [None] * count
+        self._simulation = Simulation(
+            episodes=self.episodes,
+            states=self.states,
+            controls=np.zeros((count, m)),
+            goals=np.zeros((count, n)),
+            limits=np.zeros((count, m)),
+            weights=np.zeros((count, m)),
+            parameters=np.zeros((count, 0)),
+            discs=np.zeros((count, 1, 2)),
+            fields=self.fields.places,
+            guides=np.zeros((count, N_GUIDE_POINTS, 3)),
+            noise=self._noise,
+            maps=np.zeros((count, 0), np.float32),
+            settings=settings.packed(),
+        )
+        self._connect()
+        self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
+        self._bodies = MotorBodies(count, settings.motor) if settings.motors else None
+        self._contacts: dict[int, ContactWorld] = {}
         self._all_active, self._all_robots = np.ones(count, dtype=bool), np.arange(count)
 
-    @property
-    def poses(self) -> np.ndarray:  # noqa: D102 (documented as an attribute of the class)
-        return self._free.rows[:, :3]
+    def _connect(self) -> None:
+        """Prepare the arguments of the kernels."""
+        # A plain tuple, which Numba receives in less time than a named one.
+        self._packed: tuple[np.ndarray, ...] = tuple(self._simulation)
+        model = self.settings.model
+        advance, cost = (coast, None) if self.settings.motors else (model.advance, model.state_cost)
+        self._pointers = (
+            FunctionPointer(advance, ADVANCE_FUNCTION),
+            FunctionPointer(cost or no_state_cost, STATE_COST_FUNCTION),
+        )
+        self._addresses = tuple(pointer.address for pointer in self._pointers)
 
-    @property
-    def motion(self) -> np.ndarray:  # noqa: D102 (documented as an attribute of the class)
-        return self._robots[:, : self._n_motion]
+    def _replace(self, **arrays: np.ndarray) -> None:
+        """Replace arrays of the simulation."""
+        self._simulation = self._simulation._replace(**arrays)
+        self._packed = tuple(self._simulation)
 
-    @property
-    def _first_disc(self) -> int:
-        """Column of the first disc in the array of the robots."""
-        return self._n_motion + self._n_controls + 3
-
-    @property
-    def _arrays(self) -> tuple[np.ndarray, ...]:
-        """The episodes as the record that the kernels take."""
-        if self._record is None:
-            self._record = tuple(
-                SimulationState(
-                    bodies=self._free.rows,
-                    robots=self._robots,
-                    state=self.state,
-                    tasks=self.tasks,
-                    fields=self.fields.places,
-                    guides=self._guides,
-                    noise=self._noise,
-                    noise_rows=self._noise_rows,
-                    maps=self._geodesic_maps,
-                    settings=self._packed,
-                )
-            )
-        return self._record
+    def episode(self, i: int) -> Episode:
+        """Return the episode of a robot."""
+        return Episode._make(self.episodes[i].item())
 
     def reset(
         self,
@@ -152,34 +130,29 @@ class BatchSimulator:
         for scenario in scenarios:
             self._check_scenario(scenario)
         references = [self._reference(choice, bank) for choice in choices]
-        self._make_room(max(len(one.task) for one in scenarios), max(_required_discs(one.discs) for one in scenarios))
-        m, first = self._n_controls, self._first_disc
+        self._make_room(scenarios)
+        sim = self._simulation
+        self.episodes[indices] = np.zeros((), EPISODE)
         for i, scenario, reference in zip(indices.tolist(), scenarios, references, strict=True):
             self.fields[i], task, discs = scenario.field, scenario.task, scenario.discs
-            self.tasks[i, : len(task)] = task
-            row = self._robots[i]
-            row[first:] = 0.0
-            row[first : first + discs.size] = discs.ravel()
-            if self._free_horizon:
-                row[first - 1] = task[-1]
-            if self.settings.reward == "shaped":
-                if self._drive == ARCS:
-                    row[first - 3 : first - 1] = task[LIMITS + m : LIMITS + 2 * m]
-                else:
-                    row[first - 3 : first - 1] = scenario.robot.metric(scenario.cost)
-                self._guides[i] = guide_points(task[GOAL : GOAL + 2], reference)
+            self.states[i], sim.goals[i], sim.limits[i], sim.weights[i], sim.parameters[i] = task
+            sim.discs[i], sim.discs[i, : len(discs)] = 0.0, discs
+            self.episodes["horizon"][i] = scenario.episode_limit
+            self.episodes["time_weight"][i] = scenario.cost.time_weight
+            if self.settings.shaped:
+                self.episodes[["speed_weight", "turn_weight"]][i] = scenario.robot.metric(scenario.cost)
+                sim.guides[i] = guide_points(task.goal[:2], reference)
             self._contacts.pop(i, None)
         if self._geodesic:
-            self._store_maps(indices, [scenario.field for scenario in scenarios])
-        stepping.start_episodes(indices, self._arrays)
-        if self._disturbed:
-            for i, generator in zip(indices.tolist(), generators, strict=True):
-                self._generators[i] = generator
-                self._draw_noise(i)
+            self._store_maps(indices)
+        stepping.start_episodes(indices, self._packed)
+        for i, generator in zip(indices.tolist(), generators, strict=False):
+            self._generators[i] = generator
+            self._draw_noise(i)
 
     def _reference(self, choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray | None:
         """Return the path (N, n) of the optimum that guides the shaped reward; None without such a reward or path."""
-        if self.settings.reward != "shaped" or isinstance(choice, Scenario) or bank is None:
+        if not self.settings.shaped or isinstance(choice, Scenario) or bank is None:
             return None
         return bank.states(choice)
 
@@ -202,18 +175,18 @@ class BatchSimulator:
                 f"{scenario.name!r} is {scenario.horizon_kind}; make the environment with "
                 f"horizon={scenario.horizon_kind!r}"
             )
-        if self._maps:
+        if self.settings.observation == "map":
             check_map(scenario.field, self.settings.map_vertices)
 
-    def _make_room(self, n_columns: int, n_discs: int) -> None:
-        """Enlarge the arrays of tasks and footprints."""
-        if n_columns > self.tasks.shape[1]:
-            self.tasks = np.pad(self.tasks, ((0, 0), (0, n_columns - self.tasks.shape[1])))
-            self._record = None
-        missing = self._first_disc + 2 * n_discs - self._robots.shape[1]
-        if missing > 0:
-            self._robots, self._record = np.pad(self._robots, ((0, 0), (0, missing))), None
-            self._drives_paths = True
+    def _make_room(self, scenarios: Sequence[Scenario]) -> None:
+        """Enlarge the arrays of footprints and parameters."""
+        sim = self._simulation
+        n_discs = max(len(scenario.discs) for scenario in scenarios) - sim.discs.shape[1]
+        if n_discs > 0:
+            self._replace(discs=np.pad(sim.discs, ((0, 0), (0, n_discs), (0, 0))))
+        n_parameters = len(scenarios[0].task.parameters)
+        if n_parameters != sim.parameters.shape[1]:
+            self._replace(parameters=np.zeros((len(self.states), n_parameters)))
 
     def check(self, choice: Scenario | int | None, bank: ScenarioBank | None) -> None:
         """Check that a scenario fits the observation.
@@ -229,17 +202,17 @@ class BatchSimulator:
         if choice is not None:
             self._check_scenario(get_scenario(choice, bank))
         elif bank is not None:
-            for scenario in bank if self._maps else bank[:1]:
+            for scenario in bank if self.settings.observation == "map" else bank[:1]:
                 self._check_scenario(scenario)
 
-    def _store_maps(self, robots: np.ndarray, fields: Sequence[np.ndarray]) -> None:
-        """Store the geodesic maps of robots whose tasks are stored, with given obstacle fields."""
-        maps = [geodesic_map(f, *self.tasks[i, GOAL : GOAL + 2].tolist()) for i, f in zip(robots, fields, strict=True)]
-        missing = max(map(len, maps)) - self._geodesic_maps.shape[1]
+    def _store_maps(self, robots: np.ndarray) -> None:
+        """Store the geodesic maps of robots."""
+        maps = [geodesic_map(self.fields[i], *self._simulation.goals[i, :2].tolist()) for i in robots.tolist()]
+        missing = max(map(len, maps)) - self._simulation.maps.shape[1]
         if missing > 0:
-            self._geodesic_maps, self._record = np.pad(self._geodesic_maps, ((0, 0), (0, missing))), None
+            self._replace(maps=np.pad(self._simulation.maps, ((0, 0), (0, missing))))
         for i, packed in zip(robots.tolist(), maps, strict=True):
-            self._geodesic_maps[i, : len(packed)] = packed
+            self._simulation.maps[i, : len(packed)] = packed
 
     def _draw_noise(self, i: int) -> None:
         generator = self._generators[i]
@@ -258,161 +231,122 @@ class BatchSimulator:
 
         """
         active = self._all_active if active is None else active
-        state, arrays = self.state, self._arrays
-        if self._disturbed:
-            self._noise_rows[:] = state[:, STEPS] % NOISE_ROWS
-        start = stepping.command if self._motors or self._drive == GENERAL else stepping.drive_arcs
-        invalid = start(actions, active, arrays)
+        if self._bodies is None:
+            invalid = stepping.drive(actions, active, self._packed, self._addresses)
+        else:
+            invalid = stepping.command(actions, active, self._packed)
         if invalid >= 0:
-            robot = "" if len(state) == 1 else f" for robot {invalid}"
+            robot = "" if len(self.states) == 1 else f" for robot {invalid}"
             expected = in_words(actions.shape[1])
             raise ValueError(f"action: expected {expected} finite numbers, got {actions[invalid].tolist()}{robot}")
-        if self._motors:
-            bodies, substeps = self._free.rows, self._substeps
-            for substep in range(substeps):
-                stepping.drive_motors(bodies, state, self.tasks, self.fields.places, self._packed, substep, substeps)
-                self._free.advance()
-            stepping.read_velocities(bodies, state, substeps)
-        else:
-            if self._drives_paths:
-                stepping.drive_paths(arrays, self._robot_motion)
-            self._free.advance()
+        if self._bodies is not None:
+            for substep in range(self._substeps + 1):
+                stepping.push_bodies(self._bodies.rows, self._packed, self._addresses, substep, self._substeps)
+                if substep < self._substeps:
+                    self._bodies.advance()
         if not self.settings.terminate_on_collision:
-            for i in np.flatnonzero(state[:, REMAINING] > 0).tolist():
+            for i in np.flatnonzero(self.episodes["remaining"] > 0).tolist():
                 self._drive_in_contact(i)
-        stepping.end_periods(active, arrays)
-        if self._disturbed:
+        stepping.end_periods(active, self._packed)
+        if self.settings.disturbed:
             # The observation at the end of a period uses the noise row of the next period.
-            for i in np.flatnonzero(active & (state[:, STEPS] % NOISE_ROWS == 0)).tolist():
+            for i in np.flatnonzero(active & (self.episodes["steps"] % NOISE_ROWS == 0)).tolist():
                 self._draw_noise(i)
-
-    @property
-    def _robot_motion(self) -> RobotMotion:
-        """The kernels of the robot's model."""
-        if self._pointers is None:
-            model = self.settings.model
-            self._pointers = (
-                FunctionPointer(model.advance, ADVANCE_FUNCTION),
-                FunctionPointer(model.state_cost or no_state_cost, STATE_COST_FUNCTION),
-            )
-        return RobotMotion(*self._pointers)
 
     def _drive_in_contact(self, i: int) -> None:
         """Simulate the rest of a period after a contact."""
-        row, body = self.state[i], self._free.rows[i]
-        duration = float(row[REMAINING])
-        field, discs = self.fields[i], self._robots[i, self._first_disc :].reshape(-1, 2)
-        discs = discs[discs[:, 1] > 0.0]
+        sim, episode, state, model = self._simulation, self.episodes[i], self.states[i], self.settings.model
+        field, controls = self.fields[i], sim.controls[i]
+        discs = sim.discs[i][sim.discs[i, :, 1] > 0.0]
         discs.flags.writeable = False
-        motor = self.settings.motor
         if i not in self._contacts:
-            self._contacts[i] = ContactWorld(field, discs, motor.mass, motor.moment, motor.friction)
+            self._contacts[i] = ContactWorld(field, discs, self.settings.motor)
+        duration = float(episode["remaining"])
         substeps = math.ceil(duration / MAX_CONTACT_STEP)
-        step = duration / substeps
-        command = self._command(i, step)
-        velocity = row[VX : SPIN + 1].copy() if self._motors else np.array(command(0.0, 0.0, float(body[2]), 0.0))
-        motion = self.motion[i].copy()
-        lowest, speeds, turn_rates, proximity = self._contacts[i].drive(body, velocity, command, duration, substeps)
-        if self._motors:
-            row[VX : SPIN + 1] = velocity
-        model = self.settings.model
+        command = self._command(i, duration / substeps)
+        before, pose = state.copy(), state[:3]
+        if self.settings.motors:
+            velocity = np.array([episode["vx"], episode["vy"], episode["spin"]])
+        else:
+            velocity = np.array(command(0.0, 0.0, float(pose[2]), 0.0))
+        lowest, speeds, turn_rates, proximity = self._contacts[i].drive(pose, velocity, command, duration, substeps)
+        if self.settings.motors:
+            episode["vx"], episode["vy"], episode["spin"] = velocity
         if model.velocity_states is not None:  # what the contact has left of the velocity
-            ahead = velocity[0] * math.cos(body[2]) + velocity[1] * math.sin(body[2])
+            ahead = velocity[0] * math.cos(pose[2]) + velocity[1] * math.sin(pose[2])
             for name, value in zip(model.velocity_states, (ahead, velocity[2]), strict=True):
-                self.motion[i, model.state_names.index(name) - 3] = value
-        if self._drive == ARCS:
-            row[EFFORT] += stepping.effort(self.tasks, i, speeds, turn_rates)
+                state[model.state_names.index(name)] = value
+        if self.settings.commands_motion:
+            episode["effort"] += stepping.effort(sim.weights[i], np.sqrt([speeds, turn_rates]))
         else:
             # The controls are held, and further states change by them also in contact; the state cost is that at both
             # ends of the period.
-            row[EFFORT] += stepping.control_effort(self.tasks, self._controls(i), i) * duration
+            episode["effort"] += stepping.effort(sim.weights[i], controls) * duration
             if model.state_cost is not None:
-                parameters = self._parameters(i)
-                ends = [np.concatenate([body[:3], values]) for values in (motion, self.motion[i])]
-                row[EFFORT] += sum(model.state_cost(q, parameters) for q in ends) / 2 * duration
-        row[PROXIMITY] += proximity
-        row[POSE_CLEARANCE] = footprint_clearance(body[0], body[1], body[2], discs, field)[0]
-        row[CLEARANCE] = min(row[CLEARANCE], lowest)
-
-    def _controls(self, i: int) -> np.ndarray:
-        """Return the controls (m,) of a robot in its period."""
-        if self._drive == ARCS:
-            return np.array([self.state[i, SPEED], self.state[i, TURN_RATE]])
-        return self._robots[i, self._n_motion : self._n_motion + self._n_controls].copy()
-
-    def _parameters(self, i: int) -> np.ndarray:
-        """Return the parameters of a robot's model."""
-        return self.tasks[i, LIMITS + 2 * self._n_controls + 2 * self._n_motion :]
+                ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
+                episode["effort"] += ends / 2 * duration
+        episode["proximity"] += proximity
+        episode["pose_clearance"] = footprint_clearance(*pose.tolist(), discs, field)[0]
+        episode["clearance"] = min(episode["clearance"], lowest)
 
     def _command(self, i: int, step: float) -> Callable[[float, float, float, float], tuple[float, float, float]]:
         """Return the function from the velocity of a robot in contact to that of its next step without contact."""
-        row, motor, model = self.state[i], self.settings.motor, self.settings.model
-        if self._motors:
-            speed, turn_rate = float(row[SPEED]), float(row[TURN_RATE])
+        sim, motor, model, state = self._simulation, self.settings.motor, self.settings.model, self.states[i]
+        controls, packed = sim.controls[i].copy(), sim.settings[0]["motor"]
+        if self.settings.motors:
 
             def track(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
-                fx, fy, torque = stepping.wheel_forces(vx, vy, heading, spin, speed, turn_rate, step, self._packed)
+                fx, fy, torque = stepping.wheel_forces(np.array([vx, vy, spin]), heading, controls, step, packed)
                 return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
 
             return track
-        controls, parameters, new = self._controls(i), self._parameters(i), np.zeros(3 + self._n_motion)
+        new = np.zeros(len(state))
 
         def follow(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
-            q = np.array([0.0, 0.0, heading, *self.motion[i]])
-            model.advance(q, controls, step, parameters, new)
-            self.motion[i] = new[3:]
+            model.advance(np.array([0.0, 0.0, heading, *state[3:]]), controls, step, sim.parameters[i], new)
+            state[3:] = new[3:]
             return new[0] / step, new[1] / step, (new[2] - heading) / step
 
         return follow
 
     def observe(self, out: np.ndarray, robots: np.ndarray | None = None) -> None:
         """Write flat observations to `out` (count, size), float32: of all robots, or of those given by index."""
-        if self._disturbed:
-            self._noise_rows[:] = self.state[:, STEPS] % NOISE_ROWS
-        self.layout.fill(self._all_robots if robots is None else robots, self._arrays, out)
+        self.layout.fill(self._all_robots if robots is None else robots, self._packed, out)
 
     def at_goal(self, i: int) -> bool:
         """Return whether the pose of a robot equals its goal, within the tolerances."""
-        return bool(stepping.at_goal(i, SimulationState(*self._arrays)))
-
-    def at_horizon(self, i: int) -> bool:
-        """Return whether the episode of a robot has reached the horizon."""
-        return bool(self.state[i, STEPS] >= self.state[i, LAST_STEP])
+        return bool(stepping.at_goal(i, self._simulation))
 
     def ranges(self, i: int) -> np.ndarray:
         """Return the lidar ranges of a robot without noise (m); empty without a lidar."""
-        return self.layout.scan(self._free.rows[i], self.fields[i])
+        return self.layout.scan(self.states[i], self.fields[i])
 
     def __getstate__(self) -> dict[str, Any]:
         # Contact worlds have no memory between periods, so they can be created again.
-        return {**self.__dict__, "_contacts": {}, "_record": None, "_pointers": None}
+        shared = ("_simulation", "_packed", "_pointers", "_addresses", "episodes", "states", "_noise")
+        arrays = self._simulation._replace(fields=np.zeros(0))
+        return {**{k: v for k, v in self.__dict__.items() if k not in shared}, "_contacts": {}, "_arrays": arrays}
 
-
-def _required_discs(discs: np.ndarray) -> int:
-    """Return the number of discs in the array of footprints; one is for discs around the robot's position only."""
-    return 1 if len(discs) == 1 and discs[0, 0] == 0.0 else max(len(discs), 2)
-
-
-# Kernels that only some observations need.
-OBSERVING = {"geodesic": solve_eikonal}
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        arrays: Simulation = state.pop("_arrays")
+        self.__dict__.update(state)
+        self._simulation = arrays._replace(fields=self.fields.places)
+        self.episodes, self.states, self._noise = arrays.episodes, arrays.states, arrays.noise
+        self._connect()
 
 
 def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
-    motors = stepping.command, stepping.drive_motors, stepping.read_velocities
-    moving = motors if settings.motors else (stepping.drive_arcs,)
-    if settings.model.drive == GENERAL:
-        moving = (
-            stepping.command,
-            stepping.drive_paths,
-            settings.model.advance,
-            settings.model.state_cost or no_state_cost,
-        )
-    if settings.reward == "shaped":  # the optima of banks, which guide the robots, are checked
-        moving = *moving, footprint_clearance, proximity_value
-    if settings.observation in OBSERVING:
-        moving = *moving, OBSERVING[settings.observation]
+    model = settings.model
+    kernels = [clearances, footprint_clearances, stepping.start_episodes, stepping.end_periods, observe_robots]
+    if settings.motors:
+        kernels += [stepping.command, stepping.push_bodies, coast, no_state_cost]
+    else:
+        kernels += [stepping.drive, model.advance, model.state_cost or no_state_cost]
+    if settings.shaped:  # the optima of banks, which guide the robots, are checked
+        kernels += [footprint_clearance, proximity_value]
+    if settings.observation == "geodesic":
+        kernels.append(solve_eikonal)
     if not settings.terminate_on_collision:
-        moving = *moving, settings.model.advance, resolve_overlap, proximity_value, stepping.wheel_forces
-    sampling = clearances, footprint_clearances
-    return *sampling, stepping.start_episodes, *moving, stepping.end_periods, observe_robots
+        kernels += [resolve_overlap, proximity_value, stepping.effort, stepping.wheel_forces]
+    return tuple(kernels)

@@ -1,60 +1,78 @@
-"""The episodes of many robots as arrays: the columns of the state, and the record that the kernels take."""
+"""The episodes of many robots as arrays with named fields, and the record that the kernels take."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
-from numba import float32, int64, types
+from numba import float32, from_dtype, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.internals import vector_at
-from leapnav.envs.kernels.types import CONSTANT, CUBE, INTEGERS, MATRIX, VECTOR
+from leapnav.envs.kernels.internals import part_of, vector_at
+from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, VECTOR
+from leapnav.envs.settings import SETTINGS
 from leapnav.envs.shapes.field import pack_field
-
-# Columns of the state.
-(
-    STEPS,  # control periods completed
-    LAST_STEP,  # control periods in the episode
-    TIME,  # s
-    COST,  # J so far
-    POSE_CLEARANCE,  # clearance of the pose, m
-    CLEARANCE,  # smallest clearance during the period, m
-    COLLIDED,  # whether there was a contact in the episode
-    IN_CONTACT,  # whether there was a contact in the period
-    REMAINING,  # time of the period after the first contact, s
-    SUCCESS,
-    TERMINATED,
-    TRUNCATED,
-    SPEED,  # commanded speed (m/s) and turn rate (rad/s) of a robot that follows arcs, with actuation noise
-    TURN_RATE,
-    DURATION,  # of the period, s
-    VX,  # velocity (m/s, m/s, rad/s) of a robot with motors
-    VY,
-    SPIN,
-    EFFORT,  # parts of the reward of the period, as costs
-    PROXIMITY,
-    TIME_COST,
-    COLLISION,
-    MISS,
-    SHAPING,
-    REWARD,
-    POTENTIAL,  # of the current state, for the shaped reward
-    TIME_WEIGHT,  # cost per second, if the horizon is free
-    COLUMNS,
-) = range(28)
-
-# What the infos contain: numbers, flags, and the parts of the reward (as costs).
-INFOS = {"cost": COST, "clearance": CLEARANCE, "time": TIME}
-FLAGS = {"collision": COLLIDED, "is_success": SUCCESS}
-PARTS = {"effort": EFFORT, "proximity": PROXIMITY, "collision": COLLISION, "miss": MISS}
-_TIMED_PARTS = {**PARTS, "time": TIME_COST}
 
 N_GUIDE_POINTS = 17  # points along the reference path, for the potential
 
 
+class Episode(NamedTuple):
+    """The episode of one robot.
+
+    Attributes:
+        steps, last_step: control periods completed, and in the episode.
+        time, horizon: time since the start, and at the end of the episode (s).
+        time_weight: cost per second, if the horizon is free.
+        speed_weight, turn_weight: weights of squared speed and turn rate in the potential of the shaped reward.
+        potential: of the current state, for the shaped reward.
+        cost: J so far.
+        duration, remaining: of the period, and of its part after the first contact (s).
+        vx, vy, spin: velocity (m/s, m/s, rad/s) of a robot with motors.
+        pose_clearance, clearance: of the pose, and the smallest one during the period (m).
+        effort, proximity, time_cost, collision, miss: parts of the reward of the period, as costs.
+        shaping: part of the reward of the period.
+        reward: the reward of the period.
+        collided, in_contact: whether there was a contact in the episode, and in the period.
+        success, terminated, truncated: see `NavigateEnv`.
+
+    """
+
+    steps: int
+    last_step: int
+    time: float
+    horizon: float
+    time_weight: float
+    speed_weight: float
+    turn_weight: float
+    potential: float
+    cost: float
+    duration: float
+    remaining: float
+    vx: float
+    vy: float
+    spin: float
+    pose_clearance: float
+    clearance: float
+    effort: float
+    proximity: float
+    time_cost: float
+    collision: float
+    miss: float
+    shaping: float
+    reward: float
+    collided: bool
+    in_contact: bool
+    success: bool
+    terminated: bool
+    truncated: bool
+
+
+EPISODE = np.dtype(list(get_type_hints(Episode).items()), align=True)
+EPISODES = from_dtype(EPISODE)[::1]
+
+
 def guide_points(goal: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
-    """Return the guide points of a reference path (K, >= 2), see `SimulationState`; without one, only the goal."""
+    """Return the guide points of a reference path (K, >= 2), see `Simulation`; without one, only the goal."""
     guides = np.zeros((N_GUIDE_POINTS, 3))
     guides[:, :2] = goal
     if reference is not None:
@@ -63,11 +81,6 @@ def guide_points(goal: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
         selected = np.linspace(0, len(path) - 1, N_GUIDE_POINTS).round().astype(int)
         guides[:, :2], guides[:, 2] = path[selected], length[-1] - length[selected]
     return guides
-
-
-def parts(free_horizon: bool) -> dict[str, int]:
-    """Return the columns of the parts of the reward."""
-    return _TIMED_PARTS if free_horizon else PARTS
 
 
 class SharedFields:
@@ -111,50 +124,63 @@ def field_of(places, i):
     return vector_at(places[i, 0], places[i, 1])
 
 
-class SimulationState(NamedTuple):
-    """The episodes of `count` robots.
+@kernel(VECTOR(MATRIX, int64))
+def row_of(matrix, i):
+    """Return row i of a matrix, a view."""
+    return part_of(matrix, i * matrix.shape[1], matrix.shape[1])
+
+
+class Simulation(NamedTuple):
+    """The episodes of `count` robots with n states and m controls.
 
     Attributes:
-        bodies (count, 6 or 9): see `FreeBodies`.
-        robots (count, n - 3 + m + 3 + 2 D): further states of the robot; controls of the period, with actuation noise;
-            weights of squared speed and turn rate in the potential; the time weight; footprint of at most D discs, each
-            with its offset along the heading and its radius (m), which is not positive if the disc is unused.
-        state (count, COLUMNS): see the constants of this module.
-        tasks (count, K): see `leapnav.envs.scenarios.scenario`.
+        episodes (count,): records of `Episode`.
+        states (count, n): x, y (m), heading (rad, unwrapped) and further states of the robots.
+        controls (count, m): of the period, with actuation noise.
+        goals (count, n): NaN for a state that is free at the goal.
+        limits, weights (count, m): limits of the controls, and weights of their squares.
+        parameters (count, p): parameters of the robots' model.
+        discs (count, D, 2): footprints of at most D discs, each with its offset along the heading and its radius (m),
+            which is 0 if the disc is unused.
         fields (count, 2): the places of the packed obstacle fields, see `field_of`.
         guides (count, N_GUIDE_POINTS, 3): points (m) of the reference path, and the path length (m) from
             each to the goal.
-        noise (count, rows, columns): standard normal numbers.
-        noise_rows (count,): the row of `noise` that each robot uses.
+        noise (count, rows, columns): standard normal numbers; each period uses the next row.
         maps (count, M): packed geodesic maps, see `leapnav.envs.geodesics`, float32; empty unless they are observed.
-        settings (PACKED,): see `leapnav.envs.settings`.
+        settings (1,): record of `leapnav.envs.settings.SETTINGS`.
 
     """
 
-    bodies: np.ndarray
-    robots: np.ndarray
-    state: np.ndarray
-    tasks: np.ndarray
+    episodes: Any
+    states: np.ndarray
+    controls: np.ndarray
+    goals: np.ndarray
+    limits: np.ndarray
+    weights: np.ndarray
+    parameters: np.ndarray
+    discs: np.ndarray
     fields: np.ndarray
     guides: np.ndarray
     noise: np.ndarray
-    noise_rows: np.ndarray
     maps: np.ndarray
-    settings: np.ndarray
+    settings: Any
 
 
-SIMULATION_STATE = record_type(
-    SimulationState,
-    bodies=MATRIX,
-    robots=MATRIX,
-    state=MATRIX,
-    tasks=MATRIX,
+SIMULATION = record_type(
+    Simulation,
+    episodes=EPISODES,
+    states=MATRIX,
+    controls=MATRIX,
+    goals=MATRIX,
+    limits=MATRIX,
+    weights=MATRIX,
+    parameters=MATRIX,
+    discs=CUBE,
     fields=PLACES,
     guides=CUBE,
     noise=CUBE,
-    noise_rows=INTEGERS,
     maps=float32[:, ::1],
-    settings=VECTOR,
+    settings=from_dtype(SETTINGS)[::1],
 )
 # The same as a plain tuple, which Numba receives from Python in less time than a named one.
-PACKED_STATE = types.Tuple(SIMULATION_STATE.types)
+PACKED = types.Tuple(SIMULATION.types)

@@ -1,7 +1,6 @@
 """One control period of many robots (kernels): motion, running cost, reward, and end of the episode.
 
-The kernels take all episodes as one `SimulationState`, or as a plain tuple if Python calls them, and read and write its
-arrays.
+The kernels take all episodes as a plain tuple with the fields of `Simulation`, and read and write its arrays.
 """
 
 from __future__ import annotations
@@ -12,99 +11,39 @@ import numpy as np
 from numba import boolean, float64, int64, types
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT_MATRIX, FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
-from leapnav.envs.robots.arcs import sinc
-from leapnav.envs.robots.base import ARCS, GENERAL, WHEELS
-from leapnav.envs.scenarios.scenario import GOAL, HORIZON, LIMITS, START
-from leapnav.envs.settings import (
-    ACTUATION_NOISE,
-    COLLISION_PENALTY,
-    DISCOUNT,
-    DRIVE,
-    FREE_HORIZON,
-    GRIP,
-    HEADING_TOLERANCE,
-    MASS,
-    MISS_PENALTY,
-    MOMENT,
-    MOTION_TOLERANCE,
-    N_CONTROLS,
-    N_MOTION,
-    PERIOD,
-    POSITION_TOLERANCE,
-    RESPONSE,
-    SHAPED,
-    SLIP,
-    TERMINATE_ON_COLLISION,
-    TRACK,
-    WHEEL_FORCE,
-)
+from leapnav.envs.kernels.internals import matrix_of
+from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
+from leapnav.envs.settings import MOTOR_TYPE
 from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.simulation.arcs import arc_proximity, follow_arc
-from leapnav.envs.simulation.paths import (
-    MOTION,
-    NODES,
-    SAMPLED_FRACTIONS,
-    HeldPath,
-    follow_path,
-    path_costs,
-    sample_path,
-)
-from leapnav.envs.simulation.state import (
-    CLEARANCE,
-    COLLIDED,
-    COLLISION,
-    COST,
-    DURATION,
-    EFFORT,
-    IN_CONTACT,
-    LAST_STEP,
-    MISS,
-    PACKED_STATE,
-    PLACES,
-    POSE_CLEARANCE,
-    POTENTIAL,
-    PROXIMITY,
-    REMAINING,
-    REWARD,
-    SHAPING,
-    SIMULATION_STATE,
-    SPEED,
-    SPIN,
-    STEPS,
-    SUCCESS,
-    TERMINATED,
-    TIME,
-    TIME_COST,
-    TIME_WEIGHT,
-    TRUNCATED,
-    TURN_RATE,
-    VX,
-    VY,
-    SimulationState,
-    field_of,
-)
+from leapnav.envs.simulation.paths import ADDRESSES, MOTION, Path, drive_path, motion_at
+from leapnav.envs.simulation.state import PACKED, SIMULATION, Simulation, field_of, row_of
 
 GRAVITY = 9.81  # m/s^2
 
 
-@kernel(float64(MATRIX, int64, float64, float64))
-def effort(tasks, i, speed_squared, turn_rate_squared):
-    """Return the running cost of the motion of robot i, a unicycle, without the proximity cost."""
-    return 0.5 * (tasks[i, LIMITS + 2] * speed_squared + tasks[i, LIMITS + 3] * turn_rate_squared)
+@kernel(MATRIX(SIMULATION, int64), inline="always")
+def discs_of(sim, i):
+    """Return the footprint (D, 2) of robot i, a view."""
+    count = sim.discs.shape[1]
+    return matrix_of(sim.discs, 2 * count * i, count, 2)
 
 
-@kernel(float64(MATRIX, VECTOR, int64))
-def control_effort(tasks, controls, i):
-    """Return the running cost of the controls (m,) of robot i."""
-    m = len(controls)
+@kernel(float64(float64))
+def wrapped(angle):
+    """Return an angle (rad) between -pi and pi."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+@kernel(float64(VECTOR, VECTOR))
+def effort(weights, controls):
+    """Return the running cost of the controls (m,)."""
     total = 0.0
-    for j in range(m):
-        total += tasks[i, LIMITS + m + j] * controls[j] ** 2
+    for j in range(len(controls)):
+        total += weights[j] * controls[j] ** 2
     return 0.5 * total
 
 
-@kernel(float64(int64, SIMULATION_STATE))
+@kernel(float64(int64, SIMULATION))
 def potential(i, sim):
     """Return minus an estimate of the cost-to-go of robot i: following the reference path at constant speed.
 
@@ -112,322 +51,269 @@ def potential(i, sim):
     function of the state leaves the optimal policy unchanged (Ng, Harada and Russell, 1999); a good estimate makes it
     easier to learn.
     """
-    bodies, tasks, guides = sim.bodies, sim.tasks, sim.guides
+    episode, state, guides, settings = sim.episodes[i], row_of(sim.states, i), sim.guides, sim.settings[0]
     length = np.inf
     for k in range(guides.shape[1]):
-        dx, dy = guides[i, k, 0] - bodies[i, 0], guides[i, k, 1] - bodies[i, 1]
+        dx, dy = guides[i, k, 0] - state[0], guides[i, k, 1] - state[1]
         length = min(length, math.sqrt(dx * dx + dy * dy) + guides[i, k, 2])
-    heading = tasks[i, GOAL + 2]
-    turn = 0.0 if math.isnan(heading) else (heading - bodies[i, 2] + math.pi) % (2 * math.pi) - math.pi
-    time = max(tasks[i, HORIZON] - sim.state[i, TIME], sim.settings[PERIOD])
-    weights = int(sim.settings[N_MOTION] + sim.settings[N_CONTROLS])
-    square = sim.robots[i, weights] * (length * length) + sim.robots[i, weights + 1] * (turn * turn)
-    if sim.settings[FREE_HORIZON] != 0.0:
-        estimate = math.sqrt(2.0 * sim.state[i, TIME_WEIGHT] * square)
+    heading = sim.goals[i, 2]
+    turn = 0.0 if math.isnan(heading) else wrapped(heading - state[2])
+    square = episode.speed_weight * (length * length) + episode.turn_weight * (turn * turn)
+    if settings.free_horizon:
+        estimate = math.sqrt(2.0 * episode.time_weight * square)
     else:
-        estimate = 0.5 * square / time
-    return -min(estimate, sim.settings[MISS_PENALTY])
+        estimate = 0.5 * square / max(episode.horizon - episode.time, settings.control_period)
+    return -min(estimate, settings.miss_penalty)
 
 
-@kernel(NOTHING(INTEGERS, PACKED_STATE))
+@kernel(NOTHING(INTEGERS, PACKED))
 def start_episodes(robots, packed):
-    """Place robots, given by index, at the start of their tasks."""
-    sim = SimulationState(*packed)
-    bodies, state, tasks, settings = sim.bodies, sim.state, sim.tasks, sim.settings
-    n_motion, n_controls = int(settings[N_MOTION]), int(settings[N_CONTROLS])
-    further, first_disc = LIMITS + 2 * n_controls, n_motion + n_controls + 3
+    """Start the episodes of robots, given by index, whose states and tasks are set."""
+    sim = Simulation(*packed)
+    settings = sim.settings[0]
     for i in robots:
-        for column in range(bodies.shape[1]):
-            bodies[i, column] = tasks[i, START + column] if column < 3 else 0.0
-        for k in range(n_motion):
-            sim.robots[i, k] = tasks[i, further + k]
-        for column in range(state.shape[1]):
-            state[i, column] = 0.0
+        episode, state = sim.episodes[i], row_of(sim.states, i)
         # A remainder of less than 1e-6 periods is a rounding error of the horizon, not another period.
-        state[i, LAST_STEP] = max(1.0, math.ceil(tasks[i, HORIZON] / settings[PERIOD] - 1e-6))
-        state[i, POSE_CLEARANCE] = footprint_clearance(
-            bodies[i, 0],
-            bodies[i, 1],
-            bodies[i, 2],
-            sim.robots[i, first_disc:].reshape((-1, 2)),
-            field_of(sim.fields, i),
-        )[0]
-        state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
-        if settings[FREE_HORIZON] != 0.0:
-            state[i, TIME_WEIGHT] = sim.robots[i, first_disc - 1]
-        if settings[SHAPED] != 0.0:
-            state[i, POTENTIAL] = potential(i, sim)
+        episode.last_step = max(1, math.ceil(episode.horizon / settings.control_period - 1e-6))
+        clearance, _ = footprint_clearance(state[0], state[1], state[2], discs_of(sim, i), field_of(sim.fields, i))
+        episode.pose_clearance = episode.clearance = clearance
+        if settings.shaped:
+            episode.potential = potential(i, sim)
 
 
-@kernel(int64(MATRIX, FLAGS, PACKED_STATE))
-def command(actions, active, packed):
-    """Set the controls of a period, with actuation noise, and the speed and turn rate of a robot that follows arcs.
+@kernel(NOTHING(SIMULATION, int64, VECTOR), inline="always")
+def _disturb(sim, i, controls):
+    """Change the controls of robot i by actuation noise and slip.
 
-    For robots that are not active, the duration of the period is 0.
+    If the controls are speed and turn rate, the slip is that of two wheels, see `Disturbance`.
+    """
+    settings, m = sim.settings[0], len(controls)
+    noise = sim.noise[i, sim.episodes[i].steps % sim.noise.shape[1]]
+    slip = settings.disturbance.slip
+    for j in range(m):
+        controls[j] *= 1.0 + settings.disturbance.actuation * noise[j]
+    if settings.commands_motion:
+        half = settings.motor.track / 2
+        right = (controls[0] + half * controls[1]) * (1.0 - min(slip * abs(noise[2]), 1.0))
+        left = (controls[0] - half * controls[1]) * (1.0 - min(slip * abs(noise[3]), 1.0))
+        controls[0], controls[1] = (right + left) / 2, (right - left) / (2 * half)
+        return
+    for j in range(m):
+        controls[j] *= 1.0 - min(slip * abs(noise[m + j]), 1.0)
+
+
+@kernel(int64(MATRIX, FLAGS, SIMULATION), inline="always")
+def _begin_periods(actions, active, sim):
+    """Begin a period, and set the controls; for robots that are not active, its duration is 0.
 
     Returns:
-        -1, or the index of the first active robot whose action is not finite; the state is unchanged then.
+        See `drive`.
 
     """
-    sim = SimulationState(*packed)
-    state, tasks, settings, robots = sim.state, sim.tasks, sim.settings, sim.robots
-    first, m, drive = int(settings[N_MOTION]), int(settings[N_CONTROLS]), settings[DRIVE]
-    for i in range(len(state)):
+    settings = sim.settings[0]
+    for i in range(len(active)):
         if active[i]:
-            for j in range(m):
+            for j in range(actions.shape[1]):
                 if not math.isfinite(actions[i, j]):
                     return i
-    disturbed = settings[ACTUATION_NOISE] != 0.0 or settings[SLIP] != 0.0
-    for i in range(len(state)):
-        for column in (IN_CONTACT, REMAINING, SPEED, TURN_RATE, DURATION):
-            state[i, column] = 0.0
-        for column in (EFFORT, PROXIMITY, TIME_COST, COLLISION, MISS, SHAPING, REWARD):
-            state[i, column] = 0.0
-        state[i, CLEARANCE] = state[i, POSE_CLEARANCE]
+    for i in range(len(active)):
+        episode, controls = sim.episodes[i], row_of(sim.controls, i)
+        episode.in_contact, episode.remaining, episode.duration = False, 0.0, 0.0
+        episode.effort = episode.proximity = episode.time_cost = episode.collision = episode.miss = 0.0
+        episode.shaping = episode.reward = 0.0
+        episode.clearance = episode.pose_clearance
+        controls[:] = 0.0
         if not active[i]:
             continue
-        state[i, DURATION] = max(min(settings[PERIOD], tasks[i, HORIZON] - state[i, TIME]), 0.0)
-        if drive == ARCS:
-            speed = min(max(actions[i, 0], -1.0), 1.0) * tasks[i, LIMITS]
-            turn_rate = min(max(actions[i, 1], -1.0), 1.0) * tasks[i, LIMITS + 1]
-            if disturbed:
-                noise, row = sim.noise, sim.noise_rows[i]
-                speed *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, 0]
-                turn_rate *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, 1]
-                half = settings[TRACK] / 2
-                right = (speed + half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 2]), 1.0))
-                left = (speed - half * turn_rate) * (1.0 - min(settings[SLIP] * abs(noise[i, row, 3]), 1.0))
-                speed, turn_rate = (right + left) / 2, (right - left) / (2 * half)
-            state[i, SPEED], state[i, TURN_RATE] = speed, turn_rate
-            continue
-        for j in range(m):
-            value = min(max(actions[i, j], -1.0), 1.0) * tasks[i, LIMITS + j]
-            if disturbed:
-                noise, row = sim.noise, sim.noise_rows[i]
-                value *= 1.0 + settings[ACTUATION_NOISE] * noise[i, row, j]
-                value *= 1.0 - min(settings[SLIP] * abs(noise[i, row, m + j]), 1.0)
-            robots[i, first + j] = value
-        if drive == WHEELS:
-            track = tasks[i, LIMITS + 2 * m]
-            state[i, SPEED] = 0.5 * (robots[i, 0] + robots[i, 1])
-            state[i, TURN_RATE] = (robots[i, 1] - robots[i, 0]) / track
+        episode.duration = max(min(settings.control_period, episode.horizon - episode.time), 0.0)
+        for j in range(len(controls)):
+            controls[j] = min(max(actions[i, j], -1.0), 1.0) * sim.limits[i, j]
+        if settings.disturbance.actuation != 0.0 or settings.disturbance.slip != 0.0:
+            _disturb(sim, i, controls)
     return -1
 
 
-@kernel(boolean(CONSTANT_MATRIX))
-def is_one_disc(discs):
-    """Return whether a footprint is one disc around the robot's position, as all are in an array of one disc each."""
-    return discs[0, 0] == 0.0 and (len(discs) == 1 or discs[1, 1] <= 0.0)
+@kernel(int64(MATRIX, FLAGS, PACKED))
+def command(actions, active, packed):
+    """Begin a period of robots with motors, see `_begin_periods`."""
+    return _begin_periods(actions, active, Simulation(*packed))
 
 
-@kernel(NOTHING(PACKED_STATE, MOTION))
-def drive_paths(packed, motion):
-    """Set velocity and force of each body, and the further states, for the period, up to the first contact.
-
-    A body moves by the displacement of the robot, and its force then changes its velocity to that of the robot. For
-    robots that `drive_arcs` has left out, and those whose controls do not lead to arcs; `command` is called before.
-    """
-    sim = SimulationState(*packed)
-    bodies, state, settings = sim.bodies, sim.state, sim.settings
-    general, m, n = settings[DRIVE] == GENERAL, int(settings[N_CONTROLS]), 3 + int(settings[N_MOTION])
-    first = LIMITS + 2 * m + 2 * (n - 3)
-    q, new, samples, poses = np.empty(n), np.empty(n), np.empty((len(SAMPLED_FRACTIONS), n)), np.empty((NODES, 4))
-    for i in range(len(state)):
-        if general:
-            bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        robot, field, duration = sim.robots[i], field_of(sim.fields, i), state[i, DURATION]
-        discs = robot[n + m :].reshape((-1, 2))
-        if duration == 0.0 or (not general and is_one_disc(discs)):
-            continue
-        parameters, u = sim.tasks[i, first:], robot[n - 3 : n - 3 + m]
-        if settings[DRIVE] == ARCS:
-            u[0], u[1] = state[i, SPEED], state[i, TURN_RATE]
-        for k in range(n):
-            q[k] = bodies[i, k] if k < 3 else robot[k - 3]
-        path = HeldPath(motion, q, u, parameters, discs)
-        total = sample_path(path, duration, samples)
-        for k in range(n):
-            new[k] = samples[NODES, k]
-        before = state[i, POSE_CLEARANCE]
-        lowest, fraction, after = follow_path(path, duration, field, before, total, new)
-        state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
-        if fraction < 1.0:
-            state[i, IN_CONTACT] = 1.0
-            state[i, CLEARANCE] = after  # the robot does not reach the rest of the path
-            state[i, REMAINING] = duration * (1.0 - fraction)
-        driven = duration * fraction
-        if driven > 0.0:
-            if fraction < 1.0:
-                total = sample_path(path, driven, samples)
-            proximity, state_cost = path_costs(path, driven, field, total, lowest, samples, poses)
-            state[i, EFFORT] += (control_effort(sim.tasks, u, i) + state_cost) * driven
-            state[i, PROXIMITY] += proximity * driven
-        for k in range(3):
-            bodies[i, 3 + k] = new[k] - bodies[i, k]
-        for k in range(n - 3):
-            robot[k] = new[3 + k]
-
-
-@kernel(int64(MATRIX, FLAGS, PACKED_STATE))
-def drive_arcs(actions, active, packed):
-    """Set the velocity of each body for its period, up to the first contact, and add the running cost.
-
-    The chord of the arc that a command produces has the length v h sinc(omega h / 2) and the mean heading. A body whose
-    velocity is the chord ends at the end of the arc, because Chipmunk moves bodies by an explicit Euler step.
-    Robots with a footprint of several discs are left to `drive_paths`.
+@kernel(float64(SIMULATION, int64, MOTION, VECTOR, float64, MATRIX), inline="always")
+def _follow(sim, i, motion, u, duration, scratch):
+    """Move robot i with controls u for a duration (s), up to the first contact, and add the proximity and state cost.
 
     Returns:
-        As `command`, which is called first.
+        The fraction of the duration before the contact, or 1.
 
     """
-    sim = SimulationState(*packed)
-    bodies, state = sim.bodies, sim.state
-    wheels, all_discs = sim.settings[DRIVE] == WHEELS, sim.robots.shape[1] == 7
-    invalid = command(actions, active, packed)
+    episode, state, n = sim.episodes[i], row_of(sim.states, i), sim.states.shape[1]
+    q, new = scratch[5], scratch[6]
+    for k in range(n):
+        q[k] = state[k]
+    field = field_of(sim.fields, i)
+    path = Path(motion, q, u, row_of(sim.parameters, i), discs_of(sim, i), field, duration, scratch)
+    lowest, fraction, after, proximity, state_cost = drive_path(path, episode.pose_clearance, new)
+    episode.in_contact = fraction < 1.0
+    # A robot in contact does not reach the rest of the path.
+    episode.clearance = after if episode.in_contact else min(episode.clearance, lowest)
+    episode.pose_clearance = after
+    episode.proximity += proximity
+    episode.effort += state_cost
+    for k in range(n):
+        state[k] = new[k]
+    return fraction
+
+
+@kernel(int64(MATRIX, FLAGS, PACKED, ADDRESSES))
+def drive(actions, active, packed, addresses):
+    """Drive robots without motors for a period, up to the first contact, and add the running cost.
+
+    Args:
+        actions (count, m): the controls divided by their limits.
+        active (count,): the robots that drive.
+        packed: the episodes.
+        addresses: see `motion_at`.
+
+    Returns:
+        -1, or the index of the first active robot whose action is not finite; nothing is changed then.
+
+    """
+    sim = Simulation(*packed)
+    invalid = _begin_periods(actions, active, sim)
     if invalid >= 0:
         return invalid
-    for i in range(len(state)):
-        bodies[i, 3] = bodies[i, 4] = bodies[i, 5] = 0.0
-        if state[i, DURATION] == 0.0 or not (all_discs or is_one_disc(sim.robots[i, 5:].reshape((-1, 2)))):
-            continue
-        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], field_of(sim.fields, i)
-        distance, turn = state[i, SPEED] * state[i, DURATION], state[i, TURN_RATE] * state[i, DURATION]
-        lowest, fraction, after = follow_arc(x, y, heading, distance, turn, state[i, POSE_CLEARANCE], field)
-        state[i, CLEARANCE], state[i, POSE_CLEARANCE] = lowest, after
-        if fraction < 1.0:
-            state[i, IN_CONTACT] = 1.0
-            state[i, CLEARANCE] = after  # the robot does not reach the rest of the arc
-            state[i, REMAINING] = state[i, DURATION] * (1.0 - fraction)
-            distance *= fraction
-            turn *= fraction
-        driven = state[i, DURATION] * fraction
-        if wheels:
-            state[i, EFFORT] += control_effort(sim.tasks, sim.robots[i, :2], i) * driven
-        else:
-            state[i, EFFORT] += effort(sim.tasks, i, state[i, SPEED] ** 2, state[i, TURN_RATE] ** 2) * driven
-        if driven > 0.0:
-            state[i, PROXIMITY] += arc_proximity(x, y, heading, distance, turn, lowest, field) * driven
-        chord, middle = distance * sinc(turn / 2), heading + turn / 2
-        bodies[i, 3], bodies[i, 4], bodies[i, 5] = chord * math.cos(middle), chord * math.sin(middle), turn
+    scratch, motion = np.empty((7, sim.states.shape[1])), motion_at(addresses)
+    for i in range(len(active)):
+        episode, controls = sim.episodes[i], row_of(sim.controls, i)
+        if episode.duration > 0.0:
+            fraction = _follow(sim, i, motion, controls, episode.duration, scratch)
+            episode.effort += effort(row_of(sim.weights, i), controls) * episode.duration * fraction
+            episode.remaining = episode.duration * (1.0 - fraction)
     return -1
 
 
-@kernel(types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, float64, float64, VECTOR))
-def wheel_forces(vx, vy, heading, spin, speed, turn_rate, duration, settings):
+@kernel(types.UniTuple(float64, 3)(VECTOR, float64, VECTOR, float64, MOTOR_TYPE))
+def wheel_forces(velocity, heading, controls, duration, motor):
     """Return the force (x, y) (N) and the torque (N m) on a robot whose motors track the commanded wheel speeds.
 
     The motors reduce the deviation from the commanded motion, each with at most its maximum force. The tyres remove the
     lateral velocity with at most their grip.
+
+    Args:
+        velocity (3,): vx, vy (m/s) and turn rate (rad/s).
+        heading: rad.
+        controls (2,): commanded speed (m/s) and turn rate (rad/s).
+        duration: of the step (s).
+        motor: see `leapnav.envs.settings.Motor`.
+
     """
+    vx, vy, spin = velocity[0], velocity[1], velocity[2]
     cos, sin = math.cos(heading), math.sin(heading)
-    mass, half = settings[MASS], settings[TRACK] / 2
-    response = max(settings[RESPONSE], duration)
+    mass, half, limit = motor.mass, motor.track / 2, motor.wheel_force
+    response = max(motor.response, duration)
     ahead, aside = cos * vx + sin * vy, cos * vy - sin * vx
-    push = mass * (speed - ahead) / response / 2
-    twist = settings[MOMENT] * (turn_rate - spin) / response / (2 * half)
-    limit = settings[WHEEL_FORCE]
+    push = mass * (controls[0] - ahead) / response / 2
+    twist = motor.moment * (controls[1] - spin) / response / (2 * half)
     right, left = min(max(push + twist, -limit), limit), min(max(push - twist, -limit), limit)
-    grip = settings[GRIP] * mass * GRAVITY
+    grip = motor.grip * mass * GRAVITY
     across = min(max(-mass * aside / duration, -grip), grip)
     along = right + left
     return cos * along - sin * across, sin * along + cos * across, half * (right - left)
 
 
-# The kernels of a substep take the arrays that they use: Numba takes twice as long to receive a tuple from Python.
-@kernel(NOTHING(MATRIX, MATRIX, int64))
-def read_velocities(bodies, state, substeps):
-    """Read the velocities after a substep; those of a robot in contact are unchanged."""
-    for i in range(len(state)):
-        step = state[i, DURATION] / substeps
-        if step > 0.0 and state[i, IN_CONTACT] == 0.0:
-            state[i, VX], state[i, VY], state[i, SPIN] = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
+@kernel(NOTHING(MATRIX, SIMULATION, int64), inline="always")
+def _read_bodies(bodies, sim, substeps):
+    """Read the poses and velocities of bodies after a substep; those of a robot in contact are unchanged."""
+    for i in range(len(bodies)):
+        episode = sim.episodes[i]
+        step = episode.duration / substeps
+        if step > 0.0 and not episode.in_contact:
+            for k in range(3):
+                sim.states[i, k] = bodies[i, k]
+            episode.vx, episode.vy, episode.spin = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
 
 
-@kernel(NOTHING(MATRIX, MATRIX, MATRIX, PLACES, VECTOR, int64, int64))
-def drive_motors(bodies, state, tasks, fields, settings, substep, substeps):
-    """Set velocity and force of each body for one substep, up to the first contact, and add the running cost.
+@kernel(NOTHING(MATRIX, PACKED, ADDRESSES, int64, int64))
+def push_bodies(bodies, packed, addresses, substep, substeps):
+    """Read the bodies of robots with motors after the last substep, and set their velocities and forces for the next.
 
-    The velocities after the previous substep are read first.
+    Contacts are searched along the motion of the next substep, and the running cost is added.
+
+    Args:
+        bodies (count, 9): see `MotorBodies`.
+        packed: the episodes.
+        addresses: see `motion_at`; of `coast`.
+        substep, substeps: number of the next substep, and of all in a period; after the last one both are equal.
+
     """
+    sim, motion = Simulation(*packed), motion_at(addresses)
     if substep > 0:
-        read_velocities(bodies, state, substeps)
-    for i in range(len(state)):
-        for column in range(3, 9):
-            bodies[i, column] = 0.0
-        step = state[i, DURATION] / substeps
-        if step == 0.0 or state[i, IN_CONTACT] != 0.0:
+        _read_bodies(bodies, sim, substeps)
+    if substep == substeps:
+        return
+    settings, scratch = sim.settings[0], np.empty((9, 3))
+    velocity, moved = scratch[7], scratch[8, :2]
+    for i in range(len(bodies)):
+        episode, body = sim.episodes[i], row_of(bodies, i)
+        step = episode.duration / substeps
+        for k in range(3):
+            body[k], body[3 + k], body[6 + k] = sim.states[i, k], 0.0, 0.0
+        if step == 0.0 or episode.in_contact:
             continue
-        dx, dy, turn = state[i, VX] * step, state[i, VY] * step, state[i, SPIN] * step
-        x, y, heading, field = bodies[i, 0], bodies[i, 1], bodies[i, 2], field_of(fields, i)
-        distance, course = math.sqrt(dx * dx + dy * dy), math.atan2(dy, dx)
-        lowest, fraction, after = follow_arc(x, y, course, distance, 0.0, state[i, POSE_CLEARANCE], field)
-        state[i, CLEARANCE], state[i, POSE_CLEARANCE] = min(state[i, CLEARANCE], lowest), after
-        speed_squared = state[i, VX] ** 2 + state[i, VY] ** 2
-        state[i, EFFORT] += effort(tasks, i, speed_squared, state[i, SPIN] ** 2) * step * fraction
-        state[i, PROXIMITY] += arc_proximity(x, y, course, distance * fraction, 0.0, lowest, field) * step * fraction
-        bodies[i, 3], bodies[i, 4], bodies[i, 5] = dx * fraction, dy * fraction, turn * fraction
-        if fraction < 1.0:
-            state[i, IN_CONTACT] = 1.0
-            state[i, CLEARANCE] = after  # the robot does not reach the rest of the path
-            state[i, REMAINING] = state[i, DURATION] - step * (substep + fraction)
+        velocity[0], velocity[1], velocity[2] = episode.vx, episode.vy, episode.spin
+        fraction = _follow(sim, i, motion, velocity, step, scratch)
+        moved[0], moved[1] = math.sqrt(episode.vx**2 + episode.vy**2), episode.spin
+        episode.effort += effort(row_of(sim.weights, i), moved) * step * fraction
+        for k in range(3):
+            body[3 + k] = sim.states[i, k] - body[k]
+        if episode.in_contact:
+            episode.remaining = episode.duration - step * (substep + fraction)
             continue
-        wheels = state[i, SPEED], state[i, TURN_RATE]
-        fx, fy, torque = wheel_forces(state[i, VX], state[i, VY], heading, state[i, SPIN], *wheels, step, settings)
-        bodies[i, 6], bodies[i, 7], bodies[i, 8] = fx * step * step, fy * step * step, torque * step * step
+        force = wheel_forces(velocity, body[2], row_of(sim.controls, i), step, settings.motor)
+        body[6], body[7], body[8] = force[0] * step * step, force[1] * step * step, force[2] * step * step
 
 
-@kernel(boolean(int64, SIMULATION_STATE))
+@kernel(boolean(int64, SIMULATION))
 def at_goal(i, sim):
-    """Return whether the pose of robot i equals its goal, within the tolerances."""
-    bodies, tasks, settings = sim.bodies, sim.tasks, sim.settings
-    dx, dy = bodies[i, 0] - tasks[i, GOAL], bodies[i, 1] - tasks[i, GOAL + 1]
-    if math.hypot(dx, dy) > settings[POSITION_TOLERANCE]:
+    """Return whether the state of robot i equals its goal, within the tolerances."""
+    state, goal, settings = row_of(sim.states, i), row_of(sim.goals, i), sim.settings[0]
+    if math.hypot(state[0] - goal[0], state[1] - goal[1]) > settings.position_tolerance:
         return False
-    n_motion = int(settings[N_MOTION])
-    further = LIMITS + 2 * int(settings[N_CONTROLS]) + n_motion
-    for k in range(n_motion):
-        goal = tasks[i, further + k]
-        if not math.isnan(goal) and abs(sim.robots[i, k] - goal) > settings[MOTION_TOLERANCE]:
+    for k in range(3, len(goal)):
+        if not math.isnan(goal[k]) and abs(state[k] - goal[k]) > settings.motion_tolerance:
             return False
-    heading = tasks[i, GOAL + 2]
-    if math.isnan(heading):
-        return True
-    turn = (bodies[i, 2] - heading + math.pi) % (2 * math.pi) - math.pi
-    return abs(turn) <= settings[HEADING_TOLERANCE]
+    return math.isnan(goal[2]) or abs(wrapped(state[2] - goal[2])) <= settings.heading_tolerance
 
 
-@kernel(NOTHING(FLAGS, PACKED_STATE))
+@kernel(NOTHING(FLAGS, PACKED))
 def end_periods(active, packed):
     """Complete a period: update time, cost and reward, and determine whether the episode has ended."""
-    sim = SimulationState(*packed)
-    state, settings = sim.state, sim.settings
-    free = settings[FREE_HORIZON] != 0.0
-    for i in range(len(state)):
+    sim = Simulation(*packed)
+    settings = sim.settings[0]
+    for i in range(len(active)):
         if not active[i]:
             continue
-        state[i, STEPS] += 1.0
-        state[i, TIME] = min(state[i, STEPS] * settings[PERIOD], sim.tasks[i, HORIZON])
-        state[i, COST] += state[i, EFFORT] + state[i, PROXIMITY]
-        if free:
-            state[i, TIME_COST] = state[i, TIME_WEIGHT] * state[i, DURATION]
-            state[i, COST] += state[i, TIME_COST]
-        if state[i, IN_CONTACT] != 0.0 and state[i, COLLIDED] == 0.0:
-            state[i, COLLISION] = settings[COLLISION_PENALTY]
-            state[i, COLLIDED] = 1.0
-        last = state[i, STEPS] >= state[i, LAST_STEP]
-        reached = (free or last) and at_goal(i, sim)
-        state[i, SUCCESS] = 1.0 if reached and state[i, COLLIDED] == 0.0 else 0.0
-        ended = (reached if free else last) or (state[i, COLLIDED] != 0.0 and settings[TERMINATE_ON_COLLISION] != 0.0)
-        state[i, TERMINATED] = 1.0 if ended else 0.0
-        state[i, TRUNCATED] = 1.0 if free and last and not ended else 0.0
+        episode = sim.episodes[i]
+        episode.steps += 1
+        episode.time = min(episode.steps * settings.control_period, episode.horizon)
+        if settings.free_horizon:
+            episode.time_cost = episode.time_weight * episode.duration
+        episode.cost += episode.effort + episode.proximity + episode.time_cost
+        if episode.in_contact and not episode.collided:
+            episode.collision = settings.collision_penalty
+            episode.collided = True
+        last = episode.steps >= episode.last_step
+        reached = (settings.free_horizon or last) and at_goal(i, sim)
+        episode.success = reached and not episode.collided
+        ended = (reached if settings.free_horizon else last) or (episode.collided and settings.terminate_on_collision)
+        episode.terminated = ended
+        episode.truncated = settings.free_horizon and last and not ended
         if ended and not reached:
-            state[i, MISS] = settings[MISS_PENALTY]
-        reward = -state[i, EFFORT] - state[i, PROXIMITY] - state[i, COLLISION] - state[i, MISS]
-        if free:
-            reward -= state[i, TIME_COST]
-        if settings[SHAPED] != 0.0:
+            episode.miss = settings.miss_penalty
+        episode.reward = -episode.effort - episode.proximity - episode.collision - episode.miss - episode.time_cost
+        if settings.shaped:
             after = 0.0 if ended else potential(i, sim)
-            state[i, SHAPING] = settings[DISCOUNT] * after - state[i, POTENTIAL]
-            state[i, POTENTIAL] = after
-            reward += state[i, SHAPING]
-        state[i, REWARD] = reward
+            episode.shaping = settings.discount * after - episode.potential
+            episode.potential = after
+            episode.reward += episode.shaping

@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from torch.optim.lr_scheduler import LambdaLR
 
-from leapnav.envs.simulation.observations import goal_entries
+from leapnav.envs.simulation.observations import ObservationLayout
 from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -128,7 +128,7 @@ class Cloning:
         check_cloning(config)
         check_observations(policy, dataset)
         model = dataset.settings.model
-        n_goal = goal_entries(dataset.settings)
+        n_goal = ObservationLayout(dataset.settings).parts["goal"].stop
         settings = dataset.settings
         beams = settings.lidar_beams if settings.has_lidar else 0
         geodesic = settings.observation == "geodesic"

@@ -16,7 +16,6 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import ScenarioSource, get_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.simulator import BatchSimulator
-from leapnav.envs.simulation.state import COLLIDED, COST, SUCCESS, TERMINATED, TRUNCATED
 from leapnav.training.threads import limit_threads
 
 
@@ -101,15 +100,15 @@ def _drive(
         actions, memory = policy.predict(observations, memory, starts, deterministic=True)
         simulator.step(np.asarray(actions, dtype=float), active)
         _record(simulator, np.flatnonzero(active), paths, costs)
-        starts = active & ((simulator.state[:, TERMINATED] > 0) | (simulator.state[:, TRUNCATED] > 0))
+        starts = active & (simulator.episodes["terminated"] | simulator.episodes["truncated"])
         for i in np.flatnonzero(starts).tolist():
-            row = simulator.state[i]
+            episode = simulator.episode(i)
             episodes[playing[i]] = DrivenEpisode(
                 scenario=get_scenario(choices[playing[i]], source.bank),
                 states=np.array(paths[i]),
                 costs=np.array(costs[i]),
-                success=bool(row[SUCCESS] > 0),
-                collision=bool(row[COLLIDED] > 0),
+                success=episode.success,
+                collision=episode.collided,
             )
             if following < len(choices):
                 simulator.reset([i], [choices[following]], source.bank)
@@ -126,5 +125,5 @@ def _record(
 ) -> None:
     """Append the current states and costs of robots to their lists."""
     for i in robots.tolist():
-        paths[i].append(np.concatenate([simulator.poses[i], simulator.motion[i]]))
-        costs[i].append(float(simulator.state[i, COST]))
+        paths[i].append(simulator.states[i].copy())
+        costs[i].append(float(simulator.episodes["cost"][i]))

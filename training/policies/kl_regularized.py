@@ -11,7 +11,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Dis
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 
-from leapnav.envs.simulation.observations import TIME_LEFT, has_time_left
+from leapnav.envs.simulation.observations import TIME_LEFT, parts_of
 from leapnav.training.policies.momentum import MomentumPolicy
 
 # Fraction of the action noise that remains at the horizon. Without any noise the likelihoods would be infinite.
@@ -53,7 +53,7 @@ class KLRegularizedPolicy(MomentumPolicy):
         # latent features alone, which do not contain the remaining time.
         self._noise_fraction: th.Tensor | float = 1.0
         super().__init__(*args, **kwargs)
-        self._is_timed = has_time_left(cast(Box, self.observation_space).high)
+        self._is_timed = parts_of(cast(Box, self.observation_space))["goal"].stop > TIME_LEFT
         self.entropy_weight, self.divergence_weight = entropy_weight, divergence_weight
         self.divergence = 0.0
         # The reference is part of the policy, so that checkpoints contain it, but is not optimised.

@@ -11,12 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from leapnav.envs.simulation.observations import (
-    FREE_GOAL_ENTRIES,
-    GOAL_ENTRIES,
-    has_geodesics,
-    has_time_left,
-)
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, parts_of
 from leapnav.envs.utils.validation import check_choice
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.training.policies.memory import (
@@ -48,22 +43,19 @@ class NavigationFeatures(BaseFeaturesExtractor):
     DISTANCE_FEATURES, FREE_DISTANCE_FEATURES = 5, 3  # features of the geodesic distance
 
     def __init__(self, observation_space: spaces.Box) -> None:
-        self._is_timed = has_time_left(observation_space.high)
-        goal = GOAL_ENTRIES if self._is_timed else FREE_GOAL_ENTRIES
-        # Ranges are not negative; the entries of the motion part, which is before them, can be.
-        motion = int((observation_space.low[goal:] < 0.0).sum())
-        beams = observation_space.shape[0] - goal - motion  # the detours count as beams
-        is_geodesic = has_geodesics(observation_space.high)
-        beams -= is_geodesic  # the last entry is the geodesic distance
-        self._beams = beams // 2 if is_geodesic else beams
+        parts = parts_of(observation_space)
+        self._is_timed = parts["goal"].stop > TIME_LEFT
+        self._motion, self._lidar = parts["motion"], parts["lidar"]
+        self._detours, self._distance = parts.get("detours"), parts.get("distance")
+        motion, beams = (part.stop - part.start for part in (self._motion, self._lidar))
         if self._is_timed:
             features = self.POSE_FEATURES + self.MOTION_FEATURES * motion
         else:
             features = self.FREE_POSE_FEATURES + self.FREE_MOTION_FEATURES * motion
-        if is_geodesic:
+        if self._distance is not None:
             features += self.DISTANCE_FEATURES if self._is_timed else self.FREE_DISTANCE_FEATURES
+            beams *= 2  # the detours
         super().__init__(observation_space, features + self.BEAM_FEATURES * beams)
-        self._first_motion, self._first_beam = goal, goal + motion
 
     @property
     def motion_features(self) -> range:
@@ -72,17 +64,15 @@ class NavigationFeatures(BaseFeaturesExtractor):
             first, per_entry = self.POSE_FEATURES, self.MOTION_FEATURES
         else:
             first, per_entry = self.FREE_POSE_FEATURES, self.FREE_MOTION_FEATURES
-        return range(first, first + per_entry * (self._first_beam - self._first_motion))
+        return range(first, first + per_entry * (self._motion.stop - self._motion.start))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features (B, features_dim) of observations (B, d)."""
         features = self._timed_features if self._is_timed else self._free_features
-        motion, sensed = observations[:, self._first_motion : self._first_beam], observations[:, self._first_beam :]
-        ranges, geodesics = sensed[:, : self._beams], sensed[:, self._beams :]
-        parts = [*features(observations, motion), *_range_features(ranges)]
-        if geodesics.shape[1]:
-            parts += _detour_features(geodesics[:, :-1])
-            parts += self._distance_features(observations, geodesics[:, -1:])
+        parts = [*features(observations, observations[:, self._motion]), *_range_features(observations[:, self._lidar])]
+        if self._detours is not None and self._distance is not None:
+            parts += _detour_features(observations[:, self._detours])
+            parts += self._distance_features(observations, observations[:, self._distance])
         return th.cat(parts, dim=1)
 
     def _distance_features(self, observations: th.Tensor, distance: th.Tensor) -> list[th.Tensor]:

@@ -19,7 +19,7 @@ from torch import nn
 
 import leapnav
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.entries import ACTION, observation_entries
+from leapnav.envs.simulation.observations import ACTION, observation_entries
 from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.training.policies.actors import mean_action, policy_of

@@ -24,7 +24,8 @@ from stable_baselines3.common.policies import BasePolicy
 
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots.base import robot_class
-from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, has_time_left
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, ObservationLayout
 from leapnav.training.policies.architecture import ACTIVATIONS, EXTRACTORS, Architecture, is_actor_weight, widths
 
 # Kinds of policies by the module of their class, with the default widths of Stable-Baselines3.
@@ -97,21 +98,26 @@ def _environment(path: Path, data: Mapping[str, Any], given: Mapping[str, Any] |
     shape = stored.get("_shape")
     arguments = dict(given or {})
     if given is None and isinstance(shape, list) and len(shape) == 1 and shape[0] > FREE_GOAL_ENTRIES:
+        # The range of the lidar is the last bound; NumPy's text of a long vector contains it, too.
         high = [float(number) for number in re.findall(r"[-+]?\d[\d.e+-]*", str(stored.get("high")))] or [10.0]
-        is_timed = has_time_left(np.array(high)) and shape[0] > GOAL_ENTRIES
-        goal = GOAL_ENTRIES if is_timed else FREE_GOAL_ENTRIES
-        arguments = {"lidar_beams": shape[0] - goal, "lidar_range": high[-1]}
-        if not is_timed:
-            arguments["horizon"] = "free"
+        for kind, n_goal in (({}, GOAL_ENTRIES), ({"horizon": "free"}, FREE_GOAL_ENTRIES)):
+            arguments = {"lidar_beams": max(shape[0] - n_goal, 0), "lidar_range": high[-1], **kind}
+            if _has_bounds(ObservationLayout(EnvironmentSettings(**arguments)).space, stored):
+                break
     space: Any = NavigateEnv(split="fresh", **arguments).observation_space
     is_box = isinstance(space, spaces.Box) and shape == list(space.shape)
-    if not is_box or any(str(getattr(space, side)) != stored.get(side) for side in ("low", "high")):
+    if not is_box or not _has_bounds(space, stored):
         kind = "a Box" if shape else "no Box"
         raise ValueError(
             f"{path}: its observations ({kind} of shape {tuple(shape or ())}) are not those of the environment with "
             f"{arguments or 'the defaults'}; give the arguments it was trained with (--env observation=map, ...)"
         )
     return arguments, space
+
+
+def _has_bounds(space: Any, stored: Mapping[str, Any]) -> bool:
+    """Return whether the bounds of a space are those that a file describes."""
+    return all(str(getattr(space, side)) == stored.get(side) for side in ("low", "high"))
 
 
 def _architecture(path: Path, data: Mapping[str, Any]) -> Architecture:
