@@ -2,6 +2,7 @@
 
 import json
 import re
+import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -108,3 +109,14 @@ def test_what_is_compiled_is_not_compiled_again(tmp_path, capsys):
     assert found["compiled"] == 0
     assert Path(found["cache"]).is_dir()
     assert failing(["compile", "--jobs", "0"], capsys) == (2, "leapnav: jobs: expected an integer >= 1, got 0\n")
+
+
+def test_kernels_are_compiled_without_the_packages_of_extras():
+    extras = ("casadi", "dask", "distributed", "moviepy", "onnx", "onnxruntime", "sb3_contrib", "starlette", "yaml")
+    code = (
+        f"import sys\nsys.modules.update(dict.fromkeys({extras}))\n"  # importing them raises ModuleNotFoundError
+        "from leapnav.commands.installation.compile import compile_missing\n"
+        "print(compile_missing()['compiled'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().isdigit()

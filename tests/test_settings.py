@@ -23,7 +23,7 @@ from leapnav.envs import (
     Scenario,
     ScenarioBank,
 )
-from leapnav.envs.simulation.observations import GOAL_ENTRIES, MOTION_ENTRIES
+from leapnav.envs.simulation.observations import GOAL_ENTRIES, MOTION_ENTRIES, parts_of
 from leapnav.envs.simulation.sensing import WALL_ENTRIES
 
 ID, GOAL_ID = "leapnav/Navigate-v0", "leapnav/NavigateGoal-v0"
@@ -208,6 +208,27 @@ def slide(grip):
 def test_tyres_slip_sideways_when_they_do_not_grip():
     assert slide(grip=2.0) < 0.1
     assert slide(grip=0.2) > 0.5
+
+
+def test_a_robot_with_motors_collides_with_each_disc_of_its_footprint():
+    disc = {"circle": {"center": [6.5, 5.0], "radius": 0.5}}
+    clearances = []
+    for footprint in ([(0.0, 0.2)], [(0.0, 0.2), (0.6, 0.2)]):
+        robot = {"footprint": [{"offset": offset, "radius": radius} for offset, radius in footprint]}
+        task = scenario(start=[4.0, 5.0, 0.0], goal=[5.0, 3.0, 0.0], obstacles=[disc], robot=robot, horizon=4.0)
+        env = NavigateEnv(scenario=task, actuation="motor", observation="state")
+        env.reset()
+        terminated = False
+        while not terminated:
+            *_, terminated, _, info = env.step(np.array([1.0, 0.0]))
+        assert info["collision"]
+        clearances.append(6.0 - info["pose"][0])
+    assert clearances == pytest.approx([0.2, 0.8], abs=1e-3)
+
+
+def test_a_map_has_other_parts_than_a_network_for_the_lidar_expects():
+    with pytest.raises(ValueError, match="observation_space: expected goal, motion, lidar and detours"):
+        parts_of(NavigateEnv(split="fresh", observation="map").observation_space)
 
 
 def test_the_motors_effort_is_that_of_the_motion():

@@ -191,7 +191,7 @@ class Scenario(Frozen):
 
     @cached_property
     def task(self) -> Task:
-        """The task as arrays for the simulation and for banks.
+        """The task as arrays for the simulation and for banks (read-only).
 
         Raises:
             ScenarioError: the horizon is fixed, and the time has a weight.
@@ -203,7 +203,9 @@ class Scenario(Frozen):
             raise ScenarioError(one_line(self.name, [message]))
         goal = [math.nan if value is None else value for value in self.goal_state]
         vectors = self.start_state, goal, robot.limits(), robot.control_weight(cost), robot.parameters(cost)
-        return Task(*(np.array(vector, dtype=float) for vector in vectors))
+        for array in (task := Task(*(np.array(vector, dtype=float) for vector in vectors))):
+            array.flags.writeable = False
+        return task
 
     def from_state(self, state: Sequence[float] | np.ndarray, time: float) -> Self:
         """Return the rest of the scenario from a state (n,) of the robot at a time (s).

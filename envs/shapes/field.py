@@ -109,7 +109,7 @@ def shapes_near(x, y, field):
     return records_of(field, start + bounds[0], bounds[1] - bounds[0], COUNT)
 
 
-class Part(NamedTuple):
+class FieldPart(NamedTuple):
     """A disc or a rounded convex polygon of a packed field.
 
     Attributes:
@@ -148,11 +148,11 @@ def pack_field(
         for part in shape.parts():
             vertices, rounding = part.rounded_polygon()
             # A capsule of length zero is a disc.
-            parts.append(Part(vertices[:1] if (vertices == vertices[0]).all() else vertices, rounding, index))
+            parts.append(FieldPart(vertices[:1] if (vertices == vertices[0]).all() else vertices, rounding, index))
     return _pack(parts, arena, (weight, scale, radius), grid=grid)
 
 
-def _pack(parts: Sequence[Part], arena: Any, costs: Sequence[float], *, grid: bool = True) -> np.ndarray:
+def _pack(parts: Sequence[FieldPart], arena: Any, costs: Sequence[float], *, grid: bool = True) -> np.ndarray:
     """Return the packed field of parts, an arena, and proximity weight, proximity scale and radius."""
     header = np.zeros(1, HEADER)
     header["weight"], header["scale"], header["radius"] = costs
@@ -181,7 +181,7 @@ def _pack(parts: Sequence[Part], arena: Any, costs: Sequence[float], *, grid: bo
     return field
 
 
-def _grid_lists(parts: Sequence[Part], edges: Sequence[np.ndarray], header: Any) -> list[Sequence[int]]:
+def _grid_lists(parts: Sequence[FieldPart], edges: Sequence[np.ndarray], header: Any) -> list[Sequence[int]]:
     """Return the shapes that contribute in each cell of a grid, which is written to the header.
 
     Obstacles contribute up to CUTOFF proximity scales from the robot's rim. They may extend beyond the arena.
@@ -234,13 +234,15 @@ def _unpack(field: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
     return header, field[HEADER_SIZE:middle].view(SHAPE), field[middle:end].view(EDGE)
 
 
-def field_parts(field: np.ndarray) -> list[Part]:
+def field_parts(field: np.ndarray) -> list[FieldPart]:
     """Return the parts of a packed field."""
     _, shapes, edges = _unpack(field)
     parts = []
     for x, y, _, rounding, first, count, obstacle in shapes.tolist():
         rows = edges[first : first + count]
-        parts.append(Part(np.stack([rows["x"], rows["y"]], 1) if count else np.array([[x, y]]), rounding, obstacle))
+        parts.append(
+            FieldPart(np.stack([rows["x"], rows["y"]], 1) if count else np.array([[x, y]]), rounding, obstacle)
+        )
     return parts
 
 
@@ -263,7 +265,7 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
     if [len(part.vertices) for part in a] != [len(part.vertices) for part in b]:
         raise ValueError("obstacles: two fields can be blended only if they contain the same kinds of obstacles")
     parts = [
-        Part(blend(one.vertices, other.vertices), blend(one.rounding, other.rounding), one.obstacle)
+        FieldPart(blend(one.vertices, other.vertices), blend(one.rounding, other.rounding), one.obstacle)
         for one, other in zip(a, b, strict=True)
     ]
     one, other = read_header(first), read_header(second)

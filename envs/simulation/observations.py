@@ -116,6 +116,10 @@ def parts_of(space: spaces.Box) -> dict[str, slice]:
 
     Stable-Baselines3 passes nothing but the space to a features extractor, so the bounds are compared with those of the
     entries of each part.
+
+    Raises:
+        ValueError: the space contains other parts, such as a map.
+
     """
     bounds = list(zip(space.low.tolist(), space.high.tolist(), strict=True))
     end = GOAL_ENTRIES if bounds[TIME_LEFT:GOAL_ENTRIES] == _bounds(_TIMED_GOAL[TIME_LEFT:]) else FREE_GOAL_ENTRIES
@@ -128,6 +132,8 @@ def parts_of(space: spaces.Box) -> dict[str, slice]:
         middle = end + beams // 2
         parts["detours"], parts["distance"] = slice(middle, len(bounds) - 1), slice(len(bounds) - 1, len(bounds))
         beams //= 2
+    if any(low < 0.0 for low, _ in bounds[end:]):
+        raise ValueError("observation_space: expected goal, motion, lidar and detours, got other parts, such as a map")
     return {**parts, "lidar": slice(end, end + beams)}
 
 

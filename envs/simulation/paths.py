@@ -1,7 +1,7 @@
 """The path of a robot during a control period (kernels): first contact, clearance, proximity and state cost.
 
-The path is that of the model's `advance` with held controls. The kernels are inlined: a call would pass the 60 words of
-a `Path`, and a period would take 1.5 of the time.
+The path is that of the model's `advance` with held controls. The kernels are inlined: calls would pass all arrays of a
+`Path` by value, and a step of 1,024 unicycles would take 1.4 of the time.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ class Path(NamedTuple):
         discs (D, 2): footprint.
         field: packed obstacle field.
         duration: s.
-        samples (5, n): working memory: the states at the nodes of a panel, and two other states.
+        samples (5 or more, n): working memory: the states at the nodes of a panel, and two other states. Further rows
+            are not used.
 
     """
 

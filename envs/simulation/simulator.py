@@ -146,9 +146,10 @@ class BatchSimulator:
         if self._geodesic:
             self._store_maps(indices)
         stepping.start_episodes(indices, self._packed)
-        for i, generator in zip(indices.tolist(), generators, strict=False):
-            self._generators[i] = generator
-            self._draw_noise(i)
+        if self.settings.disturbed:
+            for i, generator in zip(indices.tolist(), generators, strict=True):
+                self._generators[i] = generator
+                self._draw_noise(i)
 
     def _reference(self, choice: Scenario | int, bank: ScenarioBank | None) -> np.ndarray | None:
         """Return the path (N, n) of the optimum that guides the shaped reward; None without such a reward or path."""
@@ -276,15 +277,15 @@ class BatchSimulator:
             ahead = velocity[0] * math.cos(pose[2]) + velocity[1] * math.sin(pose[2])
             for name, value in zip(model.velocity_states, (ahead, velocity[2]), strict=True):
                 state[model.state_names.index(name)] = value
+        # The effort is that of the actual motion, or of the controls, which are held. Further states change also in
+        # contact; the state cost is that at both ends of the period.
         if self.settings.commands_motion:
             episode["effort"] += stepping.effort(sim.weights[i], np.sqrt([speeds, turn_rates]))
         else:
-            # The controls are held, and further states change by them also in contact; the state cost is that at both
-            # ends of the period.
             episode["effort"] += stepping.effort(sim.weights[i], controls) * duration
-            if model.state_cost is not None:
-                ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
-                episode["effort"] += ends / 2 * duration
+        if model.state_cost is not None:
+            ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
+            episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
         episode["pose_clearance"] = footprint_clearance(*pose.tolist(), discs, field)[0]
         episode["clearance"] = min(episode["clearance"], lowest)

@@ -143,6 +143,8 @@ def command(actions, active, packed):
 def _follow(sim, i, motion, u, duration, scratch):
     """Move robot i with controls u for a duration (s), up to the first contact, and add the proximity and state cost.
 
+    The rows of `scratch` (7 or more, n) are those of `Path.samples`, and two for the states at both ends.
+
     Returns:
         The fraction of the duration before the contact, or 1.
 
