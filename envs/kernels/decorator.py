@@ -25,11 +25,20 @@ from numba.extending import typeof_impl
 
 
 class Declaration(NamedTuple):
-    """What is declared of a kernel: its signature, its cache directory, and the kernels that it calls."""
+    """What is declared of a kernel.
+
+    Attributes:
+        signature: its signature.
+        directory: its cache directory.
+        callees: the kernels that it calls; instead of one that Numba inlines, the callees of that one.
+        inlined: whether Numba inlines it, so that it is compiled only if Python calls it.
+
+    """
 
     signature: Any
     directory: Path
     callees: tuple[Any, ...]
+    inlined: bool
 
 
 DECLARATIONS: dict[Any, Declaration] = {}  # of all kernels of the imported modules; callees come first
@@ -68,8 +77,11 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any
             )
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
-        callees = tuple(value for value in used.values() if _is_kernel(value))
-        DECLARATIONS[compiled] = Declaration(signature, directory, callees)
+        callees: list[Any] = []
+        for value in filter(_is_kernel, used.values()):
+            callees += DECLARATIONS[value].callees if DECLARATIONS[value].inlined else [value]
+        inlined = options.get("inline") == "always"
+        DECLARATIONS[compiled] = Declaration(signature, directory, tuple(dict.fromkeys(callees)), inlined)
         return compiled
 
     return declare
@@ -84,8 +96,11 @@ def record_type(record: type[NamedTuple], **fields: types.Type) -> Any:
 
 
 def kernels_of(*modules: str) -> list[Any]:
-    """Return the kernels of the imported modules with these names, and of those below them."""
-    return [one for one in DECLARATIONS if f"{one.py_func.__module__}.".startswith(tuple(f"{m}." for m in modules))]
+    """Return the kernels of the imported modules with these names, and of those below them, except inlined ones."""
+    names = tuple(f"{module}." for module in modules)
+    return [
+        one for one, own in DECLARATIONS.items() if not own.inlined and f"{one.py_func.__module__}.".startswith(names)
+    ]
 
 
 def _globals(function: Callable[..., Any]) -> dict[str, Any]:
