@@ -126,10 +126,10 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     ## Episode end
     The episode is `terminated` at the horizon, which is part of the task (the time left is observed), or at a
     collision. It is never `truncated`. With `terminate_on_collision=False`, the robot continues in contact with the
-    obstacle, as simulated by pymunk, until the horizon; Phi is large there, 100 k with the default scale. The episode
-    is a success if, at the horizon, the robot is within `position_tolerance` and `heading_tolerance` of the goal and
-    has not collided. Further states of the robot with a goal, such as the speed of the dynamic unicycle, must be within
-    `motion_tolerance` of it.
+    obstacle, as simulated by pymunk, until the horizon, and pushes obstacles that have a `mass`; Phi is large there,
+    100 k with the default scale. The episode is a success if, at the horizon, the robot is within `position_tolerance`
+    and `heading_tolerance` of the goal and has not collided. Further states of the robot with a goal, such as the speed
+    of the dynamic unicycle, must be within `motion_tolerance` of it.
 
     With `horizon="free"`, the episode is `terminated` at the end of the first step after which the robot is within the
     tolerances of the goal, or at a collision. It is `truncated` at the time limit of the scenario, which is not

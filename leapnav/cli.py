@@ -9,6 +9,7 @@ import errno
 import os
 import sys
 from concurrent.futures import BrokenExecutor
+from contextlib import suppress
 from typing import Any
 
 import tyro
@@ -21,30 +22,32 @@ from leapnav.commands.installation.compile import Compile
 from leapnav.commands.installation.completion import Completion
 from leapnav.commands.installation.doctor import Doctor
 from leapnav.commands.play import Play
-from leapnav.commands.report import Report
-from leapnav.commands.rollout import Rollout
+from leapnav.commands.rollout import CheckDataset, Rollout
 from leapnav.commands.scenario.prove import CheckProof, Prove
 from leapnav.commands.scenario.solve import Solve
-from leapnav.commands.train import TrainCommand, train_command
+from leapnav.commands.train import (
+    TrainCommand,
+    default_configurations,
+    probes,
+    train_command,
+    tuned_configurations,
+)
 from leapnav.commands.watch import Watch
-from leapnav.commands.worlds.benchmark import Benchmark
-from leapnav.commands.worlds.import_worlds import Import
+from leapnav.commands.worlds import Worlds
 from leapnav.outputs import FAILED, json_on_stdout
-from leapnav.usage import parse_or_explain
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
 COMMANDS = {
     "solve": Solve,
     "prove": Prove,
-    "check-proof": CheckProof,
+    "proof": CheckProof,
     "bank": Bank,
-    "import": Import,
+    "worlds": Worlds,
     "rollout": Rollout,
-    "train": TrainCommand,  # `parse` replaces it by a class whose defaults are those of the family
+    "dataset": CheckDataset,
+    "train": TrainCommand,  # `parse` replaces it by a class with default configurations
     "evaluate": Evaluate,
-    "benchmark": Benchmark,
-    "report": Report,
     "export": Export,
     "watch": Watch,
     "play": Play,
@@ -58,20 +61,40 @@ COMMANDS = {
 def parse(arguments: list[str]) -> Any:
     """Parse the command line.
 
+    The default settings of a training run depend on its other settings. It is therefore parsed twice.
+
     Args:
         arguments: the words after `leapnav`.
 
     Returns:
-        The command, an instance of one of `COMMANDS`; its method `run` returns the exit code.
+        The command, or that of a group of commands; its method `run` returns the exit code.
 
     Raises:
         FileNotFoundError: there is no run to resume.
-        ValueError: an argument of `train` is invalid, or the run to resume is damaged.
-        SystemExit: the arguments are invalid, or ask for help.
+        ValueError: the family of a training run is unknown, or the run to resume is damaged.
+        SystemExit: the arguments are invalid (exit code 2, with tyro's message), or ask for help.
 
     """
-    commands = {**COMMANDS, "train": train_command(arguments)}
-    return tyro.extras.subcommand_cli_from_dict(commands, prog="leapnav", description=DESCRIPTION, args=arguments)
+    command: Any = None
+    if arguments[:1] == ["train"]:
+        words = [word for word in arguments if word not in ("-h", "--help")]
+        with suppress(SystemExit):  # the second time prints the error
+            command = _parse(words, train_command(probes(), needs_out=False), console_outputs=False)
+    defaults = default_configurations() if command is None else tuned_configurations(command.config)
+    command = _parse(arguments, train_command(defaults))
+    while not hasattr(command, "run"):
+        command = command.action
+    return command
+
+
+def _parse(arguments: list[str], train: type[TrainCommand], *, console_outputs: bool = True) -> Any:
+    return tyro.extras.subcommand_cli_from_dict(
+        {**COMMANDS, "train": train},
+        prog="leapnav",
+        description=DESCRIPTION,
+        args=arguments,
+        console_outputs=console_outputs,
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -87,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
     command = None
     try:
         words = sys.argv[1:] if arguments is None else arguments
-        command = parse_or_explain(parse, words, tuple(COMMANDS))
+        command = parse(words)
         with json_on_stdout(getattr(command, "json", None)):
             return command.run()
     except BrokenPipeError:  # the process that read the output has ended, as in `leapnav bank show ... | head`

@@ -8,7 +8,6 @@ import pytest
 
 from leapnav import durations
 from leapnav.cli import main
-from leapnav.commands.installation.completion import complete_choices
 from leapnav.commands.options import Family, FamilyOrAll, Horizon, PolicyName, parse_environment
 from leapnav.envs import FAMILIES
 from leapnav.envs.settings import HORIZONS
@@ -35,19 +34,13 @@ def completed(script, *words):
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_families_and_policies_are_completed(tmp_path, capsys):
+def test_commands_and_choices_are_completed(tmp_path, capfd):
     assert main(["completion", "bash"]) == 0
     script = tmp_path / "leapnav.bash"
-    script.write_text(capsys.readouterr().out)
-    assert completed(script, "leapnav", "rollout", "--family", "r") == ["rooms"]
-    assert completed(script, "leapnav", "watch", "--policy", "cl") == ["clutter"]
-    (tmp_path / "my_policy").mkdir()
-    assert completed(script, "leapnav", "watch", "--policy", "my") == ["my_policy"]  # files, if no choice fits
+    script.write_text(capfd.readouterr().out)
+    assert completed(script, "leapnav", "rollout", "--horizon", "fr") == ["free"]
+    assert completed(script, "leapnav", "bank", "ver") == ["verify"]
     assert "evaluate" in completed(script, "leapnav", "e")
-
-
-def test_a_script_without_open_choices_is_left_alone():
-    assert complete_choices("{'flags': ['--count'], 'type': 'value'}") == "{'flags': ['--count'], 'type': 'value'}"
 
 
 @pytest.mark.parametrize(

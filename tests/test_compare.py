@@ -57,7 +57,7 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
     print_scores(found)
     plot_scores(found, tmp_path / "scores.png")
     plot_episodes(found.banks, found.runs["function"][0].episodes, tmp_path / "episodes.png")
-    assert write_report(found, tmp_path / "report.html") is found
+    write_report(found, tmp_path / "report.html", progress=False)
     page = (tmp_path / "report.html").read_text()
     assert "Comparison of policies" in page and "Learning curves" not in page and "<h2>Runs</h2>" not in page
     assert page.count("data:image/png") == 2 * len(rows)  # episodes and decisions
@@ -93,6 +93,6 @@ def test_the_commands_take_models_of_stable_baselines3(env, tmp_path, monkeypatc
     PPO("MlpPolicy", env, policy_kwargs=network(SMALL), device="cpu").save("model.zip")
     assert main(["evaluate", "mine=model.zip", "expert", "--family", "open", "--count", "2"]) == 0
     assert "mine" in capsys.readouterr().out
-    assert main(["report", "model.zip", "--family", "open", "--count", "2", "--out", "page.html"]) == 0
+    assert main(["evaluate", "model.zip", "go-to-goal", "--family", "open", "--count", "2", "--html", "page.html"]) == 0
     page = (tmp_path / "page.html").read_text()
     assert "model.zip" in page and "go-to-goal" in page and "Learning curves" not in page

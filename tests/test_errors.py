@@ -1,12 +1,13 @@
 """Error messages of invalid input, from tables of an input and, below it, its message. No file is written.
 
 `data/errors_on_the_command_line.txt` contains arguments of `leapnav`; `data/errors_in_python.txt` contains expressions,
-whose names are the public ones and those of the fixture `names`. `data/plausible_mistakes.txt` contains 40 mistakes of
-new users, of both kinds: each message states the field, the value and what to do.
+whose names are the public ones and those of the fixture `names`. `data/plausible_mistakes.txt` and `USAGE` contain 40
+mistakes of new users, of both kinds: each message states the field, the value and what to do.
 """
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 
@@ -101,8 +102,35 @@ COMMANDS = [row for row in MISTAKES if row.id.startswith("leapnav ")]
 EXPRESSIONS = [row for row in MISTAKES if row not in COMMANDS]
 
 
+USAGE = {  # errors in the words themselves, and what the message of tyro contains
+    "evalute expert": ["evalute", "evaluate"],
+    "evaluate expert --famly open": ["--famly", "Perhaps you meant", "--family"],
+    "evaluate expert --count ten": ["--count", "'ten'"],
+    "evaluate expert --split exam": ["'exam'", "--split", "'test', 'train'"],
+    "train bcc --out run": ["bcc", "bc, dagger, ppo, sac"],
+    "train bc": ["--out", "Run directory"],
+    "train bc --resume": ["--out", "Run directory"],
+    "train bc --cloning.epoch 3 --out run": ["--cloning.epoch,", "Perhaps you meant", "--cloning.epochs"],
+    "solve": ["PATH", "Scenario file (JSON)"],
+    "solve good.json --method newton": ["'newton'", "--method", "'multiple_shooting'"],
+    "bank bild --out x.bank": ["bild", "build, show, verify, card, prove"],
+    "export clutter": ["--onnx", "Output file (.onnx)"],
+}
+
+
+@pytest.mark.parametrize("words", USAGE)
+def test_usage_errors_name_the_word(words, folder, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    printed = capsys.readouterr()
+    text = " ".join(re.sub(r"[╭╮╰╯│─]", " ", printed.err).split())
+    assert end.value.code == 2 and printed.out == ""
+    for word in USAGE[words]:
+        assert word in text
+
+
 def test_there_are_forty_plausible_mistakes():
-    assert len(MISTAKES) == 40 and len(COMMANDS) >= 20 and len(EXPRESSIONS) >= 12
+    assert len(MISTAKES) + len(USAGE) >= 40 and len(COMMANDS) + len(USAGE) >= 20 and len(EXPRESSIONS) >= 12
 
 
 @pytest.mark.parametrize(("words", "line"), rows("errors_on_the_command_line.txt") + COMMANDS)

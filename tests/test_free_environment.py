@@ -215,7 +215,7 @@ def test_the_value_does_not_depend_on_the_time():
 def test_demonstrations_are_written_checked_and_learned_from(tmp_path):
     assert main(f"rollout --out {tmp_path} --family open --horizon free --count 6 --recoveries 1".split()) == 0
     assert (tmp_path / dataset_id("open", horizon="free")).is_dir()
-    assert main(f"rollout --out {tmp_path} --check".split()) == 0
+    assert main(f"dataset check {tmp_path}".split()) == 0
     demonstrations = load_demonstrations(tmp_path)
     for demonstration in demonstrations:
         cost = demonstration.running_cost.sum()

@@ -69,7 +69,7 @@ def test_a_bank_of_given_scenarios_names_what_it_rejects(tmp_path):
 def test_a_data_card_says_where_the_scenarios_come_from(tmp_path, capsys):
     sources = {"origin": "a laboratory", "licence": "cc-by-4.0"}
     bank = build_bank_of([sample_scenario("open", 5)], tmp_path / "lab.bank", **sources, progress=False)
-    assert main(["bank", "show", str(bank.path), "--card"]) == 0
+    assert main(["bank", "card", str(bank.path)]) == 0
     card = capsys.readouterr().out
     assert card == data_card(bank) and not list(tmp_path.glob("*.png"))
     _, metadata, text = card.split("---\n", 2)
@@ -104,7 +104,7 @@ def test_files_are_scenarios_of_a_bank_and_of_a_family(folder, tmp_path, capsys,
     assert "closed: rejected: no certified optimum\nwrote mine.bank: 3 of 4 given scenarios (1 rejected: " in printed
     bank = ScenarioBank("mine.bank")
     assert [scenario.name for scenario in bank] == ["0", "clutter-6", "clutter-7"]
-    assert main(["bank", "show", "mine.bank", "--count", "0"]) == 0
+    assert main(["bank", "show", "mine.bank"]) == 0
     assert "3 scenarios of mine, given, leapnav" in capsys.readouterr().out
     evaluation = evaluate(load_policy("clutter"), bank, environment=policy_environment("clutter"), progress=False)
     assert [episode.family for episode in evaluation] == ["mine"] * 3

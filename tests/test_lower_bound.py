@@ -399,17 +399,17 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["prove", str(scenario), "--gap", "0.2", "--proof", str(proof), "--plot", str(plot)]) == 0
     assert "gap                20.000 %" in capsys.readouterr().out
     assert plot.stat().st_size > 10_000
-    assert main(["check-proof", str(proof)]) == 0
+    assert main(["proof", "check", str(proof)]) == 0
     assert "no collision-free path costs less than" in capsys.readouterr().out
-    assert main(["check-proof", str(proof), "--scenario", str(scenario)]) == 0
+    assert main(["proof", "check", str(proof), "--scenario", str(scenario)]) == 0
     other = tmp_path / "other.json"
     Scenario.from_dict(SCENARIO.to_dict() | {"horizon": 7.0}).to_json(other)
-    assert main(["check-proof", str(proof), "--scenario", str(other)]) == 1
+    assert main(["proof", "check", str(proof), "--scenario", str(other)]) == 1
     false = replace(Proof.load(proof), value=100.0)
     false.save(proof)
-    assert main(["check-proof", str(proof)]) == 1
+    assert main(["proof", "check", str(proof)]) == 1
     proof.write_text("x")
-    assert main(["check-proof", str(proof)]) == 2
+    assert main(["proof", "check", str(proof)]) == 2
 
 
 def test_a_picture_shows_each_spacing(bound: LowerBound, optimum: Optimum):

@@ -14,7 +14,6 @@ from leapnav.envs import Circle, NavigateEnv, Obstacle, Scenario, ScenarioBank, 
 from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.experts import build_bank, load_demonstrations, rollout
 from leapnav.training import PPOConfig, evaluate, train_ppo
-from leapnav.training.scoring.html_report import write_report
 
 MODULE = """
 from leapnav.envs import Circle, Obstacle, ScenarioLayout
@@ -115,7 +114,8 @@ def test_a_run_trains_and_is_evaluated(module, tmp_path):
     bank = ScenarioBank(tmp_path / "run" / "test.bank")
     assert len(evaluation) == len(bank) == 100 and bank.family == module
     assert len(evaluate(lambda observation: np.zeros(2), bank, count=2, progress=False)) == 2
-    write_report([tmp_path / "run"], tmp_path / "report.html", count=2, progress=False)
+    command = ["evaluate", str(tmp_path / "run"), "--count", "2", "--html", str(tmp_path / "report.html")]
+    assert main(command) == 0
     assert module in (tmp_path / "report.html").read_text()
 
 

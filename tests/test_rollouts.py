@@ -233,17 +233,17 @@ def test_a_dataset_is_replayed(whole, tmp_path, capsys):
     replay = check_dataset(whole, progress=False)
     assert replay.episodes > 100
     assert (replay.observation, replay.reward, replay.state) == (0.0, 0.0, 0.0)
-    assert main(["rollout", "--check", "--out", str(whole)]) == 0
+    assert main(["dataset", "check", str(whole)]) == 0
     assert f"{replay.episodes} episodes replayed" in capsys.readouterr().out
     changed = tmp_path / "changed"
     shutil.copytree(whole, changed)
     (file,) = changed.glob("**/main_data.hdf5")
     with h5py.File(file, "r+") as data:
         data["episode_7/rewards"][3] += 0.5
-    assert main(["rollout", "--check", "--out", str(changed)]) == 1
+    assert main(["dataset", "check", str(changed)]) == 1
     assert "rewards 5.0e-01" in (line := capsys.readouterr().out)
     assert "(episode 7)" in line
-    assert main(["rollout", "--check", "--out", str(tmp_path / "nowhere")]) == 2
+    assert main(["dataset", "check", str(tmp_path / "nowhere")]) == 2
 
 
 def test_the_dataset_has_reference_scores_seeds_and_costs(whole, monkeypatch):

@@ -43,7 +43,7 @@ def test_a_map_of_ros_has_scenarios_between_its_walls(tmp_path, capsys, monkeypa
     inverted = write_ros_map(tmp_path, 255 - rooms_in_gray(), negate=1, occupied_thresh=0.65, free_thresh=0.196)
     assert (read_ros_map(inverted).blocked == grid.blocked).all()
     assert len(grid.obstacles()) < 12
-    assert main(["import", "ros-map", "map.yaml", "--count", "3", "--out", "lab"]) == 0
+    assert main(["worlds", "import", "ros-map", "map.yaml", "--count", "3", "--out", "lab"]) == 0
     scenarios = read_scenarios("lab")
     assert [scenario.name for scenario in scenarios] == ["map-0", "map-1", "map-2"]
     for scenario in scenarios:
@@ -119,7 +119,7 @@ def test_unknown_cells_below_the_free_threshold_are_reported(tmp_path, capsys):
     path = write_ros_map(tmp_path, rooms_in_gray(), free_thresh=0.25)
     with pytest.warns(UserWarning, match=r"free_thresh: 25 cells with the gray value 205.* are read as free"):
         assert not read_ros_map(path).blocked[3, 3]
-    assert main(["import", "ros-map", str(path), "--count", "1", "--out", str(tmp_path / "out")]) == 0
+    assert main(["worlds", "import", "ros-map", str(path), "--count", "1", "--out", str(tmp_path / "out")]) == 0
     error = capsys.readouterr().err
     assert error.startswith(f"leapnav: warning: {path}: free_thresh: 25 cells") and error.count("\n") == 1
     with warnings.catch_warnings():

@@ -32,7 +32,9 @@ from leapnav.training.robots.rewards import GradedMiss
 from leapnav.training.robots.vec_env import environment_seed
 from leapnav.training.runs.imitation import train_bc, train_dagger
 from leapnav.training.runs.reinforcement import _resolve_warm_start, make_training_env, train_ppo, train_sac
+from leapnav.training.scoring.comparison import compare_policies, default_banks
 from leapnav.training.scoring.html_report import write_report
+from leapnav.training.scoring.policy_specs import load_policy_spec
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
 COMMON = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 4}
@@ -417,16 +419,16 @@ def test_the_report_is_one_page_that_needs_nothing_else(demos, tmp_path):
         folders.append(str(tmp_path / f"bc{seed}"))
     train_ppo(ppo(tmp_path / "ppo"), progress=False)
     page = tmp_path / "report.html"
-    found = write_report([*folders, str(tmp_path / "ppo")], page, count=2, progress=False)
-    assert list(found.runs) == [folders[0], str(tmp_path / "ppo"), "expert", "go-to-goal", "random"]
-    assert [len(runs) for runs in found.runs.values()] == [2, 1, 1, 1, 1]
+    specs = [load_policy_spec(name) for name in (*folders, str(tmp_path / "ppo"), "go-to-goal")]
+    found = compare_policies(specs, default_banks(specs), count=2, progress=False)
+    write_report(found, page, progress=False)
+    assert list(found.runs) == [folders[0], str(tmp_path / "ppo"), "go-to-goal"]
+    assert [len(runs) for runs in found.runs.values()] == [2, 1, 1]
     text = page.read_text()
     assert text.count("<svg") == 3
-    assert text.count("data:image/png;base64") == 4  # episodes and decisions of each row
+    assert text.count("data:image/png;base64") == 6  # episodes and decisions of each row
     assert "http" not in text.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
         "http://creativecommons.org", ""
     ).replace("https://matplotlib.org", "")
     for words in ("by family", "by clearance", "by reversing", "(2 runs)"):
         assert words in text
-    with pytest.raises(FileNotFoundError):
-        write_report([str(demos)], page)

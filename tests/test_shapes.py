@@ -242,7 +242,7 @@ def test_scenarios_are_read_as_written(shape):
 @each_shape
 def test_frames_and_plots_show_it(shape):
     color = pygame.Color(OBSTACLE)
-    with_shape, empty = (draw_scene(Scene(s, s.start)) for s in (scenario_of(shape), scenario_of()))
+    with_shape, empty = (draw_scene(Scene(s, s.field, s.start)) for s in (scenario_of(shape), scenario_of()))
     found = np.all(with_shape == (color.r, color.g, color.b), axis=2).sum()
     inside = np.mean([distance_to(shape, x, y) < 0 for x, y in points(4000)])
     area = inside * 5.0 * 4.4

@@ -81,11 +81,11 @@ def test_worlds_of_the_barn_challenge_are_scenarios(challenge):
 
 def test_the_barn_challenge_runs_from_its_files_to_its_score(challenge, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["import", "barn", "challenge", "--out", "worlds"]) == 0
+    assert main(["worlds", "import", "barn", "challenge", "--out", "worlds"]) == 0
     assert "wrote 3 scenarios to worlds; next: leapnav bank build --scenarios worlds" in capsys.readouterr().out
     assert main(["bank", "build", "--scenarios", "worlds", "--out", "barn.bank", "--workers", "1"]) == 0
     words = ["--policy", "clutter", "random", "--bank", "barn2.bank", "--workers", "1", "--json", "barn.json"]
-    assert main(["benchmark", "barn", "challenge", *words]) == 0
+    assert main(["worlds", "benchmark", "barn", "challenge", *words]) == 0
     assert "BARN challenge" in capsys.readouterr().out
     bank, given = ScenarioBank("barn2.bank"), ScenarioBank("barn.bank")
     assert len(bank) == 3 and sorted(bank.costs) == sorted(given.costs)
@@ -109,7 +109,10 @@ def test_problems_on_a_grid_map_are_scenarios(tmp_path, capsys, monkeypatch):
     assert around.start[:2] == (1.0, 5.0) and around.goal == (15.0, 5.0, None) and below.start[:2] == (1.0, 1.0)
     assert around.horizon == round(9.65685425 * 2 / 0.8, 1) and around.start[2] == 0.0
     assert find_optimum(around).success
-    assert main(["import", "movingai", "rooms.map", "--scen", "rooms.map.scen", "--count", "1", "--out", "out"]) == 0
+    assert (
+        main(["worlds", "import", "movingai", "rooms.map", "--scen", "rooms.map.scen", "--count", "1", "--out", "out"])
+        == 0
+    )
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["rooms-2.json"]
     with pytest.raises(ScenarioError, match=r"start: .* is inside"):
         read_movingai_problems("rooms.map", "rooms.map.scen", robot=Unicycle(radius=0.8))
@@ -229,12 +232,12 @@ def test_problems_of_dynobench_are_scenarios_with_the_durations_of_other_planner
 
 def test_the_table_of_dynobench(dynobench, tmp_path, capsys):
     out = tmp_path / "table.json"
-    assert main(["benchmark", "dynobench", str(dynobench), "--tol", "0.2", "--json", str(out)]) == 0
+    assert main(["worlds", "benchmark", "dynobench", str(dynobench), "--tol", "0.2", "--json", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "unicycle2_v0-wall_0: left out: dynamics 'unicycle2'" in printed and "idbastar_v0" in printed
     (row,) = json.loads(out.read_text()).values()
     assert row["idbastar_v0"] == 4.0 and 2.4 < row["leapnav"] < 4.0 and row["clearance"] > 0
-    assert main(["import", "dynobench", str(dynobench), "--out", str(tmp_path / "scenarios")]) == 0
+    assert main(["worlds", "import", "dynobench", str(dynobench), "--out", str(tmp_path / "scenarios")]) == 0
     assert [scenario.name for scenario in read_scenarios(tmp_path / "scenarios")] == ["unicycle1_v0-wall_0"]
 
 

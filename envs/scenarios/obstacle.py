@@ -10,25 +10,30 @@ from pydantic_core import ErrorDetails, InitErrorDetails
 
 from leapnav.envs.shapes import Circle, Polygon, Shape
 from leapnav.envs.shapes.base import KINDS
-from leapnav.envs.utils.records import Frozen
+from leapnav.envs.utils.records import Frozen, Positive
 
 
 class Obstacle(Frozen):
-    """An obstacle: exactly one shape, given by its kind.
+    """An obstacle: exactly one shape, given by its kind, and its mass if the robot can push it.
 
-    In Python `Obstacle(circle=Circle(...))`, in the scenario file `{"circle": {...}}`. The kinds are the registered
-    shapes, see `leapnav.envs.Shape`.
+    In Python `Obstacle(circle=Circle(...), mass=2.0)`, in the scenario file `{"circle": {...}, "mass": 2.0}`. The kinds
+    are the registered shapes, see `leapnav.envs.Shape`.
 
     Attributes:
         shape: the shape.
+        mass: mass (kg) of an obstacle that moves while a robot pushes it, with the friction of the ground; None: it
+            does not move. The contact is a collision in both cases. Only an environment with
+            `terminate_on_collision=False` simulates the motion; the expert, the reference costs and the geodesic
+            distances treat the obstacle as fixed.
 
     """
 
     shape: Shape
+    mass: Positive | None = None
 
     if TYPE_CHECKING:
 
-        def __init__(self, **shape: Shape | None) -> None: ...
+        def __init__(self, *, mass: float | None = None, **shape: Shape | None) -> None: ...
 
     @model_validator(mode="before")
     @classmethod
@@ -36,6 +41,7 @@ class Obstacle(Frozen):
         if not isinstance(fields, Mapping):
             return fields
         given = {kind: shape for kind, shape in fields.items() if shape is not None}
+        mass = given.pop("mass", None)
         faults: list[InitErrorDetails] = [
             {"type": "extra_forbidden", "loc": (kind,), "input": value}
             for kind, value in given.items()
@@ -47,14 +53,15 @@ class Obstacle(Frozen):
         if not faults:
             ((kind, value),) = given.items()
             try:
-                return {"shape": KINDS[kind].model_validate(value)}
+                return {"shape": KINDS[kind].model_validate(value), "mass": mass}
             except ValidationError as error:
                 faults = [_inside(kind, details) for details in error.errors(include_url=False)]
         raise ValidationError.from_exception_data(cls.__name__, faults)
 
     @model_serializer
     def _serialize(self, info: SerializationInfo) -> dict[str, Any]:
-        return {self.shape.kind: self.shape.model_dump(mode=info.mode, exclude_none=info.exclude_none)}
+        shape = {self.shape.kind: self.shape.model_dump(mode=info.mode, exclude_none=info.exclude_none)}
+        return shape if self.mass is None else {**shape, "mass": self.mass}
 
     @property
     def circle(self) -> Circle | None:

@@ -64,6 +64,7 @@ HEADER_SIZE, SHAPE_SIZE, EDGE_SIZE = (kind.itemsize // 8 for kind in (HEADER, SH
 HEADER_TYPE, SHAPE_TYPE, EDGE_TYPE = from_dtype(HEADER), from_dtype(SHAPE), from_dtype(EDGE)
 SHAPES_TYPE, EDGES_TYPE, NUMBERS = (types.Array(kind, 1, "C", readonly=True) for kind in (SHAPE_TYPE, EDGE_TYPE, int64))
 COUNT = np.dtype("i8")
+COSTS = ("weight", "scale", "radius")
 
 # Terms of obstacles farther away than 30 sigma are skipped: they are below 1e-13 k, 1/10 of the integrator's tolerance.
 CUTOFF = 30.0
@@ -246,6 +247,12 @@ def field_parts(field: np.ndarray) -> list[FieldPart]:
     return parts
 
 
+def replace_parts(field: np.ndarray, parts: Sequence[FieldPart]) -> np.ndarray:
+    """Return the packed field of other parts in the same arena, with the same proximity cost."""
+    header = read_header(field)
+    return _pack(parts, header["arena"], [float(header[name]) for name in COSTS])
+
+
 def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.ndarray:
     """Interpolate linearly between two packed fields, obstacle by obstacle.
 
@@ -269,7 +276,7 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
         for one, other in zip(a, b, strict=True)
     ]
     one, other = read_header(first), read_header(second)
-    costs = [float(blend(one[name], other[name])) for name in ("weight", "scale", "radius")]
+    costs = [float(blend(one[name], other[name])) for name in COSTS]
     return _pack(parts, blend(one["arena"], other["arena"]), costs)
 
 
@@ -343,7 +350,7 @@ def _pack_again(packed: np.ndarray, *, grid: bool) -> np.ndarray:
         raise IndexError("a polygon has fewer than 2 edges")
     if (shapes["obstacle"] < 0).any() or (shapes["obstacle"] > n).any():
         raise IndexError("an index of an obstacle is invalid")
-    costs = [float(header[name]) for name in ("weight", "scale", "radius")]
+    costs = [float(header[name]) for name in COSTS]
     return _pack(field_parts(packed), header["arena"], costs, grid=grid)
 
 

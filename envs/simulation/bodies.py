@@ -10,24 +10,27 @@ not depend on either.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pymunk
 import pymunk.batch
 from numba import float64, types
+from pymunk.constraints import Constraint, GearJoint, PivotJoint
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
 from leapnav.envs.settings import Motor
 from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import field_parts, read_header
+from leapnav.envs.shapes.field import FieldPart, field_parts, read_header, replace_parts
 from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.envs.simulation.stepping import GRAVITY
 
 WALL_THICKNESS = 1.0  # m, outside the arena
 CONTACT_MARGIN = 1e-3  # m by which the rim is enlarged, so that a robot sliding along an obstacle stays in contact
 MAX_OVERLAP = 1e-6  # m, of a robot in contact with an obstacle
+GROUND_FRICTION = 0.5  # of obstacles with a mass; wood, cardboard and plastics on a floor have 0.3 to 0.6
 MAX_CORRECTED_STEP = 0.5  # robot radii: after a longer step the robot may be on the other side of an obstacle
 
 _KINEMATICS = (
@@ -82,27 +85,39 @@ Velocity = tuple[float, float, float]  # x, y, angular
 class ContactWorld:
     """One robot and the obstacles of its arena, for the control periods with contact.
 
+    Obstacles with a mass are at rest at the start of each period and whenever the robot does not push them.
+
     Args:
         field: the packed field of the scenario.
         discs (D, 2): footprint of the robot, offset along its heading and radius (m).
         motor: mass, moment of inertia and friction of the robot.
+        masses: mass (kg) of each obstacle; None: it does not move.
+
+    Attributes:
+        field: the packed field, in which the obstacles are where the robot has pushed them.
 
     """
 
-    def __init__(self, field: np.ndarray, discs: np.ndarray, motor: Motor) -> None:
-        self._field, self._discs, self._motor = field, discs, motor
+    def __init__(self, field: np.ndarray, discs: np.ndarray, motor: Motor, masses: Sequence[float | None] = ()) -> None:
+        self.field, self._discs, self._motor = field, discs, motor
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
         shapes: list[pymunk.Shape] = []
-        for vertices, radius, _ in field_parts(field):
-            points = vertices.tolist()
+        self._parts = field_parts(field)
+        self._movable = {k: pymunk.Body() for k, mass in enumerate(masses) if mass is not None}
+        for part in self._parts:
+            body, points = self._movable.get(part.obstacle, static), part.vertices.tolist()
             if len(points) == 1:
-                shapes.append(pymunk.Circle(static, radius, points[0]))
+                shapes.append(pymunk.Circle(body, part.rounding, points[0]))
             elif len(points) == 2:
-                shapes.append(pymunk.Segment(static, points[0], points[1], radius))
+                shapes.append(pymunk.Segment(body, points[0], points[1], part.rounding))
             else:
-                shapes.append(pymunk.Poly(static, points, radius=radius))
+                shapes.append(pymunk.Poly(body, points, radius=part.rounding))
+        for k, body in self._movable.items():
+            area = sum(shape.area for shape in body.shapes)
+            for shape in body.shapes:
+                shape.mass = (masses[k] or 0.0) * shape.area / area
         x_min, y_min, x_max, y_max = read_header(field)["arena"].tolist()
         t = WALL_THICKNESS
         for left, below, right, above in (
@@ -114,7 +129,9 @@ class ContactWorld:
             shapes.append(pymunk.Poly(static, [(left, below), (right, below), (right, above), (left, above)]))
         for shape in shapes:
             shape.friction = 1.0  # Chipmunk multiplies the coefficients of both shapes
-        self._space.add(*shapes)
+        self._space.add(*self._movable.values(), *shapes)
+        for body in self._movable.values():
+            self._space.add(*_ground_friction(static, body))
 
     def drive(
         self,
@@ -163,7 +180,8 @@ class ContactWorld:
         for _ in range(substeps):
             self._space.step(step)
             to_x, to_y, to_angle = _pose(body)
-            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, to_angle, self._discs, self._field)
+            self._move_obstacles()
+            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, to_angle, self._discs, self.field)
             body.position = to_x, to_y
             lowest = min(lowest, depth)
             speed_integral += ((to_x - x) ** 2 + (to_y - y) ** 2) / step
@@ -176,13 +194,37 @@ class ContactWorld:
         self._space.remove(body, *outline)
         return lowest, speed_integral, turn_integral, (phi_sum - phi / 2) * step
 
+    def _move_obstacles(self) -> None:
+        """Update the field after obstacles have moved."""
+        if not any(body.position != (0.0, 0.0) or body.angle for body in self._movable.values()):
+            return
+
+        def moved(part: FieldPart) -> FieldPart:
+            body = self._movable.get(part.obstacle)
+            if body is None:
+                return part
+            return part._replace(vertices=np.array([body.local_to_world(vertex) for vertex in part.vertices.tolist()]))
+
+        self.field = replace_parts(self.field, [moved(part) for part in self._parts])
+
     def _proximity(self, x: float, y: float, heading: float) -> float:
         """Return the proximity cost at a pose, with clearances larger by CONTACT_MARGIN.
 
         Chipmunk does not resolve the position of a robot in contact more finely, and Phi varies by a multiple there.
         """
         cos, sin, discs = math.cos(heading), math.sin(heading), self._discs.tolist()
-        return sum(proximity_value(x + a * cos, y + a * sin, r - CONTACT_MARGIN, self._field) for a, r in discs)
+        return sum(proximity_value(x + a * cos, y + a * sin, r - CONTACT_MARGIN, self.field) for a, r in discs)
+
+
+def _ground_friction(static: pymunk.Body, body: pymunk.Body) -> tuple[Constraint, ...]:
+    """Return the constraints by which the ground slows a body with the largest force and torque of its friction."""
+    force = GROUND_FRICTION * body.mass * GRAVITY
+    linear = PivotJoint(static, body, body.center_of_gravity, body.center_of_gravity)
+    angular = GearJoint(static, body, 0.0, 1.0)
+    linear.max_force, angular.max_force = force, force * math.sqrt(body.moment / body.mass)  # at the radius of gyration
+    for constraint in (linear, angular):
+        constraint.max_bias = 0.0  # the joint resists the velocity and does not return the body to its place
+    return linear, angular
 
 
 def _pose(body: pymunk.Body) -> tuple[float, float, float]:

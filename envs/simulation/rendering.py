@@ -13,7 +13,8 @@ import pygame
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
-from leapnav.envs.shapes import Circle
+from leapnav.envs.shapes import Capsule
+from leapnav.envs.shapes.field import field_parts
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.utils.colors import EDGE, FAILURE, GOAL, OBSTACLE, OPTIMUM, POLICY, WALL
 
@@ -30,6 +31,7 @@ class Scene:
 
     Attributes:
         scenario: the scenario of the episode.
+        field: the packed obstacle field, in which obstacles may have moved.
         pose: x, y (m) and heading (rad).
         trail: the poses of the episode so far.
         optimum (N, 3): the reference path, or None.
@@ -43,6 +45,7 @@ class Scene:
     """
 
     scenario: Scenario
+    field: np.ndarray
     pose: tuple[float, float, float]
     trail: Sequence[tuple[float, float, float]] = ()
     optimum: np.ndarray | None = None
@@ -68,6 +71,7 @@ def make_scene(
     episode = simulator.episode(robot)
     return Scene(
         scenario=get_scenario(choice, bank),
+        field=simulator.fields[robot],
         pose=tuple(simulator.states[robot, :3].tolist()),
         trail=trail,
         optimum=optimum,
@@ -101,13 +105,17 @@ def draw_scene(scene: Scene) -> np.ndarray:
     beams = _lidar_ends(to_pixels, scene)
     for end, _ in beams:
         pygame.draw.line(canvas, RAY, to_pixels(*scene.pose[:2]), end, max(1, line // 2))
-    for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
-        if isinstance(part, Circle):
-            center, radius = to_pixels(*part.center), part.radius * scale
+    for vertices, rounding, _ in field_parts(scene.field):
+        if len(vertices) == 1:
+            center, radius = to_pixels(*vertices[0].tolist()), rounding * scale
             pygame.draw.circle(canvas, OBSTACLE, center, radius)
             pygame.draw.circle(canvas, EDGE, center, radius, line)
         else:
-            corners = [to_pixels(*vertex) for vertex in part.outline().tolist()]
+            ends = map(tuple, vertices.tolist())
+            outline = (
+                vertices if rounding == 0.0 else Capsule(start=next(ends), end=next(ends), radius=rounding).outline()
+            )
+            corners = [to_pixels(*vertex) for vertex in outline.tolist()]
             pygame.draw.polygon(canvas, OBSTACLE, corners)
             pygame.draw.polygon(canvas, EDGE, corners, line)
     pygame.draw.rect(canvas, WALL, frame, 2 * line)

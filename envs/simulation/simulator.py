@@ -83,6 +83,7 @@ class BatchSimulator:
         self._substeps = math.ceil(settings.control_period / MAX_MOTOR_STEP - 1e-9)
         self._bodies = MotorBodies(count, settings.motor) if settings.motors else None
         self._contacts: dict[int, ContactWorld] = {}
+        self._masses: list[tuple[float | None, ...]] = [()] * count  # of the obstacles
         self._all_active, self._all_robots = np.ones(count, dtype=bool), np.arange(count)
 
     def _connect(self) -> None:
@@ -143,6 +144,7 @@ class BatchSimulator:
                 self.episodes[["speed_weight", "turn_weight"]][i] = scenario.robot.metric(scenario.cost)
                 sim.guides[i] = guide_points(task.goal[:2], reference)
             self._contacts.pop(i, None)
+            self._masses[i] = tuple(obstacle.mass for obstacle in scenario.obstacles)
         if self._geodesic:
             self._store_maps(indices)
         stepping.start_episodes(indices, self._packed)
@@ -257,11 +259,11 @@ class BatchSimulator:
     def _drive_in_contact(self, i: int) -> None:
         """Simulate the rest of a period after a contact."""
         sim, episode, state, model = self._simulation, self.episodes[i], self.states[i], self.settings.model
-        field, controls = self.fields[i], sim.controls[i]
+        controls = sim.controls[i]
         discs = sim.discs[i][sim.discs[i, :, 1] > 0.0]
         discs.flags.writeable = False
         if i not in self._contacts:
-            self._contacts[i] = ContactWorld(field, discs, self.settings.motor)
+            self._contacts[i] = ContactWorld(self.fields[i], discs, self.settings.motor, self._masses[i])
         duration = float(episode["remaining"])
         substeps = math.ceil(duration / MAX_CONTACT_STEP)
         command = self._command(i, duration / substeps)
@@ -270,7 +272,11 @@ class BatchSimulator:
             velocity = np.array([episode["vx"], episode["vy"], episode["spin"]])
         else:
             velocity = np.array(command(0.0, 0.0, float(pose[2]), 0.0))
-        lowest, speeds, turn_rates, proximity = self._contacts[i].drive(pose, velocity, command, duration, substeps)
+        world = self._contacts[i]
+        lowest, speeds, turn_rates, proximity = world.drive(pose, velocity, command, duration, substeps)
+        if world.field is not self.fields[i]:  # obstacles have moved; the next world begins with them at rest
+            self.fields[i] = world.field
+            del self._contacts[i]
         if self.settings.motors:
             episode["vx"], episode["vy"], episode["spin"] = velocity
         if model.velocity_states is not None:  # what the contact has left of the velocity
@@ -287,7 +293,7 @@ class BatchSimulator:
             ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
             episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
-        episode["pose_clearance"] = footprint_clearance(*pose.tolist(), discs, field)[0]
+        episode["pose_clearance"] = footprint_clearance(*pose.tolist(), discs, self.fields[i])[0]
         episode["clearance"] = min(episode["clearance"], lowest)
 
     def _command(self, i: int, step: float) -> Callable[[float, float, float, float], tuple[float, float, float]]:

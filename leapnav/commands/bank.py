@@ -1,4 +1,4 @@
-"""`leapnav bank build`, `leapnav bank show` and `leapnav bank prove`: scenario banks."""
+"""`leapnav bank build|show|verify|card|prove`: scenario banks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 # Fraction of the reference cost. Smaller differences between two searches are not reported.
 MIN_IMPROVEMENT = 1e-3
+RESUMPTION = "the same command resumes where it stopped"
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Build:
     json: Path | None = None
     """JSON file of the numbers of sampled and of rejected scenarios; "-" for standard output."""
 
+    resumption = RESUMPTION
+
     def run(self) -> int:
         """Build the bank."""
         check_outputs(self.json)
@@ -85,50 +88,32 @@ class Build:
 
 @dataclass(frozen=True)
 class Show:
-    """Print a summary of a bank, draw scenarios with their optima, and optionally search all of them again.
-
-    Exit code 1: --verify found a lower cost.
-    """
+    """Check the checksums and the optima of a bank, print a summary, and optionally draw scenarios."""
 
     file: tyro.conf.Positional[Path]
     """Bank file, or the name of an included bank, for example rooms-test."""
     plot: Path | None = None
-    """Picture of the scenarios (.png, .pdf or .svg); by default the bank's name with .png in the current directory."""
+    """Picture of scenarios with their optima (.png, .pdf or .svg)."""
     count: int = 24
-    """Number of scenarios in the picture, evenly spaced in the bank; 0 for no picture."""
-    verify: bool = False
-    """Search every scenario again with about 100 times the effort (seconds each) and report lower costs."""
-    card: bool = False
-    """Print the data card of the bank, as Markdown for the Hugging Face Hub, and nothing else."""
+    """Number of scenarios in the picture, evenly spaced in the bank."""
     json: Path | None = None
-    """JSON file of name, cost, horizon (s), clearance (m) and lower bound of every scenario, and of the results of
-    --verify; "-" for standard output."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes of --verify."""
-    dask: str | None = None
-    """Address of a Dask scheduler (tcp://host:8786) whose workers are used for --verify instead."""
+    """JSON file of name, cost, horizon (s), clearance (m) and lower bound of every scenario; "-" for standard
+    output."""
 
     def run(self) -> int:
-        """Print the summary, draw the picture and, with `verify`, search again."""
-        from leapnav.envs.scenarios.bank import ScenarioBank
+        """Print the summary and draw the picture."""
         from leapnav.envs.utils.validation import check_at_least
-        from leapnav.experts.data.cards import data_card
-        from leapnav.experts.plotting import plot_bank
 
-        bank = ScenarioBank(_find(self.file))
-        plot = self.plot or Path(bank.path.with_suffix(".png").name)
-        check_at_least("count", self.count, 0)
-        check_outputs(self.json, plot)
-        bank.verify_checksums()
-        for index in range(len(bank)):
-            bank.reference(index)  # checks the optimum
-        if self.card:
-            print(data_card(bank), end="")
-            return 0
+        check_at_least("count", self.count, 1)
+        check_outputs(self.json, self.plot)
+        bank = _checked(self.file)
         _print_summary(bank)
-        if self.count > 0:
-            plot_bank(bank, plot, self.count)
-            print(f"wrote {plot}")
+        if self.plot is not None:
+            from leapnav.experts.plotting import plot_bank
+
+            plot_bank(bank, self.plot, self.count)
+            print(f"wrote {self.plot}")
+        columns = (bank.costs, bank.horizons, bank.certificates[:, 3], bank.lower_bounds)
         rows = [
             {
                 "name": scenario.name,
@@ -137,18 +122,34 @@ class Show:
                 "clearance": float(clearance),
                 "lower_bound": None if math.isnan(bound) else float(bound),
             }
-            for scenario, cost, horizon, clearance, bound in zip(
-                bank, bank.costs, bank.horizons, bank.certificates[:, 3], bank.lower_bounds, strict=True
-            )
+            for scenario, cost, horizon, clearance, bound in zip(bank, *columns, strict=True)
         ]
-        code = self._verify(bank, rows) if self.verify else 0
         write_json(rows, self.json)
-        return code
+        return 0
 
-    def _verify(self, bank: ScenarioBank, rows: list[dict[str, Any]]) -> int:
-        """Search again, print lower costs, and add the results to the rows."""
+
+@dataclass(frozen=True)
+class Verify:
+    """Search every scenario of a bank again, with about 100 times the effort (seconds each).
+
+    Exit code 1: a lower cost was found.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Bank file, or the name of an included bank, for example rooms-test."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
+    json: Path | None = None
+    """JSON file of the results of all scenarios; "-" for standard output."""
+
+    def run(self) -> int:
+        """Search again and print lower costs."""
         from leapnav.experts.second_opinion import verify_bank
 
+        check_outputs(self.json)
+        bank = _checked(self.file)
         workers = 1 if self.dask else max(self.workers, 1)
         announce(SECONDS_PER_SECOND_OPINION * len(bank) / workers, "searching every scenario again")
         opinions = verify_bank(bank, workers=self.workers, dask=self.dask)
@@ -165,10 +166,23 @@ class Show:
         )
         doubtful = sum(bool(opinion.doubts) for opinion in opinions)
         print(f"scenarios with new solutions of lower cost that collide or are not certified: {doubtful}")
-        found = {opinion.name: asdict(opinion) for opinion in opinions}
-        for row in rows:
-            row.update(found[row["name"]])
+        write_json([asdict(opinion) for opinion in opinions], self.json)
         return FAILED if improved else 0
+
+
+@dataclass(frozen=True)
+class Card:
+    """Print the data card of a bank, as Markdown for the Hugging Face Hub."""
+
+    file: tyro.conf.Positional[Path]
+    """Bank file, or the name of an included bank, for example rooms-test."""
+
+    def run(self) -> int:
+        """Print the card."""
+        from leapnav.experts.data.cards import data_card
+
+        print(data_card(_checked(self.file)), end="")
+        return 0
 
 
 @dataclass(frozen=True)
@@ -193,6 +207,8 @@ class Prove:
     """Number of processes, each with one thread."""
     json: Path | None = None
     """JSON file of the results of all scenarios that were not skipped; "-" for standard output."""
+
+    resumption = RESUMPTION
 
     def run(self) -> int:
         """Prove, and print the distribution of the gaps."""
@@ -224,22 +240,10 @@ class Bank:
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[Build, tyro.conf.subcommand("build")]
         | Annotated[Show, tyro.conf.subcommand("show")]
+        | Annotated[Verify, tyro.conf.subcommand("verify")]
+        | Annotated[Card, tyro.conf.subcommand("card")]
         | Annotated[Prove, tyro.conf.subcommand("prove")]
     ]
-
-    @property
-    def resumption(self) -> str | None:
-        """What to do after an interruption."""
-        return "the same command resumes where it stopped" if isinstance(self.action, Build | Prove) else None
-
-    @property
-    def json(self) -> Path | None:
-        """The JSON file of the action."""
-        return self.action.json
-
-    def run(self) -> int:
-        """Build a bank, show it, or prove its bounds."""
-        return self.action.run()
 
 
 def gap_summary(bank: ScenarioBank) -> list[str]:
@@ -259,19 +263,22 @@ def gap_summary(bank: ScenarioBank) -> list[str]:
     ]
 
 
-def _find(file: Path) -> Path:
-    """Return a file, or that of an included bank if its name is given."""
-    from leapnav.envs.scenarios.bank import BANK_DIRECTORY
+def _checked(file: Path) -> ScenarioBank:
+    """Return the bank in a file, or an included bank by its name, after a check of its checksums and its optima."""
+    from leapnav.envs.scenarios.bank import BANK_DIRECTORY, ScenarioBank
 
     shipped = BANK_DIRECTORY / f"{file}.bank"
-    return shipped if not file.exists() and shipped.exists() else file
+    bank = ScenarioBank(shipped if not file.exists() and shipped.exists() else file)
+    bank.verify_checksums()
+    for index in range(len(bank)):
+        bank.reference(index)
+    return bank
 
 
 def _print_summary(bank: ScenarioBank) -> None:
     import numpy as np
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+
+    from leapnav.envs.utils.tables import print_table
 
     residual, defect, drift, _ = bank.certificates.max(axis=0)
     excess = bank.second_costs / bank.costs - 1
@@ -289,16 +296,15 @@ def _print_summary(bank: ScenarioBank) -> None:
     print(f"  with alternatives  {np.isfinite(excess).sum()}")
     for line in gap_summary(bank):
         print(line)
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in ("", "minimum", "median", "maximum"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for name, values, scale in (
-        ("J*", bank.costs, 1),
-        ("horizon (s)" if bank.horizon == "fixed" else "duration (s)", bank.horizons, 1),
-        ("clearance (m)", bank.certificates[:, 3], 1),
-        ("excess cost of the second best (%)", excess[np.isfinite(excess)], 100),
-    ):
-        if len(values):
-            row = scale * np.percentile(values, [0, 50, 100])
-            table.add_row(name, *(f"{value:.3g}" for value in row))
-    Console().print(table)
+    quantities = {
+        "J*": bank.costs,
+        "horizon (s)" if bank.horizon == "fixed" else "duration (s)": bank.horizons,
+        "clearance (m)": bank.certificates[:, 3],
+        "excess cost of the second best (%)": 100 * excess[np.isfinite(excess)],
+    }
+    rows = [
+        (name, *(f"{value:.3g}" for value in np.percentile(values, [0, 50, 100])))
+        for name, values in quantities.items()
+        if len(values)
+    ]
+    print_table(("", "minimum", "median", "maximum"), rows)

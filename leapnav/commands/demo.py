@@ -24,10 +24,7 @@ class Demo:
     out: Path = Path("runs/demo")
     """Output directory; existing results in it are used again."""
 
-    @property
-    def resumption(self) -> str:
-        """What to do after an interruption."""
-        return "the same command resumes; finished steps are not repeated"
+    resumption = "the same command resumes; finished steps are not repeated"
 
     def run(self) -> int:
         """Run the demo."""
@@ -103,7 +100,7 @@ def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
     write_scores(comparison, out / "scores.json")
     plot_scores(comparison, out / "scores.png")
     plot_episodes([bank], comparison.runs["clone"][0].episodes, out / "episodes.png")
-    print_scores(comparison, console)
+    print_scores(comparison)
     console.print(f"Results in {out}:")
     for name, description in RESULTS:
         console.print(f"  {name:<15} {description}", soft_wrap=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,9 +14,7 @@ from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
-    from leapnav.envs.scenarios.bank import ScenarioBank
     from leapnav.training.scoring.comparison import Comparison
-    from leapnav.training.scoring.policy_specs import PolicySpec
 
 POLICIES = """Policies: "expert", "random", "go-to-goal", an included policy (the name of its family), the directory
 of a policy or of a run, or a model saved by Stable-Baselines3 (.zip). Runs that differ only in their seed share a row,
@@ -29,14 +26,15 @@ class Evaluate:
     """Score policies side by side against the optimum, on scenarios that were not used for training."""
 
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
-    family: FamilyOrAll = "clutter"
-    """Family of the scenarios."""
+    family: FamilyOrAll | None = None
+    """Family of the scenarios; by default those of the training runs, or clutter without any."""
     robot: Robot | None = None
     """Model of the robot of the included banks; by default that of the policies."""
     horizon: Horizon | None = None
     """Fixed or free horizon of the included banks; by default that of the policies."""
-    obstacles: Obstacles = "cost"
-    """Obstacles of the included banks: with a proximity cost, or hard obstacles, which cost nothing."""
+    obstacles: Obstacles | None = None
+    """Obstacles of the included banks: with a proximity cost, or hard obstacles, which cost nothing; by default those
+    of the training runs, or with a proximity cost."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None
@@ -56,6 +54,8 @@ class Evaluate:
     """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
     json: Path | None = None
     """JSON file of the table and of every episode; "-" for standard output."""
+    html: Path | None = None
+    """HTML page (.html): scores, profiles, episodes, and the learning curves of training runs."""
     plot: Path | None = None
     """Picture of the scores and the performance profiles (.png, .pdf or .svg)."""
     episodes_plot: Path | None = None
@@ -66,8 +66,10 @@ class Evaluate:
 
     def run(self) -> int:
         """Play the episodes and report the scores."""
+        from leapnav.envs.scenarios.bank import ScenarioBank
         from leapnav.envs.utils.validation import check_at_least
-        from leapnav.training.scoring.comparison import compare_policies
+        from leapnav.training.scoring.comparison import compare_policies, default_banks
+        from leapnav.training.scoring.html_report import write_report
         from leapnav.training.scoring.policy_specs import load_policy_spec
         from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores, scores_to_dict
 
@@ -76,13 +78,16 @@ class Evaluate:
         if self.count is not None:
             check_at_least("count", self.count, 1)
         for plot in (self.plot, self.episodes_plot, self.decisions):
-            check_outputs(self.json, plot)
+            check_outputs(self.json, plot, page=self.html)
         # All are loaded before the first episode, so that a damaged file is reported at once.
         environment = parse_environment(self.env)
         specs = [
             load_policy_spec(name, seed=self.seed, environment=environment, trust=self.trust) for name in self.policies
         ]
-        banks = self._banks(specs)
+        if self.bank is not None:
+            banks = [ScenarioBank(self.bank)]
+        else:
+            banks = default_banks(specs, self.family, self.split, self.robot, self.horizon, self.obstacles)
         n_scenarios = sum(len(bank) if self.count is None else min(self.count, len(bank)) for bank in banks)
         announce(of_evaluation(self.policies, n_scenarios), "the evaluation")
         parallel = {"workers": self.workers, "dask": self.dask}
@@ -90,6 +95,9 @@ class Evaluate:
         print_scores(comparison)
         if self.json is not None:
             write_json(scores_to_dict(comparison), self.json)
+        if self.html is not None:
+            write_report(comparison, self.html)
+            print(f"wrote {self.html}")
         if self.plot is not None:
             plot_scores(comparison, self.plot)
             print(f"wrote {self.plot}")
@@ -111,15 +119,3 @@ class Evaluate:
         print_decisions(found)
         plot_decisions(found, comparison.banks, self.decisions)
         print(f"wrote {self.decisions}")
-
-    def _banks(self, specs: Sequence[PolicySpec]) -> list[ScenarioBank]:
-        from leapnav.envs.scenarios.bank import ScenarioBank
-        from leapnav.envs.scenarios.families import check_family, families_of
-        from leapnav.training.scoring.comparison import included_banks
-
-        if self.bank is not None:
-            return [ScenarioBank(self.bank)]
-        check_family(self.family)
-        return included_banks(
-            specs, families_of(self.family), self.split, self.robot, self.horizon, obstacles=self.obstacles
-        )

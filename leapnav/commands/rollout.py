@@ -1,10 +1,13 @@
-"""`leapnav rollout`: datasets of demonstrations."""
+"""`leapnav rollout` and `leapnav dataset check`: datasets of demonstrations."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
+
+import tyro
 
 from leapnav.commands.options import FamilyOrAll, Horizon, Obstacles, Robot
 from leapnav.durations import announce, of_scenarios
@@ -45,21 +48,14 @@ class Rollout:
     """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     force: bool = False
     """Replace an existing dataset or unfinished rollout in the output directory."""
-    check: bool = False
-    """Replay the existing dataset and report the maximum deviation; exit code 1 if it is above 1e-6."""
     json: Path | None = None
-    """JSON file of the summary, or of the result of --check; "-" for standard output."""
+    """JSON file of the summary; "-" for standard output."""
 
-    @property
-    def resumption(self) -> str:
-        """What to do after an interruption."""
-        return "the same command resumes where it stopped"
+    resumption = "the same command resumes where it stopped"
 
     def run(self) -> int:
-        """Write the dataset, or check it."""
+        """Write the dataset."""
         check_outputs(self.json)
-        if self.check:
-            return self._check()
         from leapnav.experts.data.demonstrations import dataset_id
         from leapnav.experts.data.rollouts import rollout
 
@@ -89,12 +85,29 @@ class Rollout:
         write_json(asdict(summary), self.json)
         return 0
 
-    def _check(self) -> int:
+
+@dataclass(frozen=True)
+class CheckDataset:
+    """Replay a dataset of demonstrations in the environment and report the maximum deviation.
+
+    Exit code 1: a deviation is above 1e-6.
+    """
+
+    action: tyro.conf.Positional[Literal["check"]]
+    """What to do."""
+    folder: tyro.conf.Positional[Path]
+    """Directory written by `leapnav rollout`."""
+    json: Path | None = None
+    """JSON file of the deviations; "-" for standard output."""
+
+    def run(self) -> int:
+        """Replay and report."""
         from leapnav.experts.data.rollouts import check_dataset
 
-        replay = check_dataset(self.out)
+        check_outputs(self.json)
+        replay = check_dataset(self.folder)
         print(
-            f"{self.out}: {replay.episodes} episodes replayed; maximum deviation of observations "
+            f"{self.folder}: {replay.episodes} episodes replayed; maximum deviation of observations "
             f"{replay.observation:.1e}, rewards {replay.reward:.1e}, states {replay.state:.1e} (episode {replay.worst})"
         )
         write_json(asdict(replay), self.json)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
@@ -17,13 +16,16 @@ from leapnav.training.config import ALGORITHMS, BCConfig, DAggerRunConfig, PPOCo
 if TYPE_CHECKING:
     from leapnav.training.scoring.results import Evaluation
 
-HELP = """Train a policy: behaviour cloning of the expert, DAgger, or PPO or SAC, from scratch or from a warm start. The
-defaults shown are those tuned for --family (and for --warm-start); with --resume, those of the run."""
+OWN_DEFAULTS = ("free", "lidar", "motor")  # horizon, observation and actuation that other settings depend on
+NOT_GIVEN = (Path("."),)
 
 
 @dataclass(frozen=True)
 class TrainCommand:
-    """Base class of the command; `train_command` adds the type of the configuration."""
+    """Train a policy: behaviour cloning of the expert, DAgger, or PPO or SAC, from scratch or from a warm start.
+
+    The defaults shown are those tuned for --family (and for --warm-start); with --resume, those of the run.
+    """
 
     config: RunConfig
 
@@ -34,7 +36,7 @@ class TrainCommand:
             announce(of_training(config, workers), "this run")
         for evaluation in self._train():
             print(_describe(evaluation))
-        print(f"wrote {config.out} (next: leapnav evaluate {config.out} expert; leapnav report {config.out})")
+        print(f"wrote {config.out} (next: leapnav evaluate {config.out} expert --html report.html)")
         return 0
 
     @property
@@ -66,66 +68,59 @@ def _describe(evaluation: Evaluation) -> str:
     )
 
 
-def train_command(arguments: Sequence[str]) -> type[TrainCommand]:
-    """Return the class of the command for a command line.
-
-    Its defaults depend on the family, the horizon, the warm start and the run to resume in the arguments, so these are
-    read before the command line is parsed.
-
-    Args:
-        arguments: the words after `leapnav`.
-
-    Raises:
-        FileNotFoundError: there is no run to resume.
-        ValueError: the family is unknown, the warm start has no value, or the configuration of the run to resume is
-            damaged.
-
-    """
-    arguments = [word.replace("_", "-") if word.startswith("--") and "=" not in word else word for word in arguments]
-    is_train = arguments[:1] == ["train"]  # other commands have options of the same names
-    family = (_option(arguments, "--family") if is_train else None) or RunConfig.family
-    out = _option(arguments, "--out")
-    if is_train and "--warm-start" in arguments:
-        following = arguments[arguments.index("--warm-start") + 1 :][:1]
-        if not following or following[0].startswith("--"):
-            raise ValueError("warm_start: expected demonstrations or a policy, got none")
-    warm = any(word.partition("=")[0] == "--warm-start" for word in arguments)
-    start = (
-        [Path(word) for name in ("--warm-start", "--policy") for word in _values(arguments, name)] if is_train else []
-    )
-    given = {name: _option(arguments, f"--{name}") for name in ("horizon", "observation")} if is_train else {}
-    changes = {name: value for name, value in given.items() if value in ("free", "lidar")}  # those with other defaults
-    defaults: dict[str, Any] = {
-        name: replace(kind.tuned(family, warm=warm, start=start, **changes), out=tyro.MISSING)
-        for name, kind in ALGORITHMS.items()
-    }
-    if is_train and "--resume" in arguments and out is not None:
-        algorithm, config = read_config(Path(out))
-        if algorithm in defaults:
-            defaults[algorithm] = replace(config, out=tyro.MISSING)
+def train_command(defaults: Mapping[str, RunConfig], *, needs_out: bool = True) -> type[TrainCommand]:
+    """Return the class of the command with default configurations of the algorithms; `out` may have no default."""
+    if needs_out:
+        defaults = {name: replace(config, out=tyro.MISSING) for name, config in defaults.items()}
     choices = tuple(
         Annotated[kind, tyro.conf.subcommand(name, default=defaults[name])] for name, kind in ALGORITHMS.items()
     )
     union = Annotated[Union[choices], tyro.conf.arg(name="")]  # noqa: UP007 (the members are in a tuple)
     field = tyro.conf.OmitSubcommandPrefixes[union]
     command = make_dataclass("Train", [("config", field)], bases=(TrainCommand,), frozen=True)
-    command.__doc__ = HELP
+    command.__doc__ = TrainCommand.__doc__
     return command
 
 
-def _values(arguments: Sequence[str], name: str) -> list[str]:
-    """The values of an option, up to the next option."""
-    if name not in arguments:
-        return [word.removeprefix(f"{name}=") for word in arguments if word.startswith(f"{name}=")]
-    following = arguments[arguments.index(name) + 1 :]
-    return list(takewhile(lambda word: not word.startswith("--"), following))
+def default_configurations() -> dict[str, RunConfig]:
+    """Return the default configurations, without --family and other settings that change them."""
+    return {name: kind.tuned(RunConfig.family) for name, kind in ALGORITHMS.items()}
 
 
-def _option(arguments: Sequence[str], name: str) -> str | None:
-    """The value of an option, written as `--name value` or `--name=value`."""
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        if word == name:
-            return following
-        if word.startswith(f"{name}="):
-            return word.removeprefix(f"{name}=")
-    return None
+def probes() -> dict[str, RunConfig]:
+    """Return default configurations that show, after a command line has been parsed, what it contains.
+
+    The observation is not lidar, and the warm start is `NOT_GIVEN`; they are these values only if they are not given.
+    """
+    found: dict[str, Any] = default_configurations()
+    for name, config in found.items():
+        warm_start = {"warm_start": NOT_GIVEN} if hasattr(config, "warm_start") else {}
+        found[name] = replace(config, observation="geodesic", **warm_start)
+    return found
+
+
+def tuned_configurations(given: RunConfig) -> dict[str, RunConfig]:
+    """Return the default configurations for a command line: those of the run to resume, or those tuned for its words.
+
+    Args:
+        given: the command line, parsed with `probes` as defaults.
+
+    Raises:
+        FileNotFoundError: there is no run to resume.
+        ValueError: the family is unknown, the warm start is empty, or the configuration of the run to resume is
+            damaged.
+
+    """
+    defaults = default_configurations()
+    if given.resume and given.out != Path():  # otherwise `out` is missing
+        algorithm, config = read_config(given.out)
+        return {**defaults, algorithm: config}
+    warm_start: tuple[Path, ...] = getattr(given, "warm_start", NOT_GIVEN)
+    if not warm_start:
+        raise ValueError("warm_start: expected demonstrations or a policy, got none")
+    is_warm = warm_start != NOT_GIVEN
+    start = [*(warm_start if is_warm else ()), *filter(None, [getattr(given, "policy", None)])]
+    names = ("horizon", "observation", "actuation")
+    changes = {name: value for name in names if (value := getattr(given, name, None)) in OWN_DEFAULTS}
+    algorithm = next(name for name, kind in ALGORITHMS.items() if isinstance(given, kind))
+    return {**defaults, algorithm: type(given).tuned(given.family, warm=is_warm, start=start, **changes)}

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import check_family, families_of
+from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of
+from leapnav.training.config import own_bank, read_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.results import Evaluation, bank_identity
@@ -28,12 +29,14 @@ class Comparison:
         banks: the banks.
         runs: for each row of the table, the evaluations of its runs on all banks.
         seed: random seed of the bootstrap.
+        folders: directories of the training runs of the rows that have any.
 
     """
 
     banks: tuple[ScenarioBank, ...]
     runs: Mapping[str, Sequence[Evaluation]]
     seed: int
+    folders: Mapping[str, Sequence[Path]] = field(default_factory=dict)
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -88,7 +91,7 @@ class Comparison:
             name: [replace(run, episodes=tuple(e for e in run if e.bank in identities)) for run in evaluations]
             for name, evaluations in self.runs.items()
         }
-        return Comparison(banks, runs, self.seed)
+        return Comparison(banks, runs, self.seed, self.folders)
 
 
 # A policy to compare: a name, an object or a function (see `evaluate`), one of these with the arguments of its
@@ -188,6 +191,49 @@ def included_banks(
     return [ScenarioBank.shipped(family, split, model, kind, obstacles) for family in families]
 
 
+def default_banks(
+    specs: Sequence[PolicySpec],
+    family: str | None = None,
+    split: str = "test",
+    robot: str | None = None,
+    horizon: str | None = None,
+    obstacles: str | None = None,
+) -> list[ScenarioBank]:
+    """Return the included banks on which policies are scored, or those in the directories of the training runs.
+
+    Args:
+        specs: the policies.
+        family: a family, or "all"; None: those of the training runs, or "clutter" without any.
+        split: "train" or "test"; training runs have a test bank only.
+        robot, horizon: see `included_banks`.
+        obstacles: "cost" or "hard"; None: those of the training runs, or "cost" without any.
+
+    Raises:
+        FileNotFoundError, ValueError: the configuration of a run is damaged, or see `included_banks`.
+
+    """
+    configs = {spec.run: read_config(spec.run)[1] for spec in specs if spec.run is not None}
+    if family is not None:
+        check_family(family)
+    chosen = [family] if family is not None else [config.family for config in configs.values()] or ["clutter"]
+    families = {name for one in chosen for name in families_of(one)}
+    kinds = {obstacles} if obstacles is not None else {config.obstacles for config in configs.values()} or {"cost"}
+    included, own = [], {}  # those of the runs by their identity: runs can have the same bank, or several of a family
+    for name in sorted(families, key=lambda name: (*FAMILIES, name).index(name)):
+        for kind in sorted(kinds):
+            found = [
+                ScenarioBank(path)
+                for folder, config in configs.items()
+                if config.obstacles == kind and split == "test"
+                if name not in ScenarioBank.shipped_families(config.robot, config.horizon, kind)
+                if (path := own_bank(folder, config.family, name)).exists()
+            ]
+            own |= {bank_identity(bank): bank for bank in found}
+            if not found:
+                included += included_banks(specs, [name], split, robot, horizon, obstacles=kind)
+    return [*included, *own.values()]
+
+
 def _common(name: str, values: Sequence[str | None], given: str | None) -> str | None:
     """Return the value that policies have in common, None for baselines, which have none; or the given one.
 
@@ -236,7 +282,8 @@ def compare_policies(
     if len(given) < len(banks):
         raise ValueError("banks: expected different ones, got the same bank more than once")
     runs: dict[str, list[Evaluation]] = {}
-    for row, members in group_by_row(specs).items():
+    rows = group_by_row(specs)
+    for row, members in rows.items():
         runs[row] = []
         for member in members:
             evaluations = [
@@ -256,4 +303,5 @@ def compare_policies(
             episodes = tuple(episode for evaluation in evaluations for episode in evaluation)
             milliseconds = float(np.mean([evaluation.milliseconds for evaluation in evaluations]))
             runs[row].append(Evaluation(episodes, milliseconds, evaluations[0].settings))
-    return Comparison(tuple(banks), runs, seed)
+    folders = {row: [member.run for member in members if member.run] for row, members in rows.items()}
+    return Comparison(tuple(banks), runs, seed, {row: found for row, found in folders.items() if found})

@@ -12,12 +12,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.utils.colors import FAILURE, OPTIMUM
+from leapnav.envs.utils.tables import print_table
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.decisions import Decisions, decisions_of, level_regrets
 from leapnav.training.scoring.results import Evaluation, bank_identity, bank_of
@@ -55,25 +53,25 @@ def costliest_decisions(
     return sorted(found, key=lambda one: -float(one.regrets.sum()))
 
 
-def print_decisions(decisions: Sequence[Decisions], console: Console | None = None) -> None:
+def print_decisions(decisions: Sequence[Decisions]) -> None:
     """Print the most expensive decision of each episode, that of the loss excluded."""
-    table = Table(title="Most expensive decisions", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in ("scenario", "outcome", "from\ns", "to\ns", "regret", "regret of\nthe level", "lost at\ns"):
-        table.add_column(column, justify="left" if column in ("scenario", "outcome") else "right")
+    rows = []
     for one in decisions:
         ordinary = _before_loss(one)
         k = int(np.argmax(ordinary)) if len(ordinary) else 0
-        outcome = "success" if one.episode.success else "collision" if one.episode.collision else "missed"
-        table.add_row(
-            one.episode.scenario,
-            outcome,
-            f"{one.times[k]:.2f}",
-            f"{one.times[k + 1]:.2f}",
-            f"{one.regrets[k]:.3f}",
-            f"{one.regrets.sum():.3f}",
-            "" if np.isnan(one.lost_at) else f"{one.lost_at:.2f}",
+        rows.append(
+            (
+                one.episode.scenario,
+                "success" if one.episode.success else "collision" if one.episode.collision else "missed",
+                f"{one.times[k]:.2f}",
+                f"{one.times[k + 1]:.2f}",
+                f"{one.regrets[k]:.3f}",
+                f"{one.regrets.sum():.3f}",
+                "" if np.isnan(one.lost_at) else f"{one.lost_at:.2f}",
+            )
         )
-    (console or Console()).print(table)
+    columns = ("scenario", "outcome", "from\ns", "to\ns", "regret", "regret of\nthe level", "lost at\ns")
+    print_table(columns, rows, title="Most expensive decisions", text=2)
 
 
 def plot_decisions(

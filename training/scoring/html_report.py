@@ -1,4 +1,4 @@
-"""`leapnav report`: a self-contained HTML page about training runs."""
+"""`leapnav evaluate --html`: a self-contained HTML page of a comparison."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.resources import files
@@ -23,14 +23,13 @@ from matplotlib.ticker import EngFormatter
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of
+from leapnav.envs.scenarios.families import families_of
 from leapnav.envs.utils.colors import CURVES
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
-from leapnav.training.config import RunConfig, own_bank, read_config
-from leapnav.training.scoring.comparison import Comparison, compare_policies, included_banks
+from leapnav.training.config import RunConfig, read_config
+from leapnav.training.scoring.comparison import Comparison
 from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions
-from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.reports import (
     COLUMNS,
     NEGATIVE_REGRET,
@@ -42,7 +41,6 @@ from leapnav.training.scoring.reports import (
 )
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 
-BASELINES = ("expert", "go-to-goal", "random")  # in the order of the table
 CLEARANCE_BINS = (0.0, 0.05, 0.1, 0.2, math.inf)  # bin edges of the optimum's clearance (m)
 N_GALLERY_COLUMNS = 4
 
@@ -52,116 +50,34 @@ class _RunRecord:
     """The files of a run.
 
     Attributes:
-        spec: the policy.
+        folder: its directory.
         config: the configuration.
         record: content of `config.json`.
         evaluations: lines of `evaluations.jsonl`.
 
     """
 
-    spec: PolicySpec
+    folder: Path
     config: RunConfig
     record: dict[str, Any]
     evaluations: list[dict[str, Any]]
 
 
-def write_report(
-    runs: Sequence[str | os.PathLike[str]] | Comparison,
-    path: str | os.PathLike[str],
-    *,
-    family: str | None = None,
-    count: int | None = None,
-    environment: Mapping[str, Any] | None = None,
-    trust: bool = False,
-    seed: int = 0,
-    progress: bool = True,
-) -> Comparison:
-    """Evaluate runs or policies, the expert and the baselines, and write the page; or write that of a comparison.
+def write_report(comparison: Comparison, path: str | os.PathLike[str], *, progress: bool = True) -> None:
+    """Write the page of a comparison: scores, profiles, episodes, and the learning curves of training runs.
 
     Args:
-        runs: run directories, or other policies as in `leapnav evaluate`, which have no learning curves. Runs that
-            differ only in their seed share a row and a curve, as do runs with the same label ("LABEL=DIRECTORY"). A
-            result of `compare` is written as it is, without another evaluation.
+        comparison: the results, of `compare` or `leapnav evaluate`. Runs that differ only in their seed share a row and
+            a curve.
         path: file of the page.
-        family: family of the scenarios, or "all"; None: those of the runs, or "clutter" without runs.
-        count: number of scenarios of each family; None: all.
-        environment, trust: of models saved by Stable-Baselines3, see `load_zip`.
-        seed: random seed of the bootstrap intervals.
         progress: show progress bars.
-
-    Returns:
-        The results.
 
     Raises:
-        FileNotFoundError: a directory contains no run.
-        ValueError: there are no runs, or a run is damaged.
+        FileNotFoundError: a file of a training run is missing.
+        ValueError: a file of a training run is damaged.
 
     """
-    if isinstance(runs, Comparison):
-        _write_page(path, runs, {}, list(runs.runs), progress)
-        return runs
-    if not runs:
-        raise ValueError("runs: expected at least one, got none")
-    specs = [load_policy_spec(os.fspath(run), environment=environment, trust=trust) for run in runs]
-    records = [_read_run(spec) for spec in specs if (Path(spec.name) / "config.json").is_file()]
-    banks = _banks(specs, _report_families(family, records), records)
-    baselines = [load_policy_spec(name) for name in BASELINES if name not in {spec.name for spec in specs}]
-    comparison = compare_policies([*specs, *baselines], banks, count=count, seed=seed, progress=progress)
-    groups = group_by_row(specs)
-    by_row = {
-        row: found
-        for row, members in groups.items()
-        if (found := [record for record in records if any(record.spec is member for member in members)])
-    }
-    _write_page(path, comparison, by_row, list(groups), progress)
-    return comparison
-
-
-def _banks(specs: Sequence[PolicySpec], families: Sequence[str], records: Sequence[_RunRecord]) -> list[ScenarioBank]:
-    """Return the test banks of families: the included ones, or those in the directories of the runs."""
-    found: dict[str, ScenarioBank] = {}  # by their identity: runs can have the same bank, or different ones of a family
-    own, included = set(), []
-    for name in families:
-        for record in records:
-            config, path = record.config, own_bank(Path(record.spec.name), record.config.family, name)
-            shipped = ScenarioBank.shipped_families(config.robot, config.horizon, config.obstacles)
-            if name not in shipped and path.exists():
-                bank = ScenarioBank(path)
-                found.setdefault(bank_identity(bank), bank)
-                own.add((name, config.obstacles))
-    for kind in sorted({record.config.obstacles for record in records} or {"cost"}):
-        included += included_banks(specs, [name for name in families if (name, kind) not in own], obstacles=kind)
-    return [*included, *found.values()]
-
-
-def _report_families(family: str | None, records: Sequence[_RunRecord]) -> list[str]:
-    """Return the families of a report, in the order of `FAMILIES`."""
-    if family is not None:
-        check_family(family)
-    chosen = {family or "clutter"} if family is not None or not records else set()
-    if family is None:
-        chosen |= {record.config.family for record in records}
-    found = {name for one in chosen for name in families_of(one)}
-    return sorted(found, key=lambda name: (*FAMILIES, name).index(name))
-
-
-def _write_page(
-    path: str | os.PathLike[str],
-    comparison: Comparison,
-    by_row: dict[str, list[_RunRecord]],
-    galleries: Sequence[str],
-    progress: bool,
-) -> None:
-    """Write the page.
-
-    Args:
-        path: its file.
-        comparison: the results.
-        by_row: the training runs of the rows that have any.
-        galleries: the rows whose episodes are drawn.
-        progress: show progress bars.
-
-    """
+    by_row = {row: [_read_run(folder) for folder in folders] for row, folders in comparison.folders.items()}
     records = [record for members in by_row.values() for record in members]
     families = comparison.families
     scores = comparison.scores()
@@ -189,8 +105,10 @@ def _write_page(
         profiles=_profiles(comparison),
         failures=_success_tables(comparison),
         negative_regret=NEGATIVE_REGRET if any(row.regret.value < 0 for row in scores) else "",
-        galleries=[{"name": row, "png": _gallery(comparison.banks, comparison.runs[row][0])} for row in galleries],
-        decisions=[{"name": row, "png": _decisions(comparison, row, progress)} for row in galleries],
+        galleries=[
+            {"name": row, "png": _gallery(comparison.banks, comparison.runs[row][0])} for row in comparison.runs
+        ],
+        decisions=[{"name": row, "png": _decisions(comparison, row, progress)} for row in comparison.runs],
         runs=[_summary(record) for record in records],
     )
     write_text(path, page)
@@ -199,7 +117,7 @@ def _write_page(
 def _title(records: Sequence[_RunRecord]) -> str:
     if not records:
         return "Comparison of policies"
-    return "Training runs" if len(records) > 1 else f"Training run {records[0].spec.name}"
+    return "Training runs" if len(records) > 1 else f"Training run {records[0].folder}"
 
 
 def _split_cell(text: str) -> tuple[str, str]:
@@ -208,14 +126,13 @@ def _split_cell(text: str) -> tuple[str, str]:
     return value, interval
 
 
-def _read_run(spec: PolicySpec) -> _RunRecord:
+def _read_run(folder: Path) -> _RunRecord:
     """Read the files of a run."""
-    folder = Path(spec.name)
     _, config = read_config(folder)
     try:
         record = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         lines = (folder / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
-        return _RunRecord(spec, config, record, [json.loads(line) for line in lines])
+        return _RunRecord(folder, config, record, [json.loads(line) for line in lines])
     except ValueError as error:
         raise ValueError(f"{folder / 'evaluations.jsonl'}: damaged: {error}") from None
 
@@ -322,7 +239,7 @@ def _summary(record: _RunRecord) -> dict[str, str]:
     last = record.evaluations[-1] if record.evaluations else {"step": 0, "seconds": 0.0}
     config, algorithm = record.config, record.record["config"]["algorithm"]
     return {
-        "name": record.spec.name,
+        "name": str(record.folder),
         "summary": (
             f"{algorithm}, {config.family}, seed {config.seed}, {last['step']:,} samples or environment steps, "
             f"{last['seconds'] / 60:.1f} min"

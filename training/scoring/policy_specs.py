@@ -30,6 +30,7 @@ class PolicySpec:
         policy: the policy, or a function that makes it for an environment.
         environment: arguments of the environment that determine the policy's observations.
         is_baseline: whether the policy drives any robot.
+        run: directory of the training run; None for other policies.
 
     """
 
@@ -39,6 +40,7 @@ class PolicySpec:
     policy: PolicyOrFactory
     environment: Mapping[str, Any]
     is_baseline: bool = False
+    run: Path | None = None
 
     @property
     def robot(self) -> str | None:
@@ -84,7 +86,8 @@ def load_policy_spec(
     # The method is the configuration of the run without the seed and the directory.
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
     method = json.dumps(training, sort_keys=True) if training else None
-    return PolicySpec(place, label, method, policy, policy_environment(place))
+    run = Path(place) if (Path(place) / "config.json").is_file() else None
+    return PolicySpec(place, label, method, policy, policy_environment(place), run=run)
 
 
 def group_by_row(specs: Sequence[PolicySpec]) -> dict[str, list[PolicySpec]]:

@@ -11,15 +11,13 @@ from typing import IO, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.utils.colors import CURVES, FAILURE, OPTIMUM, POLICY
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode, plain
+from leapnav.envs.utils.tables import print_table
 from leapnav.experts.data.demonstrations import ENVIRONMENT
 from leapnav.experts.plotting import draw_scenario
 from leapnav.training.scoring.barn import BarnScore
@@ -45,32 +43,28 @@ MARKDOWN_COLUMNS = ("success", "collision", "soc", "regret")  # attributes of `S
 N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal; the other outputs have all
 
 
-def print_scores(comparison: Comparison, console: Console | None = None) -> None:
+def print_scores(comparison: Comparison) -> None:
     """Print the table of the policies with 95 % intervals, and for several banks a table by bank."""
-    console = console or Console()
     scores = comparison.scores()
-    table = Table(
-        title=f"{scores[0].episodes} scenarios; brackets: 95 % interval over {sampled(scores)}",
-        box=box.SIMPLE_HEAD,
-        padding=0,
-        pad_edge=False,
-    )
-    table.add_column("policy", min_width=10, overflow="fold")
-    for title, *_ in COLUMNS[:N_TERMINAL_COLUMNS]:
-        table.add_column(title, justify="right", no_wrap=True)
-    table.add_column("time\nms", justify="right", no_wrap=True)
-    for row in scores:
-        cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS[:N_TERMINAL_COLUMNS]]
-        table.add_row(row_name(row), *cells, f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-")
-    console.print(table)
+    columns = COLUMNS[:N_TERMINAL_COLUMNS]
+    rows = [
+        (
+            row_name(row),
+            *(cell(getattr(row, name), *form) for _, name, *form in columns),
+            f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-",
+        )
+        for row in scores
+    ]
+    title = f"{scores[0].episodes} scenarios; brackets: 95 % interval over {sampled(scores)}"
+    print_table(("policy", *(title for title, *_ in columns), "time\nms"), rows, title=title)
     if any(row.regret.value < 0 for row in scores):
-        console.print(NEGATIVE_REGRET)
+        print(NEGATIVE_REGRET)
     if any(row.true_regret.episodes for row in scores):
-        console.print("Cost above the true optimal cost of the scenario, between proved limits (medians):")
+        print("Cost above the true optimal cost of the scenario, between proved limits (medians):")
         for row in scores:
-            console.print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
+            print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
     if len(comparison.banks) > 1:
-        console.print(_bank_table(comparison))
+        _print_banks(comparison)
 
 
 def sampled(scores: Sequence[Score]) -> str:
@@ -80,14 +74,16 @@ def sampled(scores: Sequence[Score]) -> str:
 
 def print_barn_scores(scores: Sequence[BarnScore]) -> None:
     """Print the scores of the BARN challenge."""
-    table = Table(title="BARN challenge", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("policy", min_width=6, overflow="fold")
-    for title in ("success %", "time s", "score"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for row in scores:
-        seconds = f"{row.seconds:.1f}" if math.isfinite(row.seconds) else "-"
-        table.add_row(row.policy, f"{100 * row.success:.1f}", seconds, f"{row.score:.4f}")
-    Console().print(table)
+    rows = [
+        (
+            row.policy,
+            f"{100 * row.success:.1f}",
+            f"{row.seconds:.1f}" if math.isfinite(row.seconds) else "-",
+            f"{row.score:.4f}",
+        )
+        for row in scores
+    ]
+    print_table(("policy", "success %", "time s", "score"), rows, title="BARN challenge")
 
 
 def _bracket_text(bracket: Bracket) -> str:
@@ -97,18 +93,14 @@ def _bracket_text(bracket: Bracket) -> str:
     return f"{100 * bracket.low:z.2f} to {100 * bracket.high:z.2f} % ({episodes})"
 
 
-def _bank_table(comparison: Comparison) -> Table:
+def _print_banks(comparison: Comparison) -> None:
     grouping = "family" if len(comparison.families) == len(comparison.banks) else "bank"
-    table = Table(title=f"success % / SOC by {grouping}", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("policy", min_width=6, overflow="fold")
-    rows: dict[str, list[str]] = {name: [] for name in comparison.runs}
-    for name, bank in zip(comparison.bank_names, comparison.banks, strict=True):
-        table.add_column(name, justify="right", overflow="fold")
-        for row in comparison.of(bank).scores():
-            rows[row.policy].append(f"{100 * row.success.value:.1f} / {row.soc.value:.3f}")
-    for name, cells in rows.items():
-        table.add_row(name, *cells)
-    return table
+    parts = [{row.policy: row for row in comparison.of(bank).scores()} for bank in comparison.banks]
+    rows = [
+        (name, *(f"{100 * part[name].success.value:.1f} / {part[name].soc.value:.3f}" for part in parts))
+        for name in comparison.runs
+    ]
+    print_table(("policy", *comparison.bank_names), rows, title=f"success % / SOC by {grouping}")
 
 
 def row_name(row: Score) -> str:

@@ -32,7 +32,9 @@ class Check:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Print versions and run a self-test of a few seconds.
+    """Print versions, compile the kernels that are not in the cache, and run a self-test of a few seconds.
+
+    The compilation takes minutes after the installation.
 
     Exit code 0: all checks passed; 1: a check failed.
     """
@@ -49,7 +51,8 @@ class Doctor:
             print(f"{name:{width}}  {number}", flush=True)
         from leapnav.commands.installation.compile import compile_missing
 
-        compile_missing()  # otherwise the first check would include the compilation
+        print("compiling the kernels that are not in the cache", flush=True)
+        compile_missing()
         checks = []
         for function in (find_an_optimum, keep_compiled_code, drive_the_expert, load_a_policy):
             check = _run(function)

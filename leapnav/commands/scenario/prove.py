@@ -1,4 +1,4 @@
-"""`leapnav prove` and `leapnav check-proof`: proved lower bounds of the cost of a scenario."""
+"""`leapnav prove` and `leapnav proof check`: proved lower bounds of the cost of a scenario."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Prove:
     plot: Path | None = None
     """Picture (.png, .pdf or .svg) of the cells that each spacing leaves, with the optimum and its alternatives."""
     proof: Path | None = None
-    """File for the proof; `leapnav check-proof` checks it."""
+    """File for the proof; `leapnav proof check` checks it."""
     json: Path | None = None
     """JSON file of the result; "-" for standard output."""
 
@@ -76,7 +76,9 @@ class CheckProof:
     Exit code 0: the proof is correct; 1: it is not; 2: the file is not a proof.
     """
 
-    proof: tyro.conf.Positional[Path]
+    action: tyro.conf.Positional[Literal["check"]]
+    """What to do."""
+    file: tyro.conf.Positional[Path]
     """File written by `leapnav prove --proof`."""
     scenario: Path | None = None
     """Scenario file (JSON) that must be the one of the proof."""
@@ -86,7 +88,7 @@ class CheckProof:
         from leapnav.envs.scenarios.scenario import Scenario
         from leapnav.experts import Proof, ProofError, check_proof
 
-        proof = Proof.load(self.proof)
+        proof = Proof.load(self.file)
         if self.scenario is not None and Scenario.from_json(self.scenario) != proof.scenario:
             print(f"{proof.scenario.name}: the proof is for another scenario than {self.scenario}")
             return FAILED

@@ -129,59 +129,46 @@ def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
 
 
 def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, float]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    from leapnav.envs.utils.tables import print_table
 
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("method", no_wrap=True)
-    table.add_column("status", overflow="fold")
     is_free = any(extremal.problem.horizon is None for extremal in extremals.values())
-    for column in (
-        "cost",
-        *(("horizon\ns",) if is_free else ()),
-        "residual",
-        "itera-\ntions",
-        "evalu-\nations",
-        "time\nms",
-    ):
-        table.add_column(column, justify="right", no_wrap=True)
+    rows = []
     for method, extremal in extremals.items():
         certificate = extremal.certificate
-        table.add_row(
-            method,
-            extremal.status.name,
-            "-" if certificate is None else f"{extremal.cost:.9g}",
-            *((f"{extremal.horizon:.6g}",) if is_free else ()),
-            "-" if certificate is None else f"{max(certificate.residual, certificate.defect):.1e}",
-            str(len(extremal.history)),
-            str(extremal.n_evaluations),
-            f"{1000 * seconds[method]:.1f}",
+        rows.append(
+            (
+                method,
+                extremal.status.name,
+                "-" if certificate is None else f"{extremal.cost:.9g}",
+                *((f"{extremal.horizon:.6g}",) if is_free else ()),
+                "-" if certificate is None else f"{max(certificate.residual, certificate.defect):.1e}",
+                str(len(extremal.history)),
+                str(extremal.n_evaluations),
+                f"{1000 * seconds[method]:.1f}",
+            )
         )
-    Console().print(table)
+    horizon = ("horizon\ns",) if is_free else ()
+    columns = ("method", "status", "cost", *horizon, "residual", "iterations", "evaluations", "time\nms")
+    print_table(columns, rows, text=2)
 
 
 def _print_alternatives(optimum: Optimum) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    from leapnav.envs.utils.tables import print_table
 
     for doubt in optimum.doubts:
         print(f"  not certified      J = {doubt.cost:.6g} was also found: {doubt.status.value}")
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in ("cost", "excess", "winding", "clearance"):
-        table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("driving", overflow="fold")
-    table.add_column("sides", overflow="fold")
+    rows = []
     for extremal in (optimum, *optimum.alternatives):
         clearance = extremal.certificate.clearance if extremal.certificate is not None else None
-        table.add_row(
-            f"{extremal.cost:.6f}",
-            f"{100 * (extremal.cost / optimum.cost - 1):.2f} %" if optimum.cost > 0 else "-",
-            f"{extremal.heading_winding:+d}" if extremal.heading_winding else "0",
-            _describe_clearance(clearance),
-            ", ".join(extremal.driving_modes) or "rotate in place",
-            "".join(side[0].upper() for side in extremal.path_class) or "-",
+        rows.append(
+            (
+                ", ".join(extremal.driving_modes) or "rotate in place",
+                "".join(side[0].upper() for side in extremal.path_class) or "-",
+                f"{extremal.cost:.6f}",
+                f"{100 * (extremal.cost / optimum.cost - 1):.2f} %" if optimum.cost > 0 else "-",
+                f"{extremal.heading_winding:+d}" if extremal.heading_winding else "0",
+                _describe_clearance(clearance),
+            )
         )
     print("Local optima (excess: cost above the optimum; sides: Left or Right of the path, for each obstacle)")
-    Console().print(table)
+    print_table(("driving", "sides", "cost", "excess", "winding", "clearance"), rows, text=2)

@@ -1,4 +1,4 @@
-"""`leapnav benchmark`: policies and the expert in the worlds of other benchmarks."""
+"""`leapnav worlds benchmark`: policies and the expert in the worlds of other benchmarks."""
 
 from __future__ import annotations
 
@@ -41,10 +41,7 @@ class BenchmarkBarn:
     json: Path | None = None
     """JSON file of the tables and of every episode; "-" for standard output."""
 
-    @property
-    def resumption(self) -> str:
-        """What to do after an interruption."""
-        return "the same command resumes the bank where it stopped"
+    resumption = "the same command resumes the bank where it stopped"
 
     def run(self) -> int:
         """Build the bank, play the episodes and report the scores."""
@@ -122,30 +119,16 @@ class BenchmarkDynobench:
 class Benchmark:
     """Run a benchmark of the field on your own download."""
 
-    name: tyro.conf.OmitSubcommandPrefixes[
+    action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[BenchmarkBarn, tyro.conf.subcommand("barn")]
         | Annotated[BenchmarkDynobench, tyro.conf.subcommand("dynobench")]
     ]
 
-    @property
-    def resumption(self) -> str | None:
-        """What to do after an interruption."""
-        return getattr(self.name, "resumption", None)
-
-    def run(self) -> int:
-        """Run the benchmark."""
-        return self.name.run()
-
 
 def _print_durations(rows: Mapping[str, Mapping[str, float | None]]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    from leapnav.envs.utils.tables import print_table
 
-    table = Table(title="durations (s)", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("problem", overflow="fold")
-    for title in next(iter(rows.values()), {}):
-        table.add_column(title, justify="right")
-    for name, row in rows.items():
-        table.add_row(name, *("-" if value is None else f"{value:.3g}" for value in row.values()))
-    Console().print(table)
+    cells = [
+        (name, *("-" if value is None else f"{value:.3g}" for value in row.values())) for name, row in rows.items()
+    ]
+    print_table(("problem", *next(iter(rows.values()), {})), cells, title="durations (s)")

@@ -1,4 +1,4 @@
-"""`leapnav import`: scenario files from the worlds of other benchmarks."""
+"""`leapnav worlds import`: scenario files from the worlds of other benchmarks."""
 
 from __future__ import annotations
 
@@ -144,17 +144,13 @@ class ImportTpcap:
 class Import:
     """Read the worlds of another benchmark from your own download, and write them as scenario files."""
 
-    source: tyro.conf.OmitSubcommandPrefixes[
+    action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[ImportBarn, tyro.conf.subcommand("barn")]
         | Annotated[ImportDynobench, tyro.conf.subcommand("dynobench")]
         | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
         | Annotated[ImportRosMap, tyro.conf.subcommand("ros-map")]
         | Annotated[ImportTpcap, tyro.conf.subcommand("tpcap")]
     ]
-
-    def run(self) -> int:
-        """Read the worlds."""
-        return self.source.run()
 
 
 def _write(scenarios: Sequence[Scenario], out: Path) -> int:
