@@ -31,6 +31,8 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
     | `"sparse"` (the default) | 1 for each step that ends at the goal, within the tolerances; otherwise 0 |
     | `"cost"` | that of `NavigateEnv`; `compute_reward` then needs the infos of the steps |
 
+    `env.unwrapped.compute_reward(achieved_goal, desired_goal, info)` returns it for any goal, as in Gymnasium-Robotics.
+
     The sensing noise of a `Disturbance` affects the lidar but not the goals, which determine the reward. The `info` of
     a step also contains `terminated` and `at_horizon`. Everything else is the same as in `NavigateEnv`.
     """

@@ -15,7 +15,7 @@ from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import ScenarioSource, WithSpec, get_scenario
-from leapnav.envs.settings import Disturbance, EnvironmentSettings, Motor
+from leapnav.envs.settings import EnvironmentSettings, takes_settings
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.simulation.state import Episode
 
@@ -193,6 +193,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
     _goal_conditioned = False
 
+    @takes_settings
     def __init__(
         self,
         family: str | None = None,
@@ -203,54 +204,15 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         robot: RobotModel | Mapping[str, Any] | str | None = None,
         horizon: str | None = None,
         obstacles: str | None = None,
-        observation: str = "lidar",
-        reward: str = "cost",
-        actuation: str = "velocity",
-        disturbance: Disturbance | Mapping[str, float] | float | None = None,
-        motor: Motor | Mapping[str, float] | None = None,
-        dict_observation: bool = False,
-        control_period: float = 0.05,
-        position_tolerance: float = 0.1,
-        heading_tolerance: float = 0.1,
-        motion_tolerance: float = 0.1,
-        collision_penalty: float = 50.0,
-        miss_penalty: float = 50.0,
-        discount: float = 0.99,
-        terminate_on_collision: bool = True,
-        lidar_beams: int = 32,
-        lidar_range: float = 10.0,
-        map_obstacles: int = 8,
-        map_vertices: int = 8,
         render_mode: str | None = None,
+        **settings: Any,
     ) -> None:
         self._source = ScenarioSource(family, scenario, split, bank, robot, horizon, obstacles)
-        self.settings = EnvironmentSettings(
-            robot=self._source.robot.model,
-            horizon=self._source.horizon,
-            observation=observation,
-            reward=reward,
-            actuation=actuation,
-            disturbance=disturbance,  # type: ignore[arg-type] (the settings accept all these forms)
-            motor=motor,  # type: ignore[arg-type]
-            dict_observation=dict_observation,
-            control_period=control_period,
-            position_tolerance=position_tolerance,
-            heading_tolerance=heading_tolerance,
-            motion_tolerance=motion_tolerance,
-            collision_penalty=collision_penalty,
-            miss_penalty=miss_penalty,
-            discount=discount,
-            terminate_on_collision=terminate_on_collision,
-            lidar_beams=lidar_beams,
-            lidar_range=lidar_range,
-            map_obstacles=map_obstacles,
-            map_vertices=map_vertices,
-            goal_conditioned=self._goal_conditioned,
-        )
+        self.settings = EnvironmentSettings.of(self, self._source, settings)
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         # Real time, also for the wrappers that record videos.
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / control_period))}
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.settings.control_period))}
         self._simulator = BatchSimulator(1, self.settings)
         self.observation_space = self._simulator.layout.space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._source.robot.sizes()[1],), np.float32)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numba import from_dtype
@@ -20,6 +21,7 @@ from leapnav.envs.utils.validation import (
     check_not_negative,
     check_positive,
     is_number,
+    suggestion,
 )
 
 OBSERVATIONS = "lidar", "state", "map", "geodesic"
@@ -158,6 +160,27 @@ class EnvironmentSettings:
         object.__setattr__(self, "disturbance", _as_disturbance(self.disturbance))
         object.__setattr__(self, "motor", _as_dataclass("motor", Motor, self.motor))
 
+    @classmethod
+    def of(cls, env: Any, source: Any, arguments: Mapping[str, Any]) -> Self:
+        """Return the settings of an environment.
+
+        Args:
+            env: the environment, whose class is named in errors and has `_goal_conditioned`.
+            source: its `ScenarioSource`, which determines the robot and the kind of the horizon.
+            arguments: the other arguments.
+
+        Raises:
+            TypeError: an argument is unknown.
+            ValueError: an argument is invalid.
+
+        """
+        for name in arguments:
+            if name not in ARGUMENTS:
+                near = suggestion(name, ARGUMENTS)
+                raise TypeError(f"{type(env).__name__}: unexpected argument {name!r}{near}")
+        kinds = {"robot": source.robot.model, "horizon": source.horizon}
+        return cls(**kinds, **arguments, goal_conditioned=env._goal_conditioned)
+
     @property
     def model(self) -> type[RobotModel]:
         """The class of the robot's model."""
@@ -196,6 +219,22 @@ class EnvironmentSettings:
     def packed(self) -> np.ndarray:
         """Return the settings as an array of one record of SETTINGS, which the kernels read."""
         return np.array([_values(self, SETTINGS)], SETTINGS)
+
+
+# The settings that are arguments of the environments under the same name.
+ARGUMENTS = {f.name: f for f in fields(EnvironmentSettings) if f.name not in ("robot", "horizon", "goal_conditioned")}
+
+
+def takes_settings(function: Callable[..., None]) -> Callable[..., None]:
+    """Decorate a constructor with the keyword arguments `**settings`: its signature shows them with their defaults."""
+    own = inspect.signature(function)
+    parameters = [one for one in own.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
+    shown = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type)
+        for name, f in ARGUMENTS.items()
+    ]
+    function.__signature__ = own.replace(parameters=[*parameters, *shown])  # type: ignore[attr-defined]
+    return function
 
 
 def _values(record: Any, dtype: np.dtype) -> tuple[Any, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,7 @@ from leapnav.envs.scenarios.sources import (
     draw_level,
     get_scenario,
 )
-from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.settings import EnvironmentSettings, takes_settings
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.utils.validation import check_integer, is_integer
 
@@ -72,6 +71,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
     _goal_conditioned = False
 
+    @takes_settings
     def __init__(
         self,
         num_envs: int = 1,
@@ -89,21 +89,13 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         **settings: Any,
     ) -> None:
         self.num_envs = check_integer("num_envs", num_envs, 1)
-        for name in settings:
-            if name not in SETTING_NAMES:
-                raise TypeError(f"{type(self).__name__}: unexpected argument {name!r}")
         self._source = ScenarioSource(family, scenario, split, bank, robot, horizon, obstacles)
         if sampler is not None and self._source.bank is None:
             raise ValueError("sampler: expected an environment with a bank, got one of fresh or fixed scenarios")
         self._sampler = sampler
         if sampler is not None:
             check_sampler(sampler, self._source.bank)
-        self.settings = EnvironmentSettings(
-            robot=self._source.robot.model,
-            horizon=self._source.horizon,
-            **settings,
-            goal_conditioned=self._goal_conditioned,
-        )
+        self.settings = EnvironmentSettings.of(self, self._source, settings)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -423,10 +415,6 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
         stepped = mask if restarted is None else mask & ~restarted
         infos = super()._infos(mask, restarted)
         return {**infos, **_add_masks(ends, stepped)} if stepped.any() else infos
-
-
-# Arguments that are passed on to the settings.
-SETTING_NAMES = {field.name for field in fields(EnvironmentSettings)} - {"goal_conditioned", "robot", "horizon"}
 
 
 def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

@@ -18,12 +18,8 @@ __version__ = version("leapnav")
 
 for _name, _module in (("Navigate", "navigation"), ("NavigateGoal", "goal_navigation")):
     if f"leapnav/{_name}-v0" not in gymnasium.registry:  # a subprocess worker imports the package again
-        # Gymnasium's wrappers hide `compute_reward` of the goal environment, which does their checks itself.
-        _is_wrapped = _name == "Navigate"
         gymnasium.register(
             f"leapnav/{_name}-v0",
             entry_point=f"leapnav.envs.{_module}:{_name}Env",
             vector_entry_point=f"leapnav.envs.vector:{_name}VectorEnv",
-            order_enforce=_is_wrapped,
-            disable_env_checker=not _is_wrapped,
         )

@@ -66,7 +66,7 @@ def test_both_checkers_accept_the_goal_environment_without_a_warning(reward):
         warnings.simplefilter("error")
         check_env(gym.make(GOAL_ID, render_mode="rgb_array", reward=reward).unwrapped)
         if reward == "sparse":  # the checker gives compute_reward an empty info
-            check_env_sb3(gym.make(GOAL_ID, observation="map", actuation="motor"))
+            check_env_sb3(gym.make(GOAL_ID, observation="map", actuation="motor").unwrapped)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
