@@ -11,7 +11,7 @@ import pytest
 import uvicorn
 
 from leapnav.envs import Scenario
-from leapnav.play.server import create_app
+from leapnav.play.server import SCRIPTS, create_app
 from leapnav.play.solving import PlaySolver
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -76,11 +76,18 @@ def opened(port, **options):
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.goto(f"http://127.0.0.1:{port}/")
         rest(page)
+        expose(page)
         try:
             yield page
         finally:
             browser.close()
     assert not [problem for problem in problems if REFUSED not in problem]
+
+
+def expose(page):
+    """Makes what the scripts export global, for the expressions of the tests."""
+    for name in SCRIPTS:
+        page.evaluate("(name) => import(`/${name}`).then((module) => { Object.assign(window, module); })", name)
 
 
 def until(page, condition):

@@ -240,7 +240,7 @@ def test_an_evaluation_brackets_the_true_regret(proved: Path, built: Path, capsy
 
 
 def test_the_commands(bank_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["bank", "show", str(bank_file), "--count", "0"]) == 0
+    assert main(["bank", "show", str(bank_file)]) == 0
     assert "lower bounds" not in capsys.readouterr().out
     out = tmp_path / "bounds.json"
     arguments = ["bank", "prove", str(bank_file), "--gap", "0.4", "--workers", "1", "--count", "2", "--json", str(out)]
@@ -250,7 +250,7 @@ def test_the_commands(bank_file: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "median 40.00 %" in printed
     rows = json.loads(out.read_text())
     assert [row["index"] for row in rows] == [0, 1]
-    assert main(["bank", "show", str(bank_file), "--count", "0", "--json", str(out)]) == 0
+    assert main(["bank", "show", str(bank_file), "--json", str(out)]) == 0
     assert "gap at most" in capsys.readouterr().out
     shown = json.loads(out.read_text())
     scenarios = shown["scenarios"] if isinstance(shown, dict) else shown

@@ -145,37 +145,55 @@ def regret_of(scenario, episode):
     return (episode["cost"] - reached.cost) / reached.cost
 
 
-def test_a_person_s_actions_are_replayed_and_compared_with_the_optimum(ask):
+def driven(ask, scenario, commands):
+    """The episode after the commands of a person."""
+    status, started = ask("/driving/start", {"scenario": scenario})
+    assert status == 200 and started["states"] == [scenario["start"]] and started["period"] == 0.05
+    size, states, done = started["max_commands"], list(started["states"]), False
+    for k in range(0, len(commands), size):
+        status, found = ask("/driving/step", {"id": started["id"], "commands": commands[k : k + size]})
+        assert status == 200
+        states, done = states + found["states"], found["done"]
+    status, episode = ask("/driving/finish", {"id": started["id"]})
+    assert status == 200 and episode["states"] == states and done != episode["stopped"]
+    return episode
+
+
+def test_a_person_s_episode_is_compared_with_the_optimum(ask):
     scenario = fields(horizon=7.02, obstacles=[])  # 6 m at 2 m/s; the last period is shorter
     speed = 6 / 7.02 / SCENARIO.robot.max_speed
-    status, found = ask("/replay", {"scenario": scenario, "actions": [[speed, 0]] * 141})
-    assert status == 200 and found["success"] and not found["stopped"] and found["policy"] == "you"
+    found = driven(ask, scenario, [[speed, 0]] * 141)
+    assert found["success"] and not found["stopped"] and found["policy"] == "you" and found["missed"] is None
     assert found["states"][-1] == pytest.approx([7, 2.5, 0], abs=1e-3)
     assert found["regret"] == pytest.approx(regret_of(scenario, found)) and 0 <= found["regret"] < 0.01
-    turning = [[speed, 0.2 if k < 70 else -0.2] for k in range(141)]
-    _, found = ask("/replay", {"scenario": scenario, "actions": turning})
-    assert not found["success"] and found["regret"] is None
-    _, found = ask("/replay", {"scenario": scenario, "actions": [[-1, 0]] * 141})
+    found = driven(ask, scenario, [[speed, 0.2 if k < 70 else -0.2] for k in range(141)])
+    assert not found["success"] and found["regret"] is None and found["missed"].startswith("the goal by ")
+    found = driven(ask, scenario, [[speed, 0.1 if k > 130 else 0] for k in range(141)])
+    assert not found["success"] and found["missed"] == "the heading of the goal"
+    found = driven(ask, scenario, [[-1, 0]] * 100)
     assert found["collision"] and found["regret"] is None and found["time"] < 1
-    _, found = ask("/replay", {"scenario": scenario, "actions": [[speed, 0]] * 10})
+    found = driven(ask, scenario, [[speed, 0]] * 10)
     assert found["stopped"] and not found["success"] and found["time"] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
-    ("actions", "message"),
+    ("commands", "message"),
     [
-        (None, "actions: expected 1 to 160 pairs of numbers, got NoneType"),
-        ([], "actions: expected 1 to 160 pairs of numbers, got 0"),
-        ([[0, 0]] * 161, "actions: expected 1 to 160 pairs of numbers, got 161"),
-        ([[0, 0], [1.5, 0]], "actions[1]: expected two numbers from -1 to 1, got [1.5, 0]"),
-        ([[0, float("nan")]], "actions[0]: expected two numbers from -1 to 1, got [0, nan]"),
-        ([[0, "1"]], "actions[0]: expected two numbers from -1 to 1, got [0, '1']"),
-        ([[0, 0, 0]], "actions[0]: expected two numbers from -1 to 1, got [0, 0, 0]"),
-        ([0], "actions[0]: expected two numbers from -1 to 1, got 0"),
+        (None, "commands: expected 1 to 100 pairs of numbers, got NoneType"),
+        ([], "commands: expected 1 to 100 pairs of numbers, got 0"),
+        ([[0, 0]] * 101, "commands: expected 1 to 100 pairs of numbers, got 101"),
+        ([[0, 0], [1.5, 0]], "commands[1]: expected two numbers from -1 to 1, got [1.5, 0]"),
+        ([[0, float("nan")]], "commands[0]: expected two numbers from -1 to 1, got [0, nan]"),
+        ([[0, "1"]], "commands[0]: expected two numbers from -1 to 1, got [0, '1']"),
+        ([[0, 0, 0]], "commands[0]: expected two numbers from -1 to 1, got [0, 0, 0]"),
+        ([0], "commands[0]: expected two numbers from -1 to 1, got 0"),
     ],
 )
-def test_actions_are_validated(actions, message, ask):
-    assert ask("/replay", {"scenario": fields(), "actions": actions}) == (400, {"error": message})
+def test_commands_are_validated(commands, message, ask):
+    _, started = ask("/driving/start", {"scenario": fields()})
+    assert ask("/driving/step", {"id": started["id"], "commands": commands}) == (400, {"error": message})
+    status, found = ask("/driving/step", {"id": "another", "commands": [[0, 0]]})
+    assert status == 400 and found["error"].startswith("id: there is no such episode")
 
 
 def test_lessons_are_served(ask):
@@ -240,7 +258,7 @@ def test_invalid_requests_are_refused(ask):
     assert found == {"error": r"Scenario: name: expected printable characters, got '\ud800'"}
     _, found = ask("/drive", {"scenario": fields(horizon=1000), "policy": "open"})
     assert found == {"error": "horizon: expected at most 300 s for an episode, got 1000"}
-    _, found = ask("/replay", {"scenario": fields(horizon=1000), "actions": [[0, 0]]})
+    _, found = ask("/driving/start", {"scenario": fields(horizon=1000)})
     assert found == {"error": "horizon: expected at most 300 s for an episode, got 1000"}
 
 

@@ -5,7 +5,7 @@ from play_helpers import fields, load, opened, rest, served, until
 
 from leapnav.envs import Scenario
 from leapnav.experts import find_optimum
-from leapnav.play.episodes import replay_actions
+from leapnav.play.episodes import Driving
 
 PLAIN = fields(obstacles=[])
 FREE = fields(obstacles=[], horizon=None, cost={**PLAIN["cost"], "proximity_weight": 0, "time_weight": 0.5})
@@ -60,7 +60,9 @@ def test_a_person_arrives_at_the_goal_at_any_time(page):
 
 def test_episodes_of_scenarios_with_a_time_limit():
     scenario = Scenario.from_dict({**FREE, "time_limit": 1.0})
-    found = replay_actions(scenario, [[0, 0]] * 40)
+    driving = Driving(scenario)
+    assert driving.step([[0, 0]] * 40)["done"]
+    found = driving.finish()
     assert not found["success"] and not found["stopped"] and found["time"] == pytest.approx(1.0)
     with pytest.raises(ValueError, match="time_limit: expected at most 300 s for an episode, got 1000"):
-        replay_actions(Scenario.from_dict({**FREE, "time_limit": 1000.0}), [[0, 0]])
+        Driving(Scenario.from_dict({**FREE, "time_limit": 1000.0}))

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from play_helpers import SCENARIO, dragged, fields, load, opened, rest, screen, served, until
+from play_helpers import SCENARIO, dragged, expose, fields, load, opened, rest, screen, served, until
 
 from leapnav.envs import Scenario
 from leapnav.experts import find_optimum
@@ -223,7 +223,7 @@ def test_another_robot_is_chosen(page, model):
     scenario = Scenario.from_dict(page.evaluate("play.scenario"))
     assert scenario.robot.model == model
     assert page.inner_text("#cost") == f"{find_optimum(scenario).cost:.6f}"
-    assert page.is_disabled("#drive")
+    assert page.is_enabled("#drive")
     assert page.is_disabled("#turn-weight") == ("turn_weight" not in scenario.robot.cost_fields)
     field = {"car": "wheelbase", "dynamic_unicycle": "max_acceleration", "differential_drive": "track"}[model]
     page.fill(f"#{field.replace('_', '-')}", "0.8")
@@ -250,6 +250,7 @@ def test_a_link_contains_the_scenario(page):
     rest(page)
     assert page.evaluate("play.scenario") == scenario
     page.reload()
+    expose(page)
     rest(page)
     assert page.evaluate("play.scenario") == scenario
     plain = page.evaluate("(text) => encodeBase64(new TextEncoder().encode(text))", json.dumps(SCENARIO.to_dict()))
@@ -262,7 +263,7 @@ def test_a_link_contains_the_scenario(page):
         until(page, "play.notice !== null && play.pending === 0")
         (line,) = page.inner_text("#notice").splitlines()
         assert line.startswith("link: ") and page.evaluate("play.scenario.name") == "one disc"
-    page.evaluate("forgetLink()")
+    page.evaluate("history.replaceState(null, '', location.pathname)")
 
 
 def test_the_curves_of_an_alternative_are_plotted(page):

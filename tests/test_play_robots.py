@@ -7,6 +7,7 @@ from play_helpers import SCENARIO, dragged, fields, load, opened, rest, screen, 
 from leapnav.envs import Scenario
 from leapnav.envs.robots import box_footprint
 from leapnav.envs.scenarios.families import FAMILIES
+from leapnav.play.episodes import Driving
 
 FOOTPRINT = [disc.model_dump() for disc in box_footprint(0.9, 0.2, 0.4, 4)]  # the front is 0.9 m ahead of the pose
 CAR = fields(robot={"model": "car", "footprint": FOOTPRINT}, start=[1, 2.5, np.pi / 2], goal=[6, 2.5, 0], horizon=12)
@@ -73,18 +74,20 @@ def test_another_model_keeps_the_discs(page):
     assert page.locator("#radius").count() == 1
 
 
-def test_the_driving_ends_when_any_disc_is_in_contact(page):
-    scenario = {**CAR, "robot": {"model": "unicycle", "footprint": FOOTPRINT}}
-    contact = "([scenario, pose]) => isInContact(scenario, pose)"
-    # The obstacle is a disc with a radius of 0.5 m at (4, 4.2); the wall is at x = 8.
-    for pose, expected in (
-        ([4, 2.6, np.pi / 2], False),
-        ([4, 2.9, np.pi / 2], True),
-        ([4, 2.9, 0], False),
-        ([7.2, 2, 0], True),
-        ([7.2, 2, np.pi], False),
-    ):
-        assert page.evaluate(contact, [scenario, pose]) == expected
+def test_the_driving_ends_when_any_disc_is_in_contact():
+    # The obstacle is a disc with a radius of 0.5 m at (4, 4.2).
+    start = {**CAR, "robot": {"model": "unicycle", "footprint": FOOTPRINT}, "start": [4, 2, np.pi / 2]}
+    driving = Driving(Scenario.from_dict(start))
+    found = driving.step([[1, 0]] * 40)
+    assert found["done"] and driving.finish()["collision"]
+    assert found["states"][-1][1] + max(disc["offset"] + disc["radius"] for disc in FOOTPRINT) == pytest.approx(3.7)
+
+
+@pytest.mark.parametrize("model", ["car", "dynamic_unicycle", "differential_drive"])
+def test_every_robot_is_driven(model):
+    driving = Driving(Scenario.from_dict({**SCENARIO.to_dict(), "robot": {"model": model}, "obstacles": []}))
+    states = driving.step([[1, 0.5]] * 40)["states"]
+    assert max(x for x, _, _ in states) > SCENARIO.start[0] + 0.1 and states[-1][2] > 0.05
 
 
 def test_every_family_is_offered(page):

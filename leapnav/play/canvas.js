@@ -1,27 +1,26 @@
-"use strict";
+// The plane: its transformation to pixels, and the drawing of scenarios, paths and robots. All colours come from the
+// server (`play.colors`).
 
-// Drawing of the plane: scenario, paths and robots. All colours come from the server (`play.colors`).
+import { byId, play, shownScenario } from "./state.js";
+import { discsOf, frontOf, hasHeading, partsOf, placedDiscs } from "./shapes.js";
 
-const canvas = byId("view");
-let context = canvas.getContext("2d");
+export const canvas = byId("view");
+export let context = canvas.getContext("2d");
 
 // ---- The plane
 
-let view = { scale: 1, left: 0, top: 0 }; // pixels per metre, and the pixel of the origin
-let unit = 1; // pixels per unit of line widths and font sizes
-const toScreen = ([x, y]) => [view.left + view.scale * x, view.top - view.scale * y];
-const toPlane = ([x, y]) => [(x - view.left) / view.scale, (view.top - y) / view.scale];
+export let view = { scale: 1, left: 0, top: 0 }; // pixels per metre, and the pixel of the origin
+export let unit = 1; // pixels per unit of line widths and font sizes
+export const toScreen = ([x, y]) => [view.left + view.scale * x, view.top - view.scale * y];
+export const toPlane = ([x, y]) => [(x - view.left) / view.scale, (view.top - y) / view.scale];
 
-// The scenario that is drawn: that of the open lesson, or the edited one.
-const shownScenario = () => (play.lesson && play.lesson.content ? lessonScenario() : play.scenario);
-
-function fitView(width, height) {
+export function fitView(width, height) {
   const [x0, y0, x1, y1] = shownScenario().arena, margin = 6 * unit;
   const scale = Math.max(Math.min((width - 2 * margin) / (x1 - x0), (height - 2 * margin) / (y1 - y0)), 1e-9);
   view = { scale, left: (width - scale * (x1 - x0)) / 2 - scale * x0, top: (height + scale * (y1 - y0)) / 2 + scale * y0 };
 }
 
-function drawLine(points, color, width, dash = []) {
+export function drawLine(points, color, width, dash = []) {
   context.strokeStyle = color;
   context.lineWidth = width * unit;
   context.lineJoin = "round";
@@ -32,7 +31,7 @@ function drawLine(points, color, width, dash = []) {
   context.setLineDash([]);
 }
 
-function drawPoints(points, color, radius) {
+export function drawPoints(points, color, radius) {
   context.fillStyle = color;
   for (const point of points) {
     context.beginPath();
@@ -41,13 +40,13 @@ function drawPoints(points, color, radius) {
   }
 }
 
-const arrowTip = ([x, y, heading]) => {
+export const arrowTip = ([x, y, heading]) => {
   const { robot } = shownScenario(), widest = Math.max(...discsOf(robot).map(({ radius }) => radius));
   const length = Math.max(frontOf(robot) + 1.2 * widest, (26 * unit) / view.scale);
   return [x + length * Math.cos(heading), y + length * Math.sin(heading)];
 };
 
-function drawRobot(pose, color, hasArrow, isSelected = false) {
+export function drawRobot(pose, color, hasArrow, isSelected = false) {
   const { robot } = shownScenario(), [x, y] = toScreen(pose), pixels = (radius) => Math.max(view.scale * radius, 3 * unit);
   const discs = placedDiscs(robot, pose).map(({ center, radius }) => [...toScreen(center), pixels(radius)]);
   context.lineWidth = (isSelected ? 4 : 2) * unit;
@@ -90,14 +89,32 @@ function drawSelection(discs) {
 }
 
 // The pose at a time, interpolated between states at equal intervals.
-function poseAt(states, time, duration) {
+export function poseAt(states, time, duration) {
   const position = Math.min(Math.max(time / duration, 0), 1) * (states.length - 1);
   const k = Math.min(Math.floor(position), states.length - 2);
   if (k < 0) return states[0];
   return states[k].map((value, i) => value + (position - k) * (states[k + 1][i] - value));
 }
 
-function drawScenario(scenario, selected = null) {
+// Makes the outline of a part the path of the canvas.
+function tracePart({ circle, capsule, polygon }) {
+  context.beginPath();
+  if (circle) {
+    context.arc(...toScreen(circle.center), Math.max(view.scale * circle.radius, 0), 0, 2 * Math.PI);
+    return;
+  }
+  if (capsule) {
+    const { start, end, radius } = capsule, pixels = Math.max(view.scale * radius, 0);
+    const angle = Math.atan2(start[1] - end[1], end[0] - start[0]); // the canvas counts y downwards
+    context.arc(...toScreen(end), pixels, angle - Math.PI / 2, angle + Math.PI / 2);
+    context.arc(...toScreen(start), pixels, angle + Math.PI / 2, angle + (3 * Math.PI) / 2);
+  } else {
+    polygon.vertices.forEach((point, i) => (i ? context.lineTo(...toScreen(point)) : context.moveTo(...toScreen(point))));
+  }
+  context.closePath();
+}
+
+export function drawScenario(scenario, selected = null) {
   const [x0, y0, x1, y1] = scenario.arena, [left, top] = toScreen([x0, y1]), colors = play.colors;
   context.strokeStyle = colors.wall;
   context.lineWidth = 2 * unit;
@@ -117,57 +134,17 @@ function drawScenario(scenario, selected = null) {
   });
 }
 
-const drawPoses = (scenario, selected = null) => {
+export const drawPoses = (scenario, selected = null) => {
   drawRobot(scenario.start, play.colors.start, true, selected === "start");
   drawRobot(scenario.goal, play.colors.goal, true, selected === "goal");
 };
 
-const alternativeColor = (i) => play.colors.alternatives[i % play.colors.alternatives.length];
-
-function drawSolution(solution) {
-  const colors = play.colors, isOutdated = play.error !== null || !solution.success;
-  solution.alternatives.forEach((other, i) => {
-    const isShown = play.highlighted === i + 1;
-    drawLine(other.states, alternativeColor(i), isShown ? 3 : 1.4, isShown ? [] : [5, 4]);
-  });
-  if (play.sweeps && play.sweeps.length) {
-    const sweep = play.sweeps[byId("sweep-slider").value];
-    drawLine(sweep.states, colors.sweep, 2);
-    drawPoints(sweep.nodes, colors.sweep, 3);
-  }
-  drawLine(solution.path.states, colors.optimum + (isOutdated ? "77" : ""), play.highlighted === 0 ? 3 : 2);
-}
-
-function drawPlane(width, height) {
-  const { scenario, solution, episode, driving } = play, colors = play.colors;
-  fitView(width, height);
-  if (play.lesson && play.lesson.content) {
-    drawLesson();
-    return;
-  }
-  drawScenario(scenario, driving ? null : play.selected);
-  if (solution && solution.path && (!driving || byId("show-optimum").checked)) drawSolution(solution);
-  const episodeColor = episode && (episode.success ? colors.policy : colors.failure);
-  if (episode) drawLine(episode.states, episodeColor, 2.2);
-  drawPoses(scenario, driving ? null : play.selected);
-  if (driving) {
-    drawLine(driving.states, colors.policy, 2.2);
-    drawRobot(driving.pose, colors.policy, false);
-  }
-  if (play.time === null) return;
-  if (solution && solution.path) {
-    drawRobot(poseAt(solution.path.states, play.time, durationOf(solution.path)), colors.optimum, false);
-  }
-  if (episode) {
-    const duration = episode.period * (episode.states.length - 1);
-    drawRobot(poseAt(episode.states, play.time, Math.min(duration, scenario.horizon ?? duration)), episodeColor, false);
-  }
-}
+export const alternativeColor = (i) => play.colors.alternatives[i % play.colors.alternatives.length];
 
 // ---- Both canvases
 
 // Prepares a canvas for drawing in CSS pixels and returns its size.
-function prepareCanvas(element) {
+export function prepareCanvas(element) {
   const ratio = window.devicePixelRatio || 1, { clientWidth: width, clientHeight: height } = element;
   if (element.width !== Math.round(width * ratio) || element.height !== Math.round(height * ratio)) {
     element.width = Math.round(width * ratio);
@@ -179,26 +156,7 @@ function prepareCanvas(element) {
   return [width, height];
 }
 
-const PLOT_INTERVAL = 100; // ms between two drawings of the plots during a drag, which leaves more time for the plane
-let plotted = []; // what the plots show
-let plotTime = 0; // ms, of their last drawing
-
-function draw() {
-  const [width, height] = prepareCanvas(canvas);
-  if (!play.scenario || !play.colors) return;
-  drawPlane(width, height);
-  const { lesson, driving, time, searched, highlighted } = play, plots = byId("plots");
-  const shown = [shownPath(), lesson && lesson.content, lesson && lesson.step, driving !== null, time, searched,
-    highlighted, byId("show-optimum").checked, unit, plots.clientWidth, plots.clientHeight, window.devicePixelRatio];
-  if (shown.length === plotted.length && shown.every((value, i) => value === plotted[i])) return;
-  if (drag !== null && performance.now() - plotTime < PLOT_INTERVAL) return;
-  plotted = shown;
-  plotTime = performance.now();
-  drawPlots(...prepareCanvas(plots));
-}
-
 // Line widths and fonts of the canvases follow the font size of the page.
-function resize() {
+export function updateUnit() {
   unit = parseFloat(getComputedStyle(document.documentElement).fontSize) / 14;
-  draw();
 }

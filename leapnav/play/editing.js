@@ -1,6 +1,8 @@
-"use strict";
-
 // Editing of the scenario by mouse, touch and keyboard.
+
+import { byId, canEdit, edit, isFree, play, redo, scheduleSearch, setText, show, undo } from "./state.js";
+import { canRotate, centerOf, hasHeading, isInside, moved, placedDiscs, transformed } from "./shapes.js";
+import { arrowTip, canvas, toPlane, view } from "./canvas.js";
 
 const STEP = 0.05, FINE_STEP = 0.01; // m per key press
 const TURN = Math.PI / 36, FINE_TURN = Math.PI / 180; // rad per key press
@@ -10,10 +12,9 @@ const HANDLE_SIZE = { mouse: 10, pen: 14, touch: 22 }; // smallest radius of a h
 // ---- Changes of the selection
 
 const obstaclesOf = () => play.scenario.obstacles || [];
-const poseOf = (name) => [...play.scenario[name], null].slice(0, 3);
+export const poseOf = (name) => [...play.scenario[name], null].slice(0, 3);
 const isPose = (selected) => selected === "start" || selected === "goal";
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
-const canEdit = () => play.scenario !== null && !play.lesson && !play.driving;
 
 function replaceObstacle(i, obstacle, group) {
   edit({ obstacles: obstaclesOf().map((old, k) => (k === i ? obstacle : old)) }, group);
@@ -47,7 +48,7 @@ function resizeSelected(factor, group) {
 function removeSelected() {
   if (typeof play.selected !== "number") return;
   const removed = play.selected;
-  drag = null;
+  play.drag = null;
   play.selected = null;
   edit({ obstacles: obstaclesOf().filter((_, i) => i !== removed) });
 }
@@ -126,7 +127,7 @@ canvas.addEventListener("pointerdown", (event) => {
   if (!handle && event.pointerType === "touch") return; // the page may scroll; pointerup ends a tap
   play.selected = handle && (handle.kind === "obstacle" ? handle.i : handle.name);
   if (handle) {
-    drag = { ...handle, from: point };
+    play.drag = { ...handle, from: point };
     canvas.setPointerCapture(event.pointerId);
     canvas.focus({ preventScroll: true });
   }
@@ -135,24 +136,24 @@ canvas.addEventListener("pointerdown", (event) => {
 
 canvas.addEventListener("pointermove", (event) => {
   if (!event.isPrimary) return;
-  if (!drag) {
+  if (!play.drag) {
     if (canEdit()) canvas.style.cursor = findHandle(clientPoint(event), event.pointerType) ? "grab" : "default";
     return;
   }
-  if (moveTime === null) moveTime = performance.now();
-  const point = clientPoint(event), [dx, dy] = [point[0] - drag.from[0], point[1] - drag.from[1]], group = drag;
-  drag.from = point;
-  if (drag.kind === "obstacle") {
-    replaceObstacle(drag.i, moved(obstaclesOf()[drag.i], dx, dy), group);
+  if (play.moveTime === null) play.moveTime = performance.now();
+  const point = clientPoint(event), [dx, dy] = [point[0] - play.drag.from[0], point[1] - play.drag.from[1]], group = play.drag;
+  play.drag.from = point;
+  if (play.drag.kind === "obstacle") {
+    replaceObstacle(play.drag.i, moved(obstaclesOf()[play.drag.i], dx, dy), group);
     return;
   }
-  const [x, y, heading] = poseOf(drag.name);
-  if (drag.kind === "heading") setPose(drag.name, [x, y, Math.atan2(point[1] - y, point[0] - x)], group);
-  else setPose(drag.name, [x + dx, y + dy, heading], group);
+  const [x, y, heading] = poseOf(play.drag.name);
+  if (play.drag.kind === "heading") setPose(play.drag.name, [x, y, Math.atan2(point[1] - y, point[0] - x)], group);
+  else setPose(play.drag.name, [x + dx, y + dy, heading], group);
 });
 
 canvas.addEventListener("pointerup", (event) => {
-  if (!drag && event.pointerType === "touch" && canEdit()) {
+  if (!play.drag && event.pointerType === "touch" && canEdit()) {
     play.selected = null;
     show();
   }
@@ -160,8 +161,8 @@ canvas.addEventListener("pointerup", (event) => {
 
 for (const name of ["pointerup", "pointercancel"]) {
   canvas.addEventListener(name, (event) => {
-    if (!drag || !event.isPrimary) return;
-    drag = null;
+    if (!play.drag || !event.isPrimary) return;
+    play.drag = null;
     if (!play.searched) scheduleSearch();
   });
 }
@@ -232,7 +233,7 @@ for (const button of document.querySelectorAll("[data-action]")) {
 }
 
 // The buttons that apply to the selection.
-function showSelection() {
+export function showSelection() {
   const { selected } = play, isObstacle = typeof selected === "number";
   const isFixed = isObstacle && !canRotate(obstaclesOf()[selected] || {});
   const enabled = {

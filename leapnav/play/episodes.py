@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
+import secrets
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from leapnav.envs.keys import driving_controls
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.validation import is_finite_number
 from leapnav.experts.data.demonstrations import state_of
 from leapnav.experts.optimum import find_reached_optimum
 
 MAX_DRIVE_HORIZON = 300.0  # s
-CONTROL_PERIOD = 0.05  # s, of a person's actions: the default of the environment
-MAX_ACTION = 1.0
+MAX_COMMANDS = 100  # of a request
 
 
 def play_policy(scenario: Scenario, policy: str) -> dict[str, Any]:
@@ -28,8 +30,8 @@ def play_policy(scenario: Scenario, policy: str) -> dict[str, Any]:
 
     Returns:
         A dictionary: `policy`, `states` (x, y (m), heading (rad)) at intervals of `period` (s), `time` (s) of the last
-        state, `success`, `collision`, `stopped` (whether the episode ended early without a collision), `cost`, and
-        `regret` of a success, see the function `regret`.
+        state, `success`, `missed` (what was not reached), `collision`, `stopped` (whether the episode ended early
+        without a collision), `cost`, and `regret` of a success, see the function `regret`.
 
     Raises:
         ValueError: the horizon is too long.
@@ -45,29 +47,73 @@ def play_policy(scenario: Scenario, policy: str) -> dict[str, Any]:
     return {"policy": policy, **_play(scenario, env, act_with(make_policy_from_spec(policy, env)))}
 
 
-def replay_actions(scenario: Scenario, actions: Any) -> dict[str, Any]:
-    """Replay the actions of a person.
+class Driving:
+    """An episode that a person drives.
 
     Args:
         scenario: the scenario.
-        actions: a list of pairs (speed, turn rate) as fractions of the robot's limits, one per control period. A list
-            that ends before the horizon, or before the goal if the horizon is free, ends the episode as `stopped`.
 
-    Returns:
-        As `play_policy`; `policy` is "you".
+    Attributes:
+        id: text that identifies the episode.
 
     Raises:
-        ValueError: the horizon is too long, or the actions are invalid.
+        ValueError: the horizon is too long.
 
     """
-    from leapnav.envs.episodes import replay
-    from leapnav.envs.navigation import NavigateEnv
 
-    check_horizon(scenario)
-    limit = MAX_DRIVE_HORIZON if scenario.horizon is None else scenario.horizon
-    array = check_actions(actions, math.ceil(limit / CONTROL_PERIOD - 1e-9))
-    env = NavigateEnv(scenario=scenario, observation="state", control_period=CONTROL_PERIOD)
-    return {"policy": "you", **_play(scenario, env, replay(array))}
+    def __init__(self, scenario: Scenario) -> None:
+        from leapnav.envs.navigation import NavigateEnv
+
+        check_horizon(scenario)
+        self.id = secrets.token_hex(8)
+        self._env = NavigateEnv(scenario=scenario, observation="state")
+        self._info = self._env.reset(seed=0)[1]
+        self._states, self._done = [_pose(self._info)], False
+        self._ahead, self._left = driving_controls(type(scenario.robot))
+
+    def described(self) -> dict[str, Any]:
+        """Return the content of the response to a start.
+
+        A dictionary: `id`; `states`, with the first pose; `period` (s) of a command; `limit` (s) of the episode;
+        `max_commands` of a request.
+        """
+        env = self._env
+        limit = env.scenario.episode_limit
+        return {
+            "id": self.id,
+            "states": self._states[:1],
+            "period": env.control_period,
+            "limit": limit,
+            "max_commands": MAX_COMMANDS,
+        }
+
+    def step(self, commands: Any) -> dict[str, Any]:
+        """Execute commands, each for one control period, until the end of the episode.
+
+        Args:
+            commands: a list of pairs from -1 to 1: ahead and to the left.
+
+        Returns:
+            A dictionary: `states`, the poses that follow; `done`, whether the episode has ended.
+
+        Raises:
+            ValueError: the commands are invalid.
+
+        """
+        count = len(self._states)
+        for ahead, left in check_commands(commands):
+            if self._done:
+                break
+            action = np.clip(ahead * self._ahead + left * self._left, -1.0, 1.0)
+            _, _, terminated, truncated, self._info = self._env.step(action)
+            self._states.append(_pose(self._info))
+            self._done = terminated or truncated
+        return {"states": self._states[count:], "done": self._done}
+
+    def finish(self) -> dict[str, Any]:
+        """Return the episode as `play_policy` does; `policy` is "you". An unfinished episode is `stopped`."""
+        settings = self._env.settings
+        return {"policy": "you", **_describe(self._env.scenario, self._info, self._states, self._done, settings)}
 
 
 def check_horizon(scenario: Scenario) -> None:
@@ -77,21 +123,21 @@ def check_horizon(scenario: Scenario) -> None:
         raise ValueError(f"{field}: expected at most {MAX_DRIVE_HORIZON:g} s for an episode, got {limit:g}")
 
 
-def check_actions(actions: Any, max_count: int) -> np.ndarray:
-    """Return a request's actions as an array (N, 2).
+def check_commands(commands: Any) -> np.ndarray:
+    """Return the commands of a request as an array (N, 2).
 
     Raises:
-        ValueError: they are not 1 to `max_count` pairs of numbers from -1 to 1.
+        ValueError: they are not 1 to `MAX_COMMANDS` pairs of numbers from -1 to 1.
 
     """
-    if not isinstance(actions, list) or not 1 <= len(actions) <= max_count:
-        count = len(actions) if isinstance(actions, list) else type(actions).__name__
-        raise ValueError(f"actions: expected 1 to {max_count} pairs of numbers, got {count}")
-    for i, action in enumerate(actions):
-        is_pair = isinstance(action, list) and len(action) == 2 and all(is_finite_number(value) for value in action)
-        if not is_pair or max(map(abs, action)) > MAX_ACTION:
-            raise ValueError(f"actions[{i}]: expected two numbers from -1 to 1, got {str(action)[:40]}")
-    return np.array(actions, dtype=np.float32)
+    if not isinstance(commands, list) or not 1 <= len(commands) <= MAX_COMMANDS:
+        count = len(commands) if isinstance(commands, list) else type(commands).__name__
+        raise ValueError(f"commands: expected 1 to {MAX_COMMANDS} pairs of numbers, got {count}")
+    for i, command in enumerate(commands):
+        is_pair = isinstance(command, list) and len(command) == 2 and all(is_finite_number(value) for value in command)
+        if not is_pair or max(map(abs, command)) > 1.0:
+            raise ValueError(f"commands[{i}]: expected two numbers from -1 to 1, got {str(command)[:40]}")
+    return np.array(commands, dtype=np.float32)
 
 
 def _play(scenario: Scenario, env: Any, act: Any) -> dict[str, Any]:
@@ -106,24 +152,34 @@ def _play(scenario: Scenario, env: Any, act: Any) -> dict[str, Any]:
             states.append(_pose(info))
     finally:
         env.close()
-    return _describe(scenario, info, states, done, env.settings.control_period)
+    return _describe(scenario, info, states, done, env.settings)
 
 
 def _describe(
-    scenario: Scenario, info: dict[str, Any], states: list[list[float]], done: bool, period: float
+    scenario: Scenario, info: dict[str, Any], states: list[list[float]], done: bool, settings: EnvironmentSettings
 ) -> dict[str, Any]:
     """Return the content of a response, see `play_policy`."""
     success = done and bool(info["is_success"])
     return {
         "states": states,
-        "period": period,
+        "period": settings.control_period,
         "time": float(info["time"]),
         "success": success,
+        "missed": None if success else _missed(scenario, states[-1], settings),
         "collision": bool(info["collision"]),
         "stopped": not done,
         "cost": float(info["cost"]),
         "regret": regret(scenario, state_of(info), float(info["cost"])) if success else None,
     }
+
+
+def _missed(scenario: Scenario, pose: Sequence[float], settings: EnvironmentSettings) -> str:
+    """Return what an episode without success did not reach."""
+    distance, heading = math.dist(pose[:2], scenario.goal[:2]), scenario.goal[2]
+    if distance > settings.position_tolerance:
+        return f"the goal by {distance:.2f} m"
+    turn = 0.0 if heading is None else math.remainder(pose[2] - heading, 2 * math.pi)
+    return "the heading of the goal" if abs(turn) > settings.heading_tolerance else "the motion of the goal"
 
 
 def regret(scenario: Scenario, state: Sequence[float] | np.ndarray, cost: float) -> float | None:

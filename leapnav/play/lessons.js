@@ -1,11 +1,8 @@
-"use strict";
-
 // The two guided lessons: their numbers and sentences come from the server, see lessons.py.
 
-const lessonStep = () => play.lesson.content.steps[play.lesson.step];
-
-// The scenario of the open lesson at its step.
-const lessonScenario = () => lessonStep().scenario || play.lesson.content.scenario;
+import { byId, closeLesson, lessonScenario, lessonStep, play, request, setText, show, showError } from "./state.js";
+import { drawLine, drawPoints, drawPoses, drawScenario, poseAt } from "./canvas.js";
+import { drawAbscissa, drawPlot, plotBoxes } from "./plots.js";
 
 // The iterate of a method at the step; a method that has ended keeps its last one.
 const iterateAt = (method, step) => method.iterates[Math.min(step, method.iterates.length - 1)];
@@ -19,7 +16,7 @@ function branchColor(branch) {
   return { minimum: play.colors.alternatives[0], saddle: play.colors.failure, lost: play.colors.sweep }[branch];
 }
 
-async function openLesson(name) {
+export async function openLesson(name) {
   if (play.driving) return;
   play.lesson = { name, content: null, step: 0 };
   play.notice = null;
@@ -38,12 +35,6 @@ async function openLesson(name) {
     play.lesson = null;
     showError(error);
   }
-}
-
-function closeLesson() {
-  if (!play.lesson) return;
-  play.lesson = null;
-  show();
 }
 
 function setLessonStep(step) {
@@ -80,7 +71,7 @@ function lessonTable() {
   };
 }
 
-function showLesson() {
+export function showLesson() {
   const isOpen = play.lesson !== null;
   document.body.classList.toggle("has-lesson", isOpen);
   byId("lesson-box").hidden = !isOpen;
@@ -114,7 +105,7 @@ function showLesson() {
 
 // ---- Drawing
 
-function drawLesson() {
+export function drawLesson() {
   const { name, content, step } = play.lesson, scenario = lessonScenario(), colors = play.colors;
   drawScenario(scenario);
   if (name === "methods") {
@@ -134,7 +125,7 @@ function drawLesson() {
   drawPoses(scenario);
 }
 
-function drawLessonPlots(width, height) {
+export function drawLessonPlots(width, height) {
   const { name, content, step } = play.lesson, colors = play.colors;
   if (name === "methods") {
     const indices = content.steps.map((_, k) => k), marks = [[step, colors.wall]];

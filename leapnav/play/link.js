@@ -1,12 +1,12 @@
-"use strict";
-
 // Links that contain the scenario: its JSON text in the fragment of the address, as base64url, compressed if possible.
+
+import { byId, closeLesson, play, request, setScenario, show } from "./state.js";
 
 const MAX_LINK_SIZE = 1e6; // characters of the JSON text
 const DAMAGED_LINK = "link: it is damaged or contains no scenario";
 const LINK_PATTERN = /^#([zj])\.([\w-]+)$/; // "z": deflate-raw, "j": not compressed
 
-function encodeBase64(bytes) {
+export function encodeBase64(bytes) {
   let text = "";
   for (const byte of bytes) text += String.fromCharCode(byte);
   return btoa(text).replace(/\+/g, "-").replace(/\//g, "_").replace(/=+$/, "");
@@ -29,7 +29,7 @@ async function passThrough(bytes, stream) {
   return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 
-async function scenarioLink(scenario) {
+export async function scenarioLink(scenario) {
   const bytes = new TextEncoder().encode(JSON.stringify(scenario));
   const isCompressed = "CompressionStream" in window;
   const content = isCompressed ? await passThrough(bytes, new CompressionStream("deflate-raw")) : bytes;
@@ -55,11 +55,6 @@ async function scenarioOfLink(hash) {
   return checked.scenario;
 }
 
-// The fragment contains the scenario only until it is changed.
-function forgetLink() {
-  if (location.hash) history.replaceState(null, "", location.pathname);
-}
-
 async function copyLink() {
   try {
     const link = await scenarioLink((await request("/check", { scenario: play.scenario })).scenario);
@@ -74,7 +69,7 @@ async function copyLink() {
 }
 
 // Loads the scenario of the address; a damaged link is reported in one line and changes nothing.
-async function openLink() {
+export async function openLink() {
   const { hash } = location;
   try {
     const scenario = await scenarioOfLink(hash);

@@ -1,6 +1,15 @@
-"use strict";
-
 // The panels of the page and their controls.
+
+import {
+  byId, canEdit, changeScenario, closeLesson, drivePolicy, durationOf, edit, format, isFree, loadSweeps, modelOf,
+  play, request, robotOf, setDisplay, setScenario, setText, show, showError,
+} from "./state.js";
+import { alternativeColor, canvas } from "./canvas.js";
+import { showLesson } from "./lessons.js";
+import { draw, resize } from "./drawing.js";
+import { showSelection } from "./editing.js";
+import { openLink } from "./link.js";
+import { describeEpisode } from "./driving.js";
 
 const DEFAULT_HORIZON = 10, DEFAULT_TIME_WEIGHT = 0.5; // s, 1/s
 const DEFAULT_FAMILY = "clutter";
@@ -9,7 +18,7 @@ const settings = () => document.querySelectorAll("[data-group]"); // number inpu
 
 // ---- Display
 
-function show() {
+function display() {
   draw();
   const { solution, error, episode } = play, path = solution && solution.path;
   byId("status").classList.toggle("failed", error !== null || (solution !== null && !solution.success));
@@ -102,10 +111,7 @@ function showSettings() {
     if (field === "speed_weight" || field === "turn_weight") input.disabled = !weights.includes(field);
     if (field === "time_weight") input.disabled = !free;
   }
-  byId("drive").disabled = modelOf(play.scenario) !== "unicycle";
 }
-
-const modelOf = (scenario) => (scenario.robot || {}).model || "unicycle";
 
 let shownFields = null; // the names of the robot's numbers that have inputs, as one text
 
@@ -225,6 +231,7 @@ document.addEventListener("keydown", (event) => {
   if (byId("keys").open) byId("keys").scrollIntoView({ block: "nearest" });
 });
 
+setDisplay(display);
 const observer = new ResizeObserver(resize);
 observer.observe(canvas);
 observer.observe(byId("plots"));

@@ -1,16 +1,17 @@
-"use strict";
-
 // Plots: the optimum or an alternative over time, or the curves of a lesson.
 
+import { byId, durationOf, modelOf, play, robotOf } from "./state.js";
+import { alternativeColor, context, unit } from "./canvas.js";
+
 // The local optimum whose curves are plotted: the optimum or the highlighted alternative.
-function shownPath() {
+export function shownPath() {
   const solution = play.solution;
   if (!solution || !solution.path) return null;
   const other = play.highlighted > 0 ? solution.alternatives[play.highlighted - 1] : null;
   return other && other.times ? other : solution.path;
 }
 
-function shownPathName() {
+export function shownPathName() {
   const path = shownPath();
   if (!path) return "";
   const excess = play.solution.path.cost > 0 ? 100 * (path.cost / play.solution.path.cost - 1) : 0;
@@ -19,7 +20,7 @@ function shownPathName() {
   return `Alternative ${play.highlighted}, J = ${path.cost.toFixed(4)} (+${excess.toFixed(2)} %)`;
 }
 
-const shownPathColor = () => (play.highlighted > 0 ? alternativeColor(play.highlighted - 1) : play.colors.optimum);
+export const shownPathColor = () => (play.highlighted > 0 ? alternativeColor(play.highlighted - 1) : play.colors.optimum);
 
 function setFont(bold = false) {
   context.font = `${bold ? "600 " : ""}${12 * unit}px system-ui, sans-serif`;
@@ -27,7 +28,7 @@ function setFont(bold = false) {
 
 // Draws one plot: title, curves [label, values, color] over `abscissae`, in a box. Options: `minRange` of the vertical
 // axis, `isLogarithmic`, `includesZero`, `marks` (vertical lines [abscissa, color]), `dots` (whether values have dots).
-function drawPlot(box, title, curves, abscissae, options = {}) {
+export function drawPlot(box, title, curves, abscissae, options = {}) {
   const { left, top, width, height } = box, colors = play.colors;
   const { minRange = 0, isLogarithmic = false, includesZero = false, marks = [], dots = false } = options;
   const scaled = (value) => (isLogarithmic ? Math.log10(Math.max(value, 1e-16)) : value);
@@ -103,7 +104,7 @@ function drawPlot(box, title, curves, abscissae, options = {}) {
 }
 
 // The boxes of `count` plots below each other, with room for titles and for a label of the horizontal axis.
-function plotBoxes(count, width, height, headingHeight) {
+export function plotBoxes(count, width, height, headingHeight) {
   const left = 60 * unit, spacing = 26 * unit, bottom = 20 * unit;
   const plotHeight = Math.max((height - headingHeight - bottom - spacing * count) / count, 10);
   return Array.from({ length: count }, (_, k) => ({
@@ -112,7 +113,7 @@ function plotBoxes(count, width, height, headingHeight) {
   }));
 }
 
-function drawAbscissa(boxes, first, last, name, height) {
+export function drawAbscissa(boxes, first, last, name, height) {
   const { left, width } = boxes[0];
   setFont();
   context.fillStyle = play.colors.wall;
@@ -125,11 +126,7 @@ function drawAbscissa(boxes, first, last, name, height) {
   context.fillText(last, left + width, y);
 }
 
-function drawPlots(width, height) {
-  if (play.lesson && play.lesson.content) {
-    drawLessonPlots(width, height);
-    return;
-  }
+export function drawPlots(width, height) {
   const path = shownPath();
   if (!path || (play.driving && !byId("show-optimum").checked)) return;
   const curves = play.colors.curves, column = (rows, i) => rows.map((row) => row[i]);

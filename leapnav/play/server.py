@@ -31,10 +31,11 @@ SCRIPTS = (
     "shapes.js",
     "canvas.js",
     "plots.js",
+    "lessons.js",
+    "drawing.js",
     "editing.js",
     "link.js",
     "driving.js",
-    "lessons.js",
     "page.js",
 )
 FILES = {
@@ -139,7 +140,9 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
         "/search": lambda content: solver.search(_scenario(content)),
         "/sweeps": lambda content: solver.sweeps(_scenario(content)),
         "/drive": lambda content: solver.drive(_scenario(content), str(content.get("policy"))),
-        "/replay": lambda content: solver.replay(_scenario(content), content.get("actions")),
+        "/driving/start": lambda content: solver.start_driving(_scenario(content)),
+        "/driving/step": lambda content: solver.driving(content.get("id")).step(content.get("commands")),
+        "/driving/finish": lambda content: solver.driving(content.get("id")).finish(),
         "/lesson": lambda content: solver.lesson(str(content.get("lesson"))),
     }
     is_public = host in ("0.0.0.0", "::")

@@ -21,7 +21,7 @@ from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.search.initial_guess import best_path
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
-from leapnav.play.episodes import play_policy, replay_actions
+from leapnav.play.episodes import Driving, play_policy
 from leapnav.play.lessons import LESSONS
 
 OPTIMUM_POINTS, OTHER_POINTS = 201, 101  # of the optimum, and of each alternative and sweep
@@ -42,6 +42,7 @@ class PlaySolver:
         self.policies = tuple(policies)
         self._stored: OrderedDict[str, Extremal] = OrderedDict()
         self._lock = threading.Lock()
+        self._driving: Driving | None = None
 
     def follow(self, scenario: Scenario, previous: str | None) -> dict[str, Any]:
         """Return a local optimum while the user drags.
@@ -107,15 +108,26 @@ class PlaySolver:
         with self._lock:
             return play_policy(scenario, policy)
 
-    def replay(self, scenario: Scenario, actions: Any) -> dict[str, Any]:
-        """Replay a person's actions and return the path and the regret, see `leapnav.play.episodes`.
+    def start_driving(self, scenario: Scenario) -> dict[str, Any]:
+        """Start an episode that a person drives, and return its first state, see `Driving`.
 
         Raises:
-            ValueError: the actions are invalid, or the horizon is too long.
+            ValueError: the horizon is too long.
 
         """
-        with self._lock:
-            return replay_actions(scenario, actions)
+        self._driving = Driving(scenario)
+        return self._driving.described()
+
+    def driving(self, identity: Any) -> Driving:
+        """Return the episode that a person drives.
+
+        Raises:
+            ValueError: another one has been started since.
+
+        """
+        if self._driving is None or self._driving.id != identity:
+            raise ValueError(f"id: there is no such episode, or another one has been started, got {str(identity)[:40]}")
+        return self._driving
 
     def lesson(self, name: str) -> dict[str, Any]:
         """Return the content of a lesson, see `leapnav.play.lessons`; it is computed at the first request.

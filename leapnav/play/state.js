@@ -1,19 +1,17 @@
-"use strict";
-
 // State of the page, requests to the server, and the history of changes.
 
 const SEARCH_DELAY = 250; // ms from the last change to the start of the full search
 const MAX_HISTORY = 200; // changes that can be undone
 const MAX_LATENCIES = 500;
 
-const byId = (id) => document.getElementById(id);
-const setText = (id, value) => {
+export const byId = (id) => document.getElementById(id);
+export const setText = (id, value) => {
   if (byId(id).textContent !== value) byId(id).textContent = value;
 };
-const format = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
+export const format = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
 // What the page shows. It is a property of `window` so that tests and the console can read it.
-const play = (window.play = {
+export const play = (window.play = {
   scenario: null, // as in a scenario file; replaced, never changed in place
   solution: null, // latest response of /follow or /search
   previousId: null, // id of the latest certified solution, the initial guess of the next one
@@ -32,19 +30,36 @@ const play = (window.play = {
   driving: null, // the person's episode in progress, see driving.js
   undo: [], // earlier scenarios
   redo: [],
+  drag: null, // what the pointer drags, see editing.js
+  moveTime: null, // time (ms) of the first pointer move that is in no request yet
   latencies: [], // ms from a pointer move to the drawing of the followed optimum
 });
-let drag = null, following = false, searching = false, changed = false, searchTimer = null, revision = 0;
-let moveTime = null; // time (ms) of the first pointer move that is in no request yet
+let following = false, searching = false, changed = false, searchTimer = null, revision = 0;
 
-const isFree = (scenario) => scenario.horizon === null;
-const durationOf = (path) => path.times[path.times.length - 1]; // s
+export const isFree = (scenario) => scenario.horizon === null;
+export const durationOf = (path) => path.times[path.times.length - 1]; // s
 
-const robotOf = (scenario) => play.robots[(scenario.robot || {}).model || "unicycle"];
+export const robotOf = (scenario) => play.robots[modelOf(scenario)];
+
+export const modelOf = (scenario) => (scenario.robot || {}).model || "unicycle";
+
+// The step of the open lesson, the scenario of that step, and the scenario that is drawn.
+export const lessonStep = () => play.lesson.content.steps[play.lesson.step];
+export const lessonScenario = () => lessonStep().scenario || play.lesson.content.scenario;
+export const shownScenario = () => (play.lesson && play.lesson.content ? lessonScenario() : play.scenario);
+
+export const canEdit = () => play.scenario !== null && !play.lesson && !play.driving;
+
+// Displays the state; page.js says how.
+let display = () => {};
+export const show = () => display();
+export function setDisplay(update) {
+  display = update;
+}
 
 // ---- Requests
 
-async function request(path, content) {
+export async function request(path, content) {
   play.pending += 1;
   try {
     const options = content && {
@@ -62,7 +77,7 @@ async function request(path, content) {
   }
 }
 
-function scheduleSearch() {
+export function scheduleSearch() {
   clearTimeout(searchTimer);
   searchTimer = setTimeout(search, SEARCH_DELAY);
 }
@@ -85,13 +100,13 @@ async function follow() {
   following = true;
   while (changed) {
     changed = false;
-    const moved = moveTime;
-    moveTime = null;
+    const movedAt = play.moveTime;
+    play.moveTime = null;
     try {
       const solution = await request("/follow", { scenario: play.scenario, previous: play.previousId });
       if (!play.searched) setSolution(solution);
-      if (moved !== null) {
-        play.latencies.push(performance.now() - moved);
+      if (movedAt !== null) {
+        play.latencies.push(performance.now() - movedAt);
         if (play.latencies.length > MAX_LATENCIES) play.latencies.shift();
       }
     } catch (error) {
@@ -103,7 +118,7 @@ async function follow() {
 
 async function search() {
   // One search at a time: the server handles requests in order, and outdated ones would delay the next.
-  if (drag !== null || searching) return;
+  if (play.drag !== null || searching) return;
   const searchedRevision = revision;
   searching = true;
   try {
@@ -129,12 +144,12 @@ function setSolution(solution) {
   show();
 }
 
-function showError(error) {
+export function showError(error) {
   play.error = error.message;
   show();
 }
 
-async function loadSweeps() {
+export async function loadSweeps() {
   const sweptRevision = revision;
   byId("sweeps").disabled = true;
   try {
@@ -153,7 +168,7 @@ async function loadSweeps() {
 }
 
 // Requests an episode of the selected policy, or the replay of a person's actions.
-async function loadEpisode(path, content, isCurrent) {
+export async function loadEpisode(path, content, isCurrent) {
   const drivenRevision = revision;
   play.episode = null;
   show();
@@ -166,7 +181,7 @@ async function loadEpisode(path, content, isCurrent) {
   show();
 }
 
-async function drivePolicy() {
+export async function drivePolicy() {
   const policy = byId("policy").value;
   if (policy) await loadEpisode("/drive", { policy }, () => byId("policy").value === policy);
   else {
@@ -180,11 +195,11 @@ async function drivePolicy() {
 let lastGroup = null;
 
 // Changes fields of the scenario. Successive changes with the same group, such as those of a drag, are undone together.
-function edit(fields, group = null) {
+export function edit(fields, group = null) {
   changeScenario({ ...play.scenario, ...fields }, group);
 }
 
-function changeScenario(scenario, group = null) {
+export function changeScenario(scenario, group = null) {
   if (group === null || group !== lastGroup) remember();
   lastGroup = group;
   play.scenario = scenario;
@@ -198,7 +213,7 @@ function remember() {
   forgetLink();
 }
 
-function setScenario(scenario) {
+export function setScenario(scenario) {
   if (play.scenario !== null) remember();
   lastGroup = null;
   replaceScenario(scenario);
@@ -206,7 +221,7 @@ function setScenario(scenario) {
 
 function replaceScenario(scenario) {
   play.scenario = scenario;
-  drag = null;
+  play.drag = null;
   play.driving = null;
   play.selected = null;
   play.previousId = null;
@@ -216,7 +231,7 @@ function replaceScenario(scenario) {
 }
 
 function moveInHistory(from, to) {
-  if (!from.length || drag !== null || play.driving || play.lesson) return;
+  if (!from.length || play.drag !== null || play.driving || play.lesson) return;
   to.push(play.scenario);
   lastGroup = null;
   play.scenario = from.pop();
@@ -226,5 +241,16 @@ function moveInHistory(from, to) {
   scenarioChanged();
 }
 
-const undo = () => moveInHistory(play.undo, play.redo);
-const redo = () => moveInHistory(play.redo, play.undo);
+export const undo = () => moveInHistory(play.undo, play.redo);
+export const redo = () => moveInHistory(play.redo, play.undo);
+
+// The fragment contains the scenario only until it is changed.
+function forgetLink() {
+  if (location.hash) history.replaceState(null, "", location.pathname);
+}
+
+export function closeLesson() {
+  if (!play.lesson) return;
+  play.lesson = null;
+  show();
+}
