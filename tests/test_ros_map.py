@@ -56,20 +56,20 @@ def test_a_map_of_ros_has_scenarios_between_its_walls(tmp_path, capsys, monkeypa
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"resolution": None}, "map.yaml: resolution: expected a number, got None"),
-        ({"resolution": -1}, "map.yaml: resolution: expected a positive number, got -1"),
+        ({"resolution": None}, "map.yaml: resolution: missing"),
+        ({"resolution": -1}, "map.yaml: resolution: expected a number > 0, got -1"),
         ({"origin": [0, 0, 0.5]}, "map.yaml: origin: expected a map that is not rotated, got the yaw 0.5"),
-        ({"origin": "here"}, "map.yaml: origin: expected 2 or 3 numbers, got 'here'"),
-        ({"mode": "raw"}, "map.yaml: mode: expected trinary or scale, got 'raw'"),
+        ({"origin": "here"}, "map.yaml: origin: expected a list, got 'here'"),
+        ({"mode": "raw"}, "map.yaml: mode: expected 'trinary' or 'scale', got 'raw'"),
         ({"image": "map.yaml"}, "map.yaml: not an image"),
         ({"image": "none.pgm"}, "none.pgm: no such file; it is the image of"),
         ({"free_thresh": "low"}, "map.yaml: free_thresh: expected a number, got 'low'"),
         ({"image": "[1"}, "map.yaml: not valid YAML"),
-        ({"origin": "[.nan, 0, 0]"}, "map.yaml: origin: expected 2 or 3 numbers"),
+        ({"origin": "[.nan, 0, 0]"}, "map.yaml: origin: expected finite coordinates"),
         ({"origin": "[0, 0, .inf]"}, "map.yaml: origin: expected a map that is not rotated, got the yaw inf"),
-        ({"negate": "maybe"}, "map.yaml: negate: expected 0 or 1, got 'maybe'"),
-        ({"negate": "2"}, "map.yaml: negate: expected 0 or 1, got 2"),
-        ({"occupied_thresh": 65}, "map.yaml: occupied_thresh: expected a number from 0 to 1, got 65"),
+        ({"negate": "maybe"}, "map.yaml: negate: expected True or False, got 'maybe'"),
+        ({"negate": "2"}, "map.yaml: negate: expected True or False, got 2"),
+        ({"occupied_thresh": 65}, "map.yaml: occupied_thresh: expected a number <= 1, got 65"),
     ],
 )
 def test_an_invalid_map_of_ros_is_named(fields, message, tmp_path):

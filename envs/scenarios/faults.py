@@ -14,6 +14,8 @@ from leapnav.envs.utils.validation import suggestion
 MAX_FAULTS = 8  # faults in one message
 # Messages for the types of pydantic's errors.
 EXPECTED = {
+    "bool_parsing": "expected True or False",
+    "bool_type": "expected True or False",
     "greater_than": "expected a number > {gt:g}",
     "greater_than_equal": "expected a number >= {ge:g}",
     "less_than": "expected a number < {lt:g}",
@@ -23,6 +25,8 @@ EXPECTED = {
     "float_parsing": "expected a number",
     "string_type": "expected text",
     "literal_error": "expected {expected}",
+    "list_type": "expected a list",
+    "too_short": "expected at least {min_length} numbers",
     "tuple_type": "expected a list",
     "model_type": "expected an object",
     "model_attributes_type": "expected an object",

@@ -10,13 +10,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 from leapnav.envs.robots import Unicycle, box_footprint
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
-from leapnav.envs.worlds.yaml_files import YamlFields, read_yaml
+from leapnav.envs.worlds.yaml_files import Number, Pair, YamlRecord, as_record, read_yaml
 
 MODEL = "unicycle1"  # the dynamics that leapnav has: speed and turn rate with symmetric limits
 DISCS = 5  # of the footprint that covers the robot's box
@@ -62,64 +63,106 @@ def read_dynobench(folder: str | os.PathLike[str]) -> dict[str, DynobenchProblem
         raise FileNotFoundError(f"{root}: expected the directories envs and models of dynobench")
     found = {}
     for path in paths:
-        fields = read_yaml(path)
-        robots = fields.list("robots") if "robots" in fields.values else []
-        if len(robots) == 1:
-            found[f"{path.parent.name}-{path.stem}"] = _problem(root, path, fields)
+        content = read_yaml(path)
+        if isinstance(content, dict) and len(as_record(_Robots, content, path).robots) == 1:
+            found[f"{path.parent.name}-{path.stem}"] = _problem(root, path, content)
     return found
 
 
-def _problem(root: Path, path: Path, fields: YamlFields) -> DynobenchProblem:
-    robot = fields.mapping("robots", 0)
-    name = robot.text("type")
-    model = read_yaml(root / "models" / f"{name}.yaml")
-    reason = _difference(model)
-    scenario = None if reason else _scenario(f"{path.parent.name}-{path.stem}", fields, robot, model)
-    return DynobenchProblem(scenario, reason, _durations(path.with_suffix(""), model.number("dt")))
+class _Kind(YamlRecord):
+    type: str
 
 
-def _difference(model: YamlFields) -> str:
-    """Return in what the model differs from the robots of leapnav, or an empty string."""
-    if model.text("dynamics") != MODEL:
-        return f"dynamics {model.text('dynamics')!r}"
-    if model.text("shape") != "box":
-        return f"shape {model.text('shape')!r}"
-    for limit in ("vel", "angular_vel"):
-        low, high = model.number(f"min_{limit}"), model.number(f"max_{limit}")
-        if low != -high:
-            return f"min_{limit} {low:g} and max_{limit} {high:g}: the limits are not symmetric"
-    return ""
+class _Robots(YamlRecord):
+    robots: tuple[_Kind, ...] = ()
 
 
-def _scenario(name: str, fields: YamlFields, robot: YamlFields, model: YamlFields) -> Scenario:
-    environment = fields.mapping("environment")
+class _Model(YamlRecord):
+    dynamics: str
+    shape: str
+    dt: Number
+
+
+class _BoxModel(YamlRecord):
+    size: Pair
+    min_vel: Number
+    max_vel: Number
+    min_angular_vel: Number
+    max_angular_vel: Number
+
+
+class _Box(YamlRecord):
+    type: Literal["box"]
+    center: Pair
+    size: Pair
+
+
+class _Environment(YamlRecord):
+    min: Pair
+    max: Pair
+    obstacles: tuple[_Box, ...]
+
+
+class _Poses(YamlRecord):
+    start: tuple[Number, Number, Number]
+    goal: tuple[Number, Number, Number]
+
+
+class _Problem(YamlRecord):
+    environment: _Environment
+    robots: tuple[_Poses]
+
+
+class _Solution(YamlRecord):
+    feasible: bool = False
+    states: tuple[Any, ...] = ()
+
+
+def _problem(root: Path, path: Path, content: Any) -> DynobenchProblem:
+    robot = as_record(_Robots, content, path).robots[0]
+    place = root / "models" / f"{robot.type}.yaml"
+    given = read_yaml(place)
+    model = as_record(_Model, given, place)
+    reason, scenario = "", None
+    if model.dynamics != MODEL:
+        reason = f"dynamics {model.dynamics!r}"
+    elif model.shape != "box":
+        reason = f"shape {model.shape!r}"
+    else:
+        box = as_record(_BoxModel, given, place)
+        for name in ("vel", "angular_vel"):
+            low, high = getattr(box, f"min_{name}"), getattr(box, f"max_{name}")
+            if low != -high:
+                reason = f"min_{name} {low:g} and max_{name} {high:g}: the limits are not symmetric"
+        if not reason:
+            scenario = _scenario(f"{path.parent.name}-{path.stem}", as_record(_Problem, content, path), box)
+    return DynobenchProblem(scenario, reason, _durations(path.with_suffix(""), model.dt))
+
+
+def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
     obstacles = []
-    for k in range(len(environment.list("obstacles"))):
-        box = environment.mapping("obstacles", k)
-        if box.text("type") != "box":
-            raise ValueError(f"{box.place}: type: expected box, got {box.text('type')!r}")
-        (x, y), (width, height) = box.numbers("center", 2), box.numbers("size", 2)
+    for box in problem.environment.obstacles:
+        (x, y), (width, height) = box.center, box.size
         low, high = (x - width / 2, y - height / 2), (x + width / 2, y + height / 2)
         corners = (low, (high[0], low[1]), high, (low[0], high[1]))
         obstacles.append(Obstacle(polygon=Polygon(vertices=corners)))
-    length, width = model.numbers("size", 2)
-    speed, turn_rate = model.number("max_vel"), model.number("max_angular_vel")
-    start, goal = robot.numbers("start", 3), robot.numbers("goal", 3)
-    low, high = environment.numbers("min", 2), environment.numbers("max", 2)
+    (length, width), (poses,) = model.size, problem.robots
     return Scenario(
         name=name,
-        arena=(low[0], low[1], high[0], high[1]),
+        arena=(*problem.environment.min, *problem.environment.max),
         robot=Unicycle(
-            footprint=box_footprint(length / 2, length / 2, width, DISCS), max_speed=speed, max_turn_rate=turn_rate
+            footprint=box_footprint(length / 2, length / 2, width, DISCS),
+            max_speed=model.max_vel,
+            max_turn_rate=model.max_angular_vel,
         ),
-        start=(start[0], start[1], start[2]),
-        goal=(goal[0], goal[1], goal[2]),
+        start=poses.start,
+        goal=poses.goal,
         horizon=None,
         obstacles=tuple(obstacles),
         cost=Cost(
             time_weight=1.0,
-            speed_weight=1.0 / speed**2,
-            turn_weight=1.0 / turn_rate**2,
+            speed_weight=1.0 / model.max_vel**2,
+            turn_weight=1.0 / model.max_angular_vel**2,
             proximity_weight=PROXIMITY_WEIGHT,
             proximity_scale=PROXIMITY_SCALE,
         ),
@@ -130,8 +173,8 @@ def _durations(folder: Path, dt: float) -> dict[str, float]:
     """Return the durations (s) of the feasible solutions in a directory."""
     found: dict[str, float] = {}
     for path in sorted(folder.glob(f"*{SOLUTION}*.yaml")):
-        fields = read_yaml(path)
-        if fields.flag("feasible", False):
+        solution = as_record(_Solution, read_yaml(path), path)
+        if solution.feasible:
             planner = path.stem.partition(SOLUTION)[0]
-            found[planner] = round(dt * (len(fields.list("states")) - 1), 6)
+            found[planner] = round(dt * (len(solution.states) - 1), 6)
     return found

@@ -12,9 +12,10 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.families import CustomFamily, sample_scenario
@@ -24,13 +25,25 @@ from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 from leapnav.envs.utils.validation import check_at_least, check_choice
-from leapnav.envs.worlds.yaml_files import YamlFields, read_yaml
+from leapnav.envs.worlds.yaml_files import AnyNumber, Number, YamlRecord, as_record, read_yaml
 
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # defaults of the map server
 UNKNOWN = ("occupied", "free")  # what unknown cells count as
 UNKNOWN_GRAY = 205  # of 255: the value that map savers write for an unknown cell in the mode trinary
 MAX_SHALLOW, MAX_DEEP = 255, 65535  # white, with 8 and 16 bits per channel
 MAX_YAW = 1e-4  # rad: a rotation that moves a corner by 1 cm at 100 m, less than a cell; yaws are rounded in files
+
+
+class _MapFile(YamlRecord):
+    """The fields of the YAML file of a map."""
+
+    image: str
+    resolution: Annotated[Number, Field(gt=0)]
+    origin: Annotated[tuple[AnyNumber, ...], Field(min_length=2, max_length=3)]
+    mode: Literal["trinary", "scale"] = "trinary"
+    occupied_thresh: Annotated[Number, Field(ge=0, le=1)] = OCCUPIED_THRESHOLD
+    free_thresh: Annotated[Number, Field(ge=0, le=1)] = FREE_THRESHOLD
+    negate: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,32 +103,23 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    fields = read_yaml(path)
-    resolution = fields.number("resolution")
-    if not resolution > 0:
-        raise ValueError(f"{path}: resolution: expected a positive number, got {resolution}")
-    origin = _origin(fields)
-    mode = fields.values.get("mode", "trinary")
-    if mode not in ("trinary", "scale"):
-        raise ValueError(f"{path}: mode: expected trinary or scale, got {mode!r}")
-    occupied_threshold = _threshold(fields, "occupied_thresh", OCCUPIED_THRESHOLD)
-    free_threshold = _threshold(fields, "free_thresh", FREE_THRESHOLD)
-    negate = fields.flag("negate", False)
-    gray, is_opaque = _read_image(path, fields.text("image"), mode)
-    occupancy = gray if negate else 1.0 - gray
-    occupied = occupancy > occupied_threshold
-    free = (occupancy < free_threshold) & ~occupied
-    if mode == "scale":
+    fields = as_record(_MapFile, read_yaml(path), path)
+    origin = _origin(path, fields)
+    gray, is_opaque = _read_image(path, fields.image, fields.mode)
+    occupancy = gray if fields.negate else 1.0 - gray
+    occupied = occupancy > fields.occupied_thresh
+    free = (occupancy < fields.free_thresh) & ~occupied
+    if fields.mode == "scale":
         occupied, free = occupied & is_opaque, free & is_opaque
     doubtful = int((free & (gray == UNKNOWN_GRAY / 255)).sum())
-    if doubtful and unknown == "occupied" and mode == "trinary" and not negate:
+    if doubtful and unknown == "occupied" and fields.mode == "trinary" and not fields.negate:
         warnings.warn(
             f"{path}: free_thresh: {doubtful} cells with the gray value {UNKNOWN_GRAY}, which map savers write for "
             f"unknown cells, are read as free; free_thresh: {FREE_THRESHOLD} reads them as unknown",
             stacklevel=2,
         )
     blocked = ~free if unknown == "occupied" else occupied
-    return GridMap(path.stem, blocked, resolution, origin)
+    return GridMap(path.stem, blocked, fields.resolution, origin)
 
 
 def sample_on_map(
@@ -139,22 +143,17 @@ def sample_on_map(
     return [sample_scenario(family, seed + i, robot, horizon, obstacles) for i in range(count)]
 
 
-def _origin(fields: YamlFields) -> tuple[float, float]:
+def _origin(path: Path, fields: _MapFile) -> tuple[float, float]:
     """Return the position of the lower left corner (m), if the map is not rotated."""
-    origin = fields.numbers("origin", 2, 3, finite=2)
-    yaw = origin[2] if len(origin) == 3 else 0.0
-    if math.isnan(yaw):
-        warnings.warn(f"{fields.place}: origin: the yaw is not a number and is read as 0", stacklevel=3)
-    elif math.isinf(yaw) or abs(math.remainder(yaw, 2 * math.pi)) > MAX_YAW:
-        raise ValueError(f"{fields.place}: origin: expected a map that is not rotated, got the yaw {yaw}")
-    return origin[0], origin[1]
-
-
-def _threshold(fields: YamlFields, name: str, default: float) -> float:
-    value = fields.number(name, default)
-    if not 0.0 <= value <= 1.0:
-        raise ValueError(f"{fields.place}: {name}: expected a number from 0 to 1, got {value}")
-    return value
+    x, y, *yaws = fields.origin
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise ValueError(f"{path}: origin: expected finite coordinates, got {fields.origin}")
+    for yaw in yaws:
+        if math.isnan(yaw):
+            warnings.warn(f"{path}: origin: the yaw is not a number and is read as 0", stacklevel=3)
+        elif math.isinf(yaw) or abs(math.remainder(yaw, 2 * math.pi)) > MAX_YAW:
+            raise ValueError(f"{path}: origin: expected a map that is not rotated, got the yaw {yaw}")
+    return x, y
 
 
 def _read_image(path: Path, name: str, mode: str) -> tuple[np.ndarray, np.ndarray]:

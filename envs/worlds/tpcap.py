@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from pymunk.autogeometry import convex_decomposition
 
 from leapnav.envs.robots import Car, box_footprint
 from leapnav.envs.scenarios.cost import Cost
@@ -33,7 +34,7 @@ def read_tpcap(folder: str | os.PathLike[str]) -> list[Scenario]:
     """Read the cases of the competition as scenarios with a free horizon, in the order of their numbers.
 
     The car has no limit of the acceleration, its corners are rounded, and its sides are indented by up to 4 cm.
-    Obstacles that are not convex are divided into triangles.
+    Obstacles that are not convex are divided into convex polygons.
 
     Args:
         folder: directory of the files `CaseN.csv`.
@@ -92,37 +93,15 @@ def _scenario(path: Path) -> Scenario:
 
 
 def convex_parts(vertices: np.ndarray) -> list[np.ndarray]:
-    """Return a simple polygon (n, 2) if it is convex, or else triangles (3, 2) that cover it, by cutting off ears.
+    """Return convex polygons (k, 2) that cover a simple polygon (n, 2), which is one itself if it is convex.
 
     Repeated vertices, and those on a straight line between their neighbours, are left out.
     """
-    points = [tuple(point) for point in vertices.tolist()]
-    points = [point for k, point in enumerate(points) if point != points[k - 1]]
-    points = [point for k, point in enumerate(points) if _turn(points[k - 1], point, points[(k + 1) % len(points)])]
-    area = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(points, points[1:] + points[:1], strict=True))
-    if area < 0:
-        points.reverse()
-    if all(_turn(points[k - 1], point, points[(k + 1) % len(points)]) > 0 for k, point in enumerate(points)):
-        return [np.array(points)]
-    found = []
-    while len(points) > 3:
-        k = next((k for k in range(len(points)) if _is_ear(points, k)), 0)
-        corner = (points[k - 1], points[k], points[(k + 1) % len(points)])
-        if _turn(*corner) > 0:
-            found.append(np.array(corner))
-        del points[k]
-    return [*found, np.array(points)]
-
-
-def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
-    """Return twice the signed area of a triangle, positive if it turns left."""
-    return (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])
-
-
-def _is_ear(points: list[tuple[float, ...]], k: int) -> bool:
-    """Return whether the triangle at a vertex lies inside a counter-clockwise polygon."""
-    a, b, c = points[k - 1], points[k], points[(k + 1) % len(points)]
-    if _turn(a, b, c) <= 0:
-        return False
-    others = (point for point in points if point not in (a, b, c))
-    return not any(min(_turn(a, b, p), _turn(b, c, p), _turn(c, a, p)) >= 0 for p in others)
+    vertices = vertices[(vertices != np.roll(vertices, 1, axis=0)).any(axis=1)]
+    before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
+    vertices = vertices[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]]
+    x, y = vertices.T
+    if np.dot(x, np.roll(y, -1)) < np.dot(y, np.roll(x, -1)):  # clockwise
+        vertices = vertices[::-1]
+    points = vertices.tolist()
+    return [np.array(part[:-1]) for part in convex_decomposition([*points, points[0]], 0.0)]
