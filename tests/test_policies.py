@@ -1,4 +1,3 @@
-import hashlib
 import json
 
 import gymnasium as gym
@@ -10,6 +9,7 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.envs import NavigateEnv
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
+from leapnav.training.policies.files import _checksum
 from leapnav.training.robots.rewards import ScaledReward
 
 
@@ -103,7 +103,7 @@ def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
         load_policy(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     faults = [
-        ({**description, "format": 99}, "format: expected 4, got 99"),
+        ({**description, "format": 99}, "format: expected 5, got 99"),
         ({}, "not the description of a policy"),
         ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
         ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, td3, tqc, got 'dqn'"),
@@ -127,7 +127,7 @@ def test_loading_a_policy_executes_nothing(clone, tmp_path):
     save_policy(clone[0], tmp_path)
     (tmp_path / "weights.pt").write_bytes(pickle.dumps(Evil()))
     description = json.loads((tmp_path / "policy.json").read_text())
-    description["sha256"] = hashlib.sha256((tmp_path / "weights.pt").read_bytes()).hexdigest()
+    description["sha256"] = _checksum(tmp_path, description)
     (tmp_path / "policy.json").write_text(json.dumps(description))
     with pytest.raises(ValueError, match="not the weights of this policy"):
         load_policy(tmp_path)

@@ -1,6 +1,7 @@
 """Rollouts that are interrupted, resumed, damaged, repeated."""
 
 import errno
+import json
 import os
 import shutil
 import signal
@@ -15,9 +16,10 @@ from helpers import cluster_that_loses_a_worker
 
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv
+from leapnav.envs.utils.files import digest
 from leapnav.experts import ExpertPolicy, pools
 from leapnav.experts.data import rollouts
-from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
+from leapnav.experts.data.demonstrations import CHECKSUM, dataset_id, load_demonstrations
 from leapnav.experts.data.rollouts import DONE, RECORD, SHARD_SIZE, WORK, check_dataset, rollout
 from leapnav.experts.data.store import ResumableStore
 
@@ -240,6 +242,11 @@ def test_a_dataset_is_replayed(whole, tmp_path, capsys):
     (file,) = changed.glob("**/main_data.hdf5")
     with h5py.File(file, "r+") as data:
         data["episode_7/rewards"][3] += 0.5
+    assert main(["dataset", "check", str(changed)]) == 2
+    assert "main_data.hdf5: damaged, or changed since it was written" in capsys.readouterr().err
+    metadata = json.loads((file.parent / "metadata.json").read_text())
+    metadata[CHECKSUM] = digest(file)
+    (file.parent / "metadata.json").write_text(json.dumps(metadata))
     assert main(["dataset", "check", str(changed)]) == 1
     assert "rewards 5.0e-01" in (line := capsys.readouterr().out)
     assert "(episode 7)" in line

@@ -23,6 +23,7 @@ from leapnav.envs.scenarios.bank import collection_name
 from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES, MAX_HORIZON
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.utils.files import digest
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.hard_limits import without_barrier
@@ -31,6 +32,7 @@ from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solve import solve
 
 ENVIRONMENT = "leapnav/Navigate-v0"
+CHECKSUM = "leapnav_sha256"  # key of the metadata: checksum of the data file
 CONTROL_PERIOD = 0.05  # s, the default of the environment; demonstrations use it
 # A recovery starts from a perturbed state of the optimum.
 PERTURBATION = np.array([0.15, 0.15, 0.3])  # standard deviations (m, m, rad)
@@ -280,7 +282,7 @@ def write_dataset(
             requirements=[f"leapnav=={leapnav.__version__}"],
         )
         scores = {"ref_min_score": _random_score(env, scenarios), "ref_max_score": float(np.mean(returns))}
-        dataset.storage.update_metadata(scores)
+        dataset.storage.update_metadata({**scores, CHECKSUM: digest(_data_file(dataset))})
 
 
 def _random_score(env: gym.Env, scenarios: Sequence[Scenario]) -> float:
@@ -351,12 +353,28 @@ def open_dataset(folder: str | os.PathLike[str]) -> minari.MinariDataset:
 
     Raises:
         FileNotFoundError: there is no dataset, or more than one.
+        ValueError: the dataset was not written by `rollout`, or has changed since.
 
     """
     found = sorted(path.parent for path in Path(folder).glob("**/data/metadata.json"))
     if len(found) != 1:
         raise FileNotFoundError(f"{os.fspath(folder)}: expected one Minari dataset, found {len(found)}")
-    return minari.MinariDataset(found[0])
+    try:
+        dataset = minari.MinariDataset(found[0])
+        expected = dataset.storage.metadata.get(CHECKSUM)
+    except OSError:
+        raise
+    except Exception as error:  # damaged metadata may raise any error in Minari and Gymnasium
+        raise ValueError(f"{found[0] / 'metadata.json'}: not that of a dataset: {error!r}") from None
+    if expected is None:
+        raise ValueError(f"{found[0]}: expected a dataset written by leapnav rollout, got one without a checksum")
+    if digest(_data_file(dataset)) != expected:
+        raise ValueError(f"{_data_file(dataset)}: damaged, or changed since it was written")
+    return dataset
+
+
+def _data_file(dataset: minari.MinariDataset) -> Path:
+    return Path(dataset.storage.data_path) / "main_data.hdf5"
 
 
 def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:

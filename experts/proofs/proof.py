@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,15 @@ class Proof:
                 for name, number in fields.items():
                     if isinstance(number, bool) or not isinstance(number, int | float):
                         raise ProofError(f"{path}: {name}: expected a number, got {number!r}")
-        except (zipfile.BadZipFile, KeyError, TypeError, EOFError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            KeyError,
+            TypeError,
+            EOFError,
+            UnicodeDecodeError,
+            json.JSONDecodeError,
+        ) as error:
             raise ProofError(f"{path}: not a proof ({type(error).__name__}: {error})") from None
         except ValueError as error:
             raise error if isinstance(error, ProofError) else ProofError(f"{path}: not a proof ({error})") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ from leapnav.envs.robots.base import robot_class
 from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
-from leapnav.envs.utils.files import atomic_path, digest, write_text
+from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.validation import suggestion
 from leapnav.experts.data.demonstrations import ENVIRONMENT
@@ -30,7 +31,7 @@ from leapnav.training.policies.architecture import KINDS, Architecture, is_actor
 from leapnav.training.policies.zips import is_zip, load_zip
 
 BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
-FORMAT = 4  # version of policy.json
+FORMAT = 5  # version of policy.json
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
 OBSERVED = (*SENSORS, "robot", "horizon", "actuation", "dict_observation")
@@ -91,9 +92,15 @@ def save_policy(
         **asdict(architecture),
         "actor_only": half,
         "training": dict(training or {}),
-        "sha256": digest(folder / "weights.pt"),
     }
+    description["sha256"] = _checksum(folder, description)
     write_text(folder / "policy.json", encode(description, indent=1) + "\n")
+
+
+def _checksum(folder: Path, description: Mapping[str, Any]) -> str:
+    """Return the SHA-256 checksum of the weights and the description of a policy as hexadecimal digits."""
+    content = encode({name: value for name, value in description.items() if name != "sha256"})
+    return hashlib.sha256(content.encode() + (folder / "weights.pt").read_bytes()).hexdigest()
 
 
 def read_description(folder: str | Path) -> dict[str, Any]:
@@ -193,8 +200,8 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
         _check_environment(folder, description, observation_space, env)
     path = folder / "weights.pt"
     try:
-        if digest(path) != description["sha256"]:
-            raise ValueError("damaged, or of another policy")
+        if _checksum(folder, description) != description["sha256"]:
+            raise ValueError("damaged, or of another policy, or policy.json has been edited")
         weights = th.load(path, weights_only=True, map_location="cpu")
         if description["actor_only"]:
             initial = policy.state_dict()
