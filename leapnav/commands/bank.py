@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from leapnav.commands.options import Family, Horizon, Obstacles, Robot
+from leapnav.commands.options import Family, ParallelOptions, TaskOptions
 from leapnav.durations import SECONDS_PER_SECOND_OPINION, announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -23,7 +23,7 @@ RESUMPTION = "the same command resumes where it stopped"
 
 
 @dataclass(frozen=True)
-class Build:
+class Build(TaskOptions, ParallelOptions):
     """Sample scenarios, or read them; find their optima; and write those with an unambiguous certificate to a bank.
 
     The same command resumes an interrupted build.
@@ -42,20 +42,10 @@ class Build:
     """Licence of the files, for the data card."""
     family: Family = "clutter"
     """Family of the scenarios."""
-    robot: Robot = "unicycle"
-    """Model of the robot."""
-    horizon: Horizon = "fixed"
-    """Fixed or free horizon."""
-    obstacles: Obstacles = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
     """Seed of the bank; the included banks have 0 (training) and 1 (test)."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes; the bank does not depend on it."""
-    dask: str | None = None
-    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     json: Path | None = None
     """JSON file of the numbers of sampled and of rejected scenarios; "-" for standard output."""
 
@@ -68,16 +58,14 @@ class Build:
 
         if self.scenarios:
             sources = {"origin": self.origin, "licence": self.licence}
-            parallel = {"workers": self.workers, "dask": self.dask}
-            bank = build_bank_of(self.scenarios, self.out, doubtful=self.doubtful, **sources, **parallel)
+            bank = build_bank_of(self.scenarios, self.out, doubtful=self.doubtful, **sources, **self.parallel)
             assert bank.given is not None
             for kind in ("rejected", "doubtful"):
                 for name, reason in bank.given.get(kind, {}).items():
                     print(f"{name}: {kind}: {reason}")
         else:
-            announce(of_scenarios(self.family, self.count, 1 if self.dask else self.workers), "finding the optima")
-            task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles, "seed": self.seed}
-            bank = build_bank(self.family, self.count, self.out, **task, workers=self.workers, dask=self.dask)
+            announce(of_scenarios(self.family, self.count, self.processes), "finding the optima")
+            bank = build_bank(self.family, self.count, self.out, seed=self.seed, **self.task, **self.parallel)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         kind = "sampled" if bank.given is None else "given"
         print(f"wrote {self.out}: {len(bank)} of {bank.drawn} {kind} scenarios{f' ({rejected})' if rejected else ''}")
@@ -129,7 +117,7 @@ class Show:
 
 
 @dataclass(frozen=True)
-class Verify:
+class Verify(ParallelOptions):
     """Search every scenario of a bank again, with about 100 times the effort (seconds each).
 
     Exit code 1: a lower cost was found.
@@ -137,10 +125,6 @@ class Verify:
 
     file: tyro.conf.Positional[Path]
     """Bank file, or the name of an included bank, for example rooms-test."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes."""
-    dask: str | None = None
-    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     json: Path | None = None
     """JSON file of the results of all scenarios; "-" for standard output."""
 
@@ -150,9 +134,8 @@ class Verify:
 
         check_outputs(self.json)
         bank = _checked(self.file)
-        workers = 1 if self.dask else max(self.workers, 1)
-        announce(SECONDS_PER_SECOND_OPINION * len(bank) / workers, "searching every scenario again")
-        opinions = verify_bank(bank, workers=self.workers, dask=self.dask)
+        announce(SECONDS_PER_SECOND_OPINION * len(bank) / self.processes, "searching every scenario again")
+        opinions = verify_bank(bank, **self.parallel)
         improved = [opinion for opinion in opinions if opinion.improvement > MIN_IMPROVEMENT]
         for opinion in improved:
             print(

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.commands.options import EnvironmentOption, FamilyOrAll, Horizon, Obstacles, Robot, parse_environment
+from leapnav.commands.options import (
+    EnvironmentOption,
+    FamilyOrAll,
+    Horizon,
+    Obstacles,
+    ParallelOptions,
+    Robot,
+    parse_environment,
+)
 from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
@@ -22,7 +29,7 @@ and so do policies with the same LABEL=."""
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(ParallelOptions):
     """Score policies side by side against the optimum, on scenarios that were not used for training."""
 
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
@@ -46,10 +53,6 @@ class Evaluate:
     env: EnvironmentOption = ()
     """Arguments of the environment (KEY=VALUE) with which a model of Stable-Baselines3 was trained; by default derived
     from its observation space, for a lidar."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes that search the optima for the poses reached; the scores do not depend on it."""
-    dask: str | None = None
-    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     trust: bool = False
     """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
     json: Path | None = None
@@ -90,8 +93,7 @@ class Evaluate:
             banks = default_banks(specs, self.family, self.split, self.robot, self.horizon, self.obstacles)
         n_scenarios = sum(len(bank) if self.count is None else min(self.count, len(bank)) for bank in banks)
         announce(of_evaluation(self.policies, n_scenarios), "the evaluation")
-        parallel = {"workers": self.workers, "dask": self.dask}
-        comparison = compare_policies(specs, banks, count=self.count, seed=self.seed, **parallel)
+        comparison = compare_policies(specs, banks, count=self.count, seed=self.seed, **self.parallel)
         print_scores(comparison)
         if self.json is not None:
             write_json(scores_to_dict(comparison), self.json)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from leapnav.training.config import FamilyName, HorizonName, ObstaclesName, RobotName
@@ -32,6 +34,43 @@ PolicyName = (
     | str
 )
 EnvironmentOption = tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOptions:
+    """Options of commands that make scenarios."""
+
+    robot: Robot = "unicycle"
+    """Model of the robot."""
+    horizon: Horizon = "fixed"
+    """Fixed or free horizon."""
+    obstacles: Obstacles = "cost"
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
+
+    @property
+    def task(self) -> dict[str, str]:
+        """The options as arguments of functions."""
+        return {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParallelOptions:
+    """Options of commands that use several processes."""
+
+    workers: int = os.cpu_count() or 1
+    """Number of processes; the result does not depend on it."""
+    dask: str | None = None
+    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
+
+    @property
+    def parallel(self) -> dict[str, Any]:
+        """The options as arguments of functions."""
+        return {"workers": self.workers, "dask": self.dask}
+
+    @property
+    def processes(self) -> int:
+        """Number of processes on this machine, for estimates of the duration."""
+        return 1 if self.dask else max(self.workers, 1)
 
 
 def parse_environment(words: Sequence[str]) -> dict[str, Any] | None:

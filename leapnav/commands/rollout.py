@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from leapnav.commands.options import FamilyOrAll, Horizon, Obstacles, Robot
+from leapnav.commands.options import FamilyOrAll, ParallelOptions, TaskOptions
 from leapnav.durations import announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
@@ -18,7 +17,7 @@ REPLAY_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class Rollout:
+class Rollout(TaskOptions, ParallelOptions):
     """Sample scenarios, find their optima, execute them in the environment, and write a Minari dataset.
 
     The same command resumes an interrupted rollout.
@@ -28,12 +27,6 @@ class Rollout:
     """Output directory of the dataset."""
     family: FamilyOrAll = "clutter"
     """Family of the scenarios."""
-    robot: Robot = "unicycle"
-    """Model of the robot."""
-    horizon: Horizon = "fixed"
-    """Fixed or free horizon."""
-    obstacles: Obstacles = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000
@@ -42,10 +35,6 @@ class Rollout:
     """Number of recoveries per scenario: demonstrations from perturbed states of the optimum."""
     noise: float = 0.0
     """Standard deviation of the noise on the executed actions; the recorded ones are the expert's, in closed loop."""
-    workers: int = os.cpu_count() or 1
-    """Number of processes; the dataset does not depend on it."""
-    dask: str | None = None
-    """Address of a Dask scheduler (tcp://host:8786) whose workers are used instead."""
     force: bool = False
     """Replace an existing dataset or unfinished rollout in the output directory."""
     json: Path | None = None
@@ -59,20 +48,18 @@ class Rollout:
         from leapnav.experts.data.demonstrations import dataset_id
         from leapnav.experts.data.rollouts import rollout
 
-        workers = 1 if self.dask else self.workers
-        announce(of_scenarios(self.family, self.count, workers) * (1 + self.recoveries / 4), "finding the optima")
+        announce(
+            of_scenarios(self.family, self.count, self.processes) * (1 + self.recoveries / 4), "finding the optima"
+        )
         summary = rollout(
             self.family,
             self.count,
             self.out,
-            robot=self.robot,
-            horizon=self.horizon,
-            obstacles=self.obstacles,
+            **self.task,
             seed=self.seed,
             recoveries=self.recoveries,
             noise=self.noise,
-            workers=self.workers,
-            dask=self.dask,
+            **self.parallel,
             force=self.force,
         )
         print(
@@ -80,7 +67,7 @@ class Rollout:
             f"({summary.unsolved} scenarios without a certified optimum and "
             f"{summary.failed_replays} failed replays left out)"
         )
-        name = dataset_id(self.family, self.robot, self.horizon, self.obstacles)
+        name = dataset_id(self.family, **self.task)
         print(f"load it with minari.load_dataset({name!r}) and MINARI_DATASETS_PATH={self.out}")
         write_json(asdict(summary), self.json)
         return 0

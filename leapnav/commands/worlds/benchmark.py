@@ -10,12 +10,12 @@ from typing import Annotated
 
 import tyro
 
-from leapnav.commands.options import Horizon, Obstacles, Robot
+from leapnav.commands.options import TaskOptions
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 
 @dataclass(frozen=True)
-class BenchmarkBarn:
+class BenchmarkBarn(TaskOptions):
     """Score policies in the worlds of the BARN challenge, with its own score beside ours.
 
     The worlds are solved first, and the optima are stored in a bank. The BARN challenge runs in another simulator
@@ -28,12 +28,6 @@ class BenchmarkBarn:
     """Policies, see `leapnav evaluate`."""
     bank: Path = Path("barn.bank")
     """Bank of the worlds; it is built unless it exists."""
-    robot: Robot = "unicycle"
-    """Model of the robot."""
-    horizon: Horizon = "fixed"
-    """Fixed or free horizon."""
-    obstacles: Obstacles = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
     count: int | None = None
     """Number of worlds; by default all."""
     workers: int = os.cpu_count() or 1
@@ -54,8 +48,7 @@ class BenchmarkBarn:
         from leapnav.training.scoring.reports import print_barn_scores, print_scores, scores_to_dict
 
         specs = [load_policy_spec(name) for name in self.policy]
-        task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
-        scenarios = read_barn(self.folder, **task)
+        scenarios = read_barn(self.folder, **self.task)
         bank = build_bank_of(scenarios, self.bank, doubtful=True, origin=ORIGIN, licence=LICENCE, workers=self.workers)
         assert bank.given is not None
         for name, reason in bank.given["rejected"].items():

@@ -11,33 +11,26 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from leapnav.commands.options import Horizon, Obstacles, Robot
+from leapnav.commands.options import Robot, TaskOptions
 
 if TYPE_CHECKING:
     from leapnav.envs.scenarios.scenario import Scenario
 
 
 @dataclass(frozen=True)
-class ImportBarn:
+class ImportBarn(TaskOptions):
     """Read the worlds of the BARN challenge (https://github.com/Daffan/the-barn-challenge, MIT licence)."""
 
     folder: tyro.conf.Positional[Path]
     """Directory of the files world_N.world, or a clone of the repository."""
     out: Path
     """Output directory of the scenario files."""
-    robot: Robot = "unicycle"
-    """Model of the robot."""
-    horizon: Horizon = "fixed"
-    """Fixed or free horizon."""
-    obstacles: Obstacles = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
 
     def run(self) -> int:
         """Write the scenario files."""
         from leapnav.envs.worlds.barn import read_barn
 
-        task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
-        return _write(read_barn(self.folder, **task), self.out)
+        return _write(read_barn(self.folder, **self.task), self.out)
 
 
 @dataclass(frozen=True)
@@ -68,7 +61,7 @@ class ImportMovingAI:
 
 
 @dataclass(frozen=True)
-class ImportRosMap:
+class ImportRosMap(TaskOptions):
     """Sample poses on an occupancy grid of ROS (map server, Nav2)."""
 
     file: tyro.conf.Positional[Path]
@@ -81,12 +74,6 @@ class ImportRosMap:
     """First seed: scenario i has seed SEED + i."""
     unknown: Literal["occupied", "free"] = "occupied"
     """What unknown cells count as."""
-    robot: Robot = "unicycle"
-    """Model of the robot."""
-    horizon: Horizon = "fixed"
-    """Fixed or free horizon."""
-    obstacles: Obstacles = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
 
     def run(self) -> int:
         """Write the scenario files."""
@@ -97,8 +84,7 @@ class ImportRosMap:
             grid = read_ros_map(self.file, unknown=self.unknown)
         for warning in caught:
             print(f"leapnav: warning: {warning.message}", file=sys.stderr)
-        task = {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
-        return _write(sample_on_map(grid, self.count, seed=self.seed, **task), self.out)
+        return _write(sample_on_map(grid, self.count, seed=self.seed, **self.task), self.out)
 
 
 @dataclass(frozen=True)
