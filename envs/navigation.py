@@ -42,7 +42,8 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     other robots the action and the part `motion` of the observation differ.
 
     With `actuation="velocity"`, the robot follows the exact path of each action, for the unicycle a circular arc.
-    pymunk simulates robots with `actuation="motor"`, and contacts after which an episode continues.
+    pymunk integrates the motion of robots with `actuation="motor"`, and simulates the part of a control period after a
+    contact if the episode continues.
 
     `gym.make_vec("leapnav/Navigate-v0", num_envs=1024)` simulates many robots in one process, see `NavigateVectorEnv`.
     `leapnav/NavigateGoal-v0` is the same task for goal-conditioned learners, see `NavigateGoalEnv`.
@@ -125,9 +126,9 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
 
     ## Episode end
     The episode is `terminated` at the horizon, which is part of the task (the time left is observed), or at a
-    collision. It is never `truncated`. With `terminate_on_collision=False`, the robot continues in contact with the
-    obstacle, as simulated by pymunk, until the horizon, and pushes obstacles that have a `mass`; Phi is large there,
-    100 k with the default scale. The episode is a success if, at the horizon, the robot is within `position_tolerance`
+    collision. It is never `truncated`. With `terminate_on_collision=False`, the robot slides along the
+    obstacle, as simulated by pymunk, or pushes it if it has a `mass`, and the episode continues until the horizon; Phi
+    is large in contact, 100 times the proximity weight with the default scale. The episode is a success if, at the horizon, the robot is within `position_tolerance`
     and `heading_tolerance` of the goal and has not collided. Further states of the robot with a goal, such as the speed
     of the dynamic unicycle, must be within `motion_tolerance` of it.
 

@@ -36,7 +36,10 @@ MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
 
 @dataclass(frozen=True)
 class Motor:
-    """Parameters of the robot's body, motors and tyres, for `actuation="motor"`.
+    """Parameters of the robot's body, motors and tyres, for `actuation="motor"`, which needs the robot "unicycle".
+
+    Mass, moment of inertia and friction also determine the contacts of robots without motors, and the track their wheel
+    slip, see `Disturbance`.
 
     Attributes:
         mass: mass (kg).
@@ -72,7 +75,8 @@ class Disturbance:
         actuation: standard deviation of the executed speed and turn rate, relative to the commanded ones.
         slip: scale of the wheel slip: each wheel loses the fraction `slip * |n|` of its distance, n standard normal.
         sensing: standard deviation of the sensed position (m) and heading (rad), relative to which the goal and the map
-            are observed, and of the lidar ranges (m), which are measured from the true pose.
+            are observed, and of the lidar ranges (m), which are measured from the true pose. The detours of the
+            geodesic observation belong to the sensed pose and to the ranges without noise.
 
     """
 
@@ -216,6 +220,11 @@ class EnvironmentSettings:
         """Whether the controls are speed and turn rate."""
         return self.model.control_names == ("speed", "turn_rate")
 
+    @property
+    def heading_states(self) -> int:
+        """The further states that are headings in the plane: the sum of 2^k over their indices k."""
+        return sum(1 << k for k, name in enumerate(self.model.state_names) if name in self.model.heading_states)
+
     def packed(self) -> np.ndarray:
         """Return the settings as an array of one record of SETTINGS, which the kernels read."""
         return np.array([_values(self, SETTINGS)], SETTINGS)
@@ -248,7 +257,7 @@ MOTOR, DISTURBANCE = (np.dtype([(f.name, "f8") for f in fields(kind)]) for kind 
 SETTINGS = np.dtype(
     [(f.name, f.type) for f in fields(EnvironmentSettings) if f.type in ("int", "float", "bool")]
     + [(name, "bool") for name in ("free_horizon", "motors", "shaped", "commands_motion")]
-    + [("motor", MOTOR), ("disturbance", DISTURBANCE)],
+    + [("heading_states", "i8"), ("motor", MOTOR), ("disturbance", DISTURBANCE)],
     align=True,
 )
 MOTOR_TYPE = from_dtype(MOTOR)

@@ -249,15 +249,14 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
 
     def _record_outcomes(self, sampler: LevelSampler, ended: np.ndarray) -> None:
         """Tell the sampler the outcomes of the episodes that have ended."""
-        bank, settings = self.bank, self.settings
+        bank = self.bank
         assert bank is not None  # required for a sampler
         for i in np.flatnonzero(ended).tolist():
             index, episode = self._choices[i], self._simulator.episode(i)
             if not isinstance(index, int):  # selected by a reset
                 continue
-            collision, missed = episode.collided, episode.terminated and not episode.success
-            penalties = settings.collision_penalty * collision + settings.miss_penalty * missed
-            value = -episode.cost - penalties
+            collision = episode.collided
+            value = -episode.cost - self.settings.collision_penalty * collision - episode.miss
             regret = -float(bank.costs[index]) - value
             sampler.record(LevelOutcome(index, episode.success, collision, value, regret))
 

@@ -156,6 +156,24 @@ def test_a_sampler_may_draw_integers_of_numpy(bank):
     assert len(sampler.outcomes) >= 4 and {type(outcome.index) for outcome in sampler.outcomes} == {int}
 
 
+@pytest.mark.parametrize("terminate_on_collision", [True, False])
+def test_the_return_of_an_outcome_is_the_sum_of_the_rewards(bank, terminate_on_collision):
+    sampler = CountingSampler()
+    options = {**SAME, "terminate_on_collision": terminate_on_collision}
+    venv = gym.make_vec(ID, 4, **options, bank=bank, sampler=sampler)
+    venv.reset(seed=0)
+    totals, ended = np.zeros(4), []
+    for _ in range(260):
+        _, rewards, terminated, truncated, _ = venv.step(np.tile([1.0, 0.1], (4, 1)))
+        totals += rewards
+        done = terminated | truncated
+        ended += totals[done].tolist()
+        totals[done] = 0.0
+    assert len(ended) == len(sampler.outcomes) >= 4
+    assert [outcome.episode_return for outcome in sampler.outcomes] == pytest.approx(ended)
+    assert any(outcome.collision for outcome in sampler.outcomes)
+
+
 def test_a_sampler_and_a_callback_have_to_fit_the_environment(bank):
     other = UniformSampler(ScenarioBank.shipped("clutter", "test"))
     with pytest.raises(ValueError, match=r"sampler: expected one for the bank .*clutter-train\.bank"):

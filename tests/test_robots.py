@@ -225,6 +225,14 @@ def test_observation_and_action_spaces_fit_the_robot(name):
         assert observation["motion"] == pytest.approx(expected, abs=1e-6)
 
 
+def test_the_goal_of_a_further_heading_holds_modulo_2_pi():
+    for turns, reached in ((0, True), (1, True), (0.25, False)):
+        scenario = task("trailer", start=[2, 2, 0], goal=[2.05, 2, 0], goal_motion=[2 * math.pi * turns])
+        env = NavigateEnv(scenario=scenario)
+        env.reset(seed=0)
+        assert env.at_goal is reached
+
+
 @each_robot
 def test_scenarios_survive_json(name):
     scenario = task(name, start_motion=[0.1] * (ROBOTS[name].sizes()[0] - 3) or None)

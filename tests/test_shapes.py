@@ -16,8 +16,8 @@ from leapnav.envs import Capsule, Circle, NavigateEnv, Obstacle, Polygon, Scenar
 from leapnav.envs.shapes import register
 from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.distance import shape_geometry
-from leapnav.envs.shapes.field import MAX_SHAPES_WITHOUT_GRID, blend_fields, obstacle_centres, shapes_of
+from leapnav.envs.shapes.distance import part_geometry
+from leapnav.envs.shapes.field import MAX_PARTS_WITHOUT_GRID, blend_fields, obstacle_centres, parts_in
 from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
 from leapnav.envs.shapes.sampling import OFFSET, PointGrid, sample_grid
 from leapnav.envs.simulation.rendering import Scene, draw_scene
@@ -264,7 +264,7 @@ def test_more_obstacles_than_without_a_grid_change_nothing(shape):
     many = scenario_of(*circles[:10], shape, *circles[10:])
     parts = [scenario_of(shape), scenario_of(*circles[:10]), scenario_of(*circles[10:])]
     walls = scenario_of()
-    assert len(circles) > MAX_SHAPES_WITHOUT_GRID
+    assert len(circles) > MAX_PARTS_WITHOUT_GRID
     for x, y in points(200):
         expected = sum(np.array(proximity(x, y, part.field)) for part in parts)
         expected -= 2 * np.array(proximity(x, y, walls.field))
@@ -334,11 +334,11 @@ def test_normals_on_edges_and_vertices_are_unit_vectors_outwards():
     centre = vertices.mean(axis=0)
     for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
         for point in ((a + b) / 2, a + (a - centre) * 1e-2):
-            distance, nx, ny, curvature = shape_geometry(*point, 0.0, field, shapes_of(field)[0])
+            distance, nx, ny, curvature = part_geometry(*point, 0.0, field, parts_in(field)[0])
             assert math.hypot(nx, ny) == pytest.approx(1)
             assert (point - centre) @ (nx, ny) > 0
             assert curvature == pytest.approx(0 if distance < 1e-9 else 1 / distance, rel=1e-6)
-        distance, nx, ny, curvature = shape_geometry(*a, 0.0, field, shapes_of(field)[0])
+        distance, nx, ny, curvature = part_geometry(*a, 0.0, field, parts_in(field)[0])
         assert distance == pytest.approx(0, abs=1e-12)
         assert np.isfinite([nx, ny, curvature]).all()
 

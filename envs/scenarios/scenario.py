@@ -27,7 +27,7 @@ from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.base import KINDS
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import pack_field
-from leapnav.envs.utils.records import Finite, Frozen, Positive, as_tuples
+from leapnav.envs.utils.records import Finite, Frozen, Positive
 from leapnav.envs.utils.validation import as_vector, check_positive
 
 TIME_LIMIT_FACTOR = 3.0  # time limit of an episode, as a multiple of the duration of the optimum
@@ -130,7 +130,7 @@ class Scenario(Frozen):
     def _check_poses_are_free(self) -> Self:
         names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
         faults = []
-        for field, pose in (("start", self.start), ("goal", self.goal)):
+        for end, pose in (("start", self.start), ("goal", self.goal)):
             x, y, heading = pose
             distance, nearest = footprint_clearance(x, y, heading or 0.0, self.discs, self.field)
             if heading is None and self.robot.footprint is not None:  # some heading must be free
@@ -139,7 +139,7 @@ class Scenario(Frozen):
                 distance, nearest = max(found)
             if not distance > 0:
                 faults.append(
-                    f"{field}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
+                    f"{end}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
                 )
         if faults:
             raise ValueError("; ".join(faults))
@@ -290,7 +290,7 @@ class Scenario(Frozen):
         if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
             raise ScenarioError(f"a scenario is a JSON object, got {shorten(fields)}")
         try:
-            return cls(**as_tuples(fields))
+            return cls(**fields)
         except RecursionError:
             raise ScenarioError(f"Scenario {shorten(fields.get('name'))}: the fields are nested too deeply") from None
 
@@ -417,7 +417,7 @@ def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
     except ValueError as error:
         return Unicycle(), [f"robot.model: {error}"]
     try:
-        return model(**as_tuples(dict(fields))), []
+        return model(**dict(fields)), []
     except ValidationError as error:
         return Unicycle(), [
             fault(details, partial(_known_fields, robot=model), ("robot",))

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -206,9 +207,9 @@ def as_scenario(value: Scenario | Mapping[str, Any] | str) -> Scenario:
         return value
     if isinstance(value, Mapping):
         return Scenario.from_dict(dict(value))
-    if isinstance(value, str):  # the form in which datasets store it
-        return Scenario.from_json(value)
-    raise ScenarioError(f"scenario: expected a Scenario, a dict or JSON text, got {type(value).__name__}")
+    if isinstance(value, str | os.PathLike):  # datasets store the text
+        return Scenario.from_json(value if isinstance(value, str) else Path(value))
+    raise ScenarioError(f"scenario: expected a Scenario, a dict, JSON text or a file, got {type(value).__name__}")
 
 
 def get_scenario(choice: Scenario | int, bank: ScenarioBank | None) -> Scenario:

@@ -9,8 +9,8 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.distance import shape_geometry, wall_distance
-from leapnav.envs.shapes.field import header_of, shapes_of
+from leapnav.envs.shapes.distance import part_geometry, wall_distance
+from leapnav.envs.shapes.field import header_of, parts_in
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
@@ -25,12 +25,12 @@ def obstacle_distance(x, y, field):
         min(wall_distance(x, y, header, 1), wall_distance(x, y, header, 3)),
     )
     nearest = -1
-    for shape in shapes_of(field):
-        dx, dy = x - shape.x, y - shape.y
-        if dx * dx + dy * dy < max(best + shape.rim, 0.0) ** 2:  # compares squares, since most shapes are farther away
-            distance = shape_geometry(x, y, 0.0, field, shape)[0]
+    for part in parts_in(field):
+        dx, dy = x - part.x, y - part.y
+        if dx * dx + dy * dy < max(best + part.rim, 0.0) ** 2:  # compares squares, since most parts are farther away
+            distance = part_geometry(x, y, 0.0, field, part)[0]
             if distance < best:
-                best, nearest = distance, shape.obstacle
+                best, nearest = distance, part.obstacle
     return best, nearest
 
 

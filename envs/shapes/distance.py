@@ -1,4 +1,4 @@
-"""Exact distances from a disc to walls and to the shapes of a packed field (kernels).
+"""Exact distances from a disc to walls and to the parts of a packed field (kernels).
 
 The gradient of a distance is the outward unit normal, and its Hessian is the curvature of the level line times t t'
 with the tangent t.
@@ -13,7 +13,7 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
-from leapnav.envs.shapes.field import HEADER_TYPE, SHAPE_TYPE, edges_of
+from leapnav.envs.shapes.field import HEADER_TYPE, PART_TYPE, edges_of
 
 # Smallest distance (m) from a point, the centre of a circle or a vertex, with which normal and curvature are computed;
 # only guesses deep in an obstacle come closer.
@@ -27,16 +27,16 @@ def wall_distance(x, y, header, side):
     return sign * ((x if side % 2 == 0 else y) - header.arena[side])
 
 
-@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, SHAPE_TYPE), inline="always")
-def _nearest_edge(x, y, field, shape):
+@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, PART_TYPE), inline="always")
+def _nearest_edge(x, y, field, part):
     """Edge of a polygon whose line is farthest away: (signed distance of the line (m), number of the edge, beyond).
 
     `beyond` is the coordinate (m) along the line beyond the ends of the edge: negative before its first vertex,
     positive after its second, zero between them.
     """
-    edges = edges_of(field, shape)
+    edges = edges_of(field, part)
     largest, nearest = -np.inf, 0
-    for k in range(shape.edges):
+    for k in range(part.edges):
         height = edges[k].nx * x + edges[k].ny * y - edges[k].offset
         if height > largest:
             largest, nearest = height, k
@@ -45,44 +45,44 @@ def _nearest_edge(x, y, field, shape):
     return largest, nearest, min(along, max(along - edge.length, 0.0))
 
 
-@kernel(int64(float64, float64, CONSTANT, SHAPE_TYPE, float64), inline="always")
-def closest_feature(x, y, field, shape, reach):
+@kernel(int64(float64, float64, CONSTANT, PART_TYPE, float64), inline="always")
+def closest_feature(x, y, field, part, reach):
     """Number of the edge or of the vertex of a rounded polygon that is closest to a point outside.
 
     Edges have even numbers, and vertices odd ones. The curvature of the distance is continuous where the feature does
     not change. Beyond the distance `reach` (m) the result is 0.
     """
-    largest, nearest, beyond = _nearest_edge(x, y, field, shape)
-    if math.sqrt(largest * largest + beyond * beyond) - shape.rounding >= reach:
+    largest, nearest, beyond = _nearest_edge(x, y, field, part)
+    if math.sqrt(largest * largest + beyond * beyond) - part.rounding >= reach:
         return 0
     if beyond > 0.0:
-        nearest = (nearest + 1) % shape.edges  # which begins at the vertex
-    return 2 * (1 + shape.first + nearest) + (1 if beyond != 0.0 else 0)
+        nearest = (nearest + 1) % part.edges  # which begins at the vertex
+    return 2 * (1 + part.first + nearest) + (1 if beyond != 0.0 else 0)
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, CONSTANT, SHAPE_TYPE), inline="always")
-def shape_geometry(x, y, radius, field, shape):
-    """Signed distance (m) from a disc to a shape, its gradient (2), and the curvature (1/m) of its level line.
+@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, CONSTANT, PART_TYPE), inline="always")
+def part_geometry(x, y, radius, field, part):
+    """Signed distance (m) from a disc to a part, its gradient (2), and the curvature (1/m) of its level line.
 
     The nearest point of a polygon is on the edge whose line is farthest away, or one of its ends.
 
     Args:
         x, y, radius: the disc (m).
         field: packed obstacle field.
-        shape: one of its shapes.
+        part: one of its shapes.
 
     """
-    if shape.edges == 0:
-        dx, dy = x - shape.x, y - shape.y
+    if part.edges == 0:
+        dx, dy = x - part.x, y - part.y
         distance = math.sqrt(dx * dx + dy * dy)
         curvature = 1.0 / (distance if distance > MIN_DISTANCE else MIN_DISTANCE)
-        return distance - (shape.rounding + radius), dx * curvature, dy * curvature, curvature
-    largest, nearest, beyond = _nearest_edge(x, y, field, shape)
-    edge = edges_of(field, shape)[nearest]
+        return distance - (part.rounding + radius), dx * curvature, dy * curvature, curvature
+    largest, nearest, beyond = _nearest_edge(x, y, field, part)
+    edge = edges_of(field, part)[nearest]
     if beyond == 0.0:  # everywhere inside
-        return largest - shape.rounding - radius, edge.nx, edge.ny, 0.0
+        return largest - part.rounding - radius, edge.nx, edge.ny, 0.0
     distance = math.sqrt(largest * largest + beyond * beyond)
     curvature = 1.0 / (distance if distance > MIN_DISTANCE else MIN_DISTANCE)
     across, beside = largest * curvature, beyond * curvature
     nx, ny = across * edge.nx - beside * edge.ny, across * edge.ny + beside * edge.nx
-    return distance - shape.rounding - radius, nx, ny, curvature
+    return distance - part.rounding - radius, nx, ny, curvature

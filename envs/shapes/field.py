@@ -1,8 +1,8 @@
 """The packed field: obstacles, walls and proximity cost of a scenario as one array for compiled kernels.
 
-The array contains, one after the other, a `HEADER`, the `SHAPE` of each disc and rounded convex polygon, the `EDGE` of
+The array contains, one after the other, a `HEADER`, the `PART` of each disc and rounded convex polygon, the `EDGE` of
 each edge of a polygon, and a grid: for each cell the index at which its list begins, then the end of the last list,
-then the lists. A cell lists the shapes that contribute to the proximity cost somewhere in it, so that the work at a
+then the lists. A cell lists the parts that contribute to the proximity cost somewhere in it, so that the work at a
 point does not depend on the number of distant obstacles. The array has no addresses: it can be copied and pickled.
 """
 
@@ -35,19 +35,19 @@ HEADER = np.dtype(
         ("cell_size", "f8"),  # m
         ("columns", "i8"),  # cells of the grid in x and y
         ("lines", "i8"),
-        ("shapes", "i8"),  # number of shapes
-        ("edges", "i8"),  # number of edges of all shapes
+        ("parts", "i8"),  # number of parts
+        ("edges", "i8"),  # number of edges of all parts
     ]
 )
-SHAPE = np.dtype(
+PART = np.dtype(
     [
-        ("x", "f8"),  # centre and radius (m) of a circle that contains the shape
+        ("x", "f8"),  # centre and radius (m) of a circle that contains the part
         ("y", "f8"),
         ("rim", "f8"),
         ("rounding", "f8"),  # radius (m) by which the polygon is enlarged, or that of the disc
         ("first", "i8"),  # number of the first edge
         ("edges", "i8"),  # number of edges: 0 for a disc, 2 for a capsule
-        ("obstacle", "i8"),  # index in the scenario of the obstacle to which the shape belongs
+        ("obstacle", "i8"),  # index in the scenario of the obstacle to which the part belongs
     ]
 )
 EDGE = np.dtype(
@@ -60,15 +60,15 @@ EDGE = np.dtype(
         ("length", "f8"),  # m
     ]
 )
-HEADER_SIZE, SHAPE_SIZE, EDGE_SIZE = (kind.itemsize // 8 for kind in (HEADER, SHAPE, EDGE))
-HEADER_TYPE, SHAPE_TYPE, EDGE_TYPE = from_dtype(HEADER), from_dtype(SHAPE), from_dtype(EDGE)
-SHAPES_TYPE, EDGES_TYPE, NUMBERS = (types.Array(kind, 1, "C", readonly=True) for kind in (SHAPE_TYPE, EDGE_TYPE, int64))
+HEADER_SIZE, PART_SIZE, EDGE_SIZE = (kind.itemsize // 8 for kind in (HEADER, PART, EDGE))
+HEADER_TYPE, PART_TYPE, EDGE_TYPE = from_dtype(HEADER), from_dtype(PART), from_dtype(EDGE)
+PARTS_TYPE, EDGES_TYPE, NUMBERS = (types.Array(kind, 1, "C", readonly=True) for kind in (PART_TYPE, EDGE_TYPE, int64))
 COUNT = np.dtype("i8")
 COSTS = ("weight", "scale", "radius")
 
 # Terms of obstacles farther away than 30 sigma are skipped: they are below 1e-13 k, 1/10 of the integrator's tolerance.
 CUTOFF = 30.0
-MAX_SHAPES_WITHOUT_GRID = 16  # fewer shapes are evaluated faster one by one
+MAX_PARTS_WITHOUT_GRID = 16  # fewer parts are evaluated faster one by one
 # Smallest and largest number of cells per axis. Between them, a cell is as large as this multiple of the reach of an
 # obstacle.
 MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
@@ -82,28 +82,28 @@ def header_of(field):
     return records_of(field, 0, 1, HEADER)[0]
 
 
-@kernel(SHAPES_TYPE(CONSTANT))
-def shapes_of(field):
-    """Return the `SHAPE` of each disc and polygon of a packed field; the discs are first."""
-    return records_of(field, HEADER_SIZE, header_of(field).shapes, SHAPE)
+@kernel(PARTS_TYPE(CONSTANT))
+def parts_in(field):
+    """Return the `PART` of each disc and polygon of a packed field; the discs are first."""
+    return records_of(field, HEADER_SIZE, header_of(field).parts, PART)
 
 
-@kernel(EDGES_TYPE(CONSTANT, SHAPE_TYPE))
-def edges_of(field, shape):
-    """Return the `EDGE` of each edge of a shape of a packed field; none for a disc."""
-    start = HEADER_SIZE + SHAPE_SIZE * header_of(field).shapes + EDGE_SIZE * shape.first
-    return records_of(field, start, shape.edges, EDGE)
+@kernel(EDGES_TYPE(CONSTANT, PART_TYPE))
+def edges_of(field, part):
+    """Return the `EDGE` of each edge of a part of a packed field; none for a disc."""
+    start = HEADER_SIZE + PART_SIZE * header_of(field).parts + EDGE_SIZE * part.first
+    return records_of(field, start, part.edges, EDGE)
 
 
 @kernel(NUMBERS(types.float64, types.float64, CONSTANT))
-def shapes_near(x, y, field):
-    """Return the numbers of the shapes that contribute to the proximity cost at a point, and perhaps of others.
+def parts_near(x, y, field):
+    """Return the numbers of the parts that contribute to the proximity cost at a point, and perhaps of others.
 
-    A point outside the grid uses the nearest cell. That lists all shapes that contribute at the point: its projection
+    A point outside the grid uses the nearest cell. That lists all parts that contribute at the point: its projection
     onto the grid, which is convex and contains the obstacles, is not farther away from any of them.
     """
     head = header_of(field)
-    start = HEADER_SIZE + SHAPE_SIZE * head.shapes + EDGE_SIZE * head.edges
+    start = HEADER_SIZE + PART_SIZE * head.parts + EDGE_SIZE * head.edges
     column = min(max(int((x - head.grid_x) / head.cell_size), 0), head.columns - 1)
     line = min(max(int((y - head.grid_y) / head.cell_size), 0), head.lines - 1)
     bounds = records_of(field, start + column * head.lines + line, 2, COUNT)
@@ -168,11 +168,11 @@ def _pack(parts: Sequence[FieldPart], arena: Any, costs: Sequence[float], *, gri
         rim = float(np.hypot(*(part.vertices - centre).T).max()) + part.rounding
         rows.append((x, y, rim, part.rounding, first, len(lines), part.obstacle))
         first += len(lines)
-    shapes = np.array(rows, SHAPE)
-    header["shapes"], header["edges"] = len(rows), first
+    shapes = np.array(rows, PART)
+    header["parts"], header["edges"] = len(rows), first
     lists: list[Sequence[int]] = [range(len(parts))]
     header["columns"] = header["lines"] = header["cell_size"] = 1
-    if grid and len(parts) > MAX_SHAPES_WITHOUT_GRID:
+    if grid and len(parts) > MAX_PARTS_WITHOUT_GRID:
         lists = _grid_lists([*discs, *polygons], [*[_NO_EDGES] * len(discs), *edges], header[0])
     starts = len(lists) + 1 + np.cumsum([0, *map(len, lists)])
     numbers = np.concatenate([starts, *lists]).astype(COUNT)
@@ -183,7 +183,7 @@ def _pack(parts: Sequence[FieldPart], arena: Any, costs: Sequence[float], *, gri
 
 
 def _grid_lists(parts: Sequence[FieldPart], edges: Sequence[np.ndarray], header: Any) -> list[Sequence[int]]:
-    """Return the shapes that contribute in each cell of a grid, which is written to the header.
+    """Return the parts that contribute in each cell of a grid, which is written to the header.
 
     Obstacles contribute up to CUTOFF proximity scales from the robot's rim. They may extend beyond the arena.
     """
@@ -228,11 +228,11 @@ def read_header(field: np.ndarray) -> Any:
 
 
 def _unpack(field: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-    """Return the header, the shapes and the edges of a packed field, which share its memory."""
+    """Return the header, the parts and the edges of a packed field, which share its memory."""
     header = read_header(field)
-    middle = HEADER_SIZE + SHAPE_SIZE * int(header["shapes"])
+    middle = HEADER_SIZE + PART_SIZE * int(header["parts"])
     end = middle + EDGE_SIZE * int(header["edges"])
-    return header, field[HEADER_SIZE:middle].view(SHAPE), field[middle:end].view(EDGE)
+    return header, field[HEADER_SIZE:middle].view(PART), field[middle:end].view(EDGE)
 
 
 def field_parts(field: np.ndarray) -> list[FieldPart]:
@@ -340,8 +340,8 @@ def _pack_again(packed: np.ndarray, *, grid: bool) -> np.ndarray:
     header, n = read_header(packed), len(packed)
     if not (header["weight"] >= 0 and header["scale"] > 0 and header["radius"] > 0):
         raise IndexError("weight, scale or radius is invalid")
-    if not (0 <= header["shapes"] <= n and 0 <= header["edges"] <= n):
-        raise IndexError("a number of shapes or edges is invalid")
+    if not (0 <= header["parts"] <= n and 0 <= header["edges"] <= n):
+        raise IndexError("a number of parts or edges is invalid")
     _, shapes, edges = _unpack(packed)
     ends = shapes["first"] + shapes["edges"]
     if len(edges) != header["edges"] or (shapes["first"] < 0).any() or (ends > len(edges)).any():
@@ -359,8 +359,8 @@ def _equals(packed: np.ndarray, field: np.ndarray) -> bool:
     if len(packed) != len(field) or not np.allclose(packed, field, rtol=1e-9, atol=1e-9):
         return False
     (header, shapes, edges), (expected, others, _) = _unpack(packed), _unpack(field)
-    end = HEADER_SIZE + SHAPE_SIZE * len(shapes) + EDGE_SIZE * len(edges)
-    integers = [name for name in SHAPE.names or () if SHAPE[name] == COUNT]
+    end = HEADER_SIZE + PART_SIZE * len(shapes) + EDGE_SIZE * len(edges)
+    integers = [name for name in PART.names or () if PART[name] == COUNT]
     return (
         all(np.array_equal(shapes[name], others[name]) for name in integers)
         and (header["columns"], header["lines"]) == (expected["columns"], expected["lines"])

@@ -14,8 +14,8 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.distance import closest_feature, shape_geometry, wall_distance
-from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, header_of, shapes_near, shapes_of
+from leapnav.envs.shapes.distance import closest_feature, part_geometry, wall_distance
+from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, header_of, parts_in, parts_near
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 HASH_FACTOR = 31  # of numbers that are combined to one
@@ -42,7 +42,7 @@ def barrier_term(distance, nx, ny, curvature, header):
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
 def disc_proximity(x, y, radius, field):
     """Proximity cost of a disc: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
-    header, shapes = header_of(field), shapes_of(field)
+    header, parts = header_of(field), parts_in(field)
     reach = CUTOFF * header.scale
     value = gx = gy = hxx = hxy = hyy = 0.0
     for side in range(4):
@@ -53,11 +53,11 @@ def disc_proximity(x, y, radius, field):
             b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, 0.0, header)
             value, gx, gy = value + b, gx + bx, gy + by
             hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
-    for number in shapes_near(x, y, field):
-        shape = shapes[number]
-        dx, dy = x - shape.x, y - shape.y
-        if dx * dx + dy * dy < (shape.rim + radius + reach) ** 2:
-            distance, nx, ny, curvature = shape_geometry(x, y, radius, field, shape)
+    for number in parts_near(x, y, field):
+        part = parts[number]
+        dx, dy = x - part.x, y - part.y
+        if dx * dx + dy * dy < (part.rim + radius + reach) ** 2:
+            distance, nx, ny, curvature = part_geometry(x, y, radius, field, part)
             if distance < reach:
                 b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, curvature, header)
                 value, gx, gy = value + b, gx + bx, gy + by
@@ -78,8 +78,8 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
 
     One test of the distance serves all three, which takes half the time of three calls.
     """
-    header, shapes = header_of(field), shapes_of(field)
-    if header.columns * header.lines > 1:  # a cell of the grid lists the shapes near one point
+    header, parts = header_of(field), parts_in(field)
+    if header.columns * header.lines > 1:  # a cell of the grid lists the parts near one point
         first, second = disc_proximity(xa, ya, radius, field)[0], disc_proximity(xb, yb, radius, field)[0]
         return first, second, disc_proximity(xc, yc, radius, field)[0]
     steepness, contact = 1.0 / header.scale, header.least_distance
@@ -92,11 +92,11 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
             first += barrier((wall_distance(xa, ya, header, side) - radius) * steepness, contact)[0]
             second += barrier(between * steepness, contact)[0]
             third += barrier((wall_distance(xc, yc, header, side) - radius) * steepness, contact)[0]
-    for shape in shapes:
-        if (xb - shape.x) ** 2 + (yb - shape.y) ** 2 < (shape.rim + radius + reach) ** 2:
-            first += barrier(shape_geometry(xa, ya, radius, field, shape)[0] * steepness, contact)[0]
-            second += barrier(shape_geometry(xb, yb, radius, field, shape)[0] * steepness, contact)[0]
-            third += barrier(shape_geometry(xc, yc, radius, field, shape)[0] * steepness, contact)[0]
+    for part in parts:
+        if (xb - part.x) ** 2 + (yb - part.y) ** 2 < (part.rim + radius + reach) ** 2:
+            first += barrier(part_geometry(xa, ya, radius, field, part)[0] * steepness, contact)[0]
+            second += barrier(part_geometry(xb, yb, radius, field, part)[0] * steepness, contact)[0]
+            third += barrier(part_geometry(xc, yc, radius, field, part)[0] * steepness, contact)[0]
     weight = header.weight
     return weight * first, weight * second, weight * third
 
@@ -147,14 +147,14 @@ def disc_features(x, y, radius, field):
 
     The number changes where second derivatives of the proximity cost are discontinuous, apart from negligible terms.
     """
-    number, shapes = 0, shapes_of(field)
+    number, parts = 0, parts_in(field)
     reach = CUTOFF * header_of(field).scale + radius
-    for index in shapes_near(x, y, field):
-        shape = shapes[index]
-        dx, dy = x - shape.x, y - shape.y
-        if shape.edges > 0 and dx * dx + dy * dy < (shape.rim + reach) ** 2:
-            feature = closest_feature(x, y, field, shape, reach) * HASH_FACTOR
-            number += feature * feature  # a sum does not depend on the order of the shapes
+    for index in parts_near(x, y, field):
+        part = parts[index]
+        dx, dy = x - part.x, y - part.y
+        if part.edges > 0 and dx * dx + dy * dy < (part.rim + reach) ** 2:
+            feature = closest_feature(x, y, field, part, reach) * HASH_FACTOR
+            number += feature * feature  # a sum does not depend on the order of the parts
     return number
 
 

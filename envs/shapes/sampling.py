@@ -10,8 +10,8 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, tuple_of
 from leapnav.envs.shapes.barrier import CONTACT, barrier
-from leapnav.envs.shapes.distance import shape_geometry, wall_distance
-from leapnav.envs.shapes.field import header_of, shapes_of
+from leapnav.envs.shapes.distance import part_geometry, wall_distance
+from leapnav.envs.shapes.field import header_of, parts_in
 
 # Added to the distances of the points, relative to the spacing. With 0 (and at least half the spacing), 3 optima of
 # 2,000 scenarios of the unicycle are missed, by 3 to 36 %; for other robots, 7 of 800 results differ from those of the
@@ -62,13 +62,13 @@ def sample_grid(field, radius, grid, band):
                 if distance < band:
                     phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)
-    for shape in shapes_of(field):
+    for shape in parts_in(field):
         reach = shape.rim + band + radius
         first, last = _index_range(shape.x - reach, shape.x + reach, x0, spacing, columns)
         bottom, top = _index_range(shape.y - reach, shape.y + reach, y0, spacing, lines)
         for i in range(first, last):
             for j in range(bottom, top):
-                distance = shape_geometry(x0 + i * spacing, y0 + j * spacing, radius, field, shape)[0]
+                distance = part_geometry(x0 + i * spacing, y0 + j * spacing, radius, field, shape)[0]
                 if distance < band:
                     phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                     closest[i, j] = min(closest[i, j], distance)

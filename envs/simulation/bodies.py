@@ -79,7 +79,8 @@ class MotorBodies:
         return MotorBodies, self._arguments  # each step writes all rows
 
 
-Velocity = tuple[float, float, float]  # x, y, angular
+# From velocity (2), angle and angular velocity to the velocities (x, y, angular) of the next step without contacts.
+VelocityFunction = Callable[[float, float, float, float], tuple[float, float, float]]
 
 
 class ContactWorld:
@@ -133,11 +134,11 @@ class ContactWorld:
         for body in self._movable.values():
             self._space.add(*_ground_friction(static, body))
 
-    def drive(
+    def simulate(
         self,
         row: np.ndarray,
         velocity: np.ndarray,
-        control: Callable[[float, float, float, float], Velocity],
+        steer: VelocityFunction,
         duration: float,
         substeps: int,
     ) -> tuple[float, float, float, float]:
@@ -146,7 +147,7 @@ class ContactWorld:
         Args:
             row: x, y (m) and angle (rad); overwritten.
             velocity: velocity (2) (m/s) and angular velocity (rad/s); overwritten.
-            control: maps velocity (2), angle and angular velocity to the velocities of the next step without contacts.
+            steer: see `VelocityFunction`.
             duration: length of the period (s).
             substeps: number of steps.
 
@@ -157,7 +158,7 @@ class ContactWorld:
 
         def apply(body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
             # Chipmunk calls this before it solves for the contacts, which remove the velocity into an obstacle.
-            vx, vy, turn_rate = control(*body.velocity, body.angle, body.angular_velocity)
+            vx, vy, turn_rate = steer(*body.velocity, body.angle, body.angular_velocity)
             body.velocity = vx, vy
             body.angular_velocity = turn_rate
 

@@ -145,7 +145,7 @@ def largest_distance(path, end):
 
 
 @kernel(types.UniTuple(float64, 3)(PATH, float64, float64, VECTOR), inline="always")
-def follow_path(path, before, total, new):
+def first_contact(path, before, total, new):
     """Find the smallest clearance along a path, and the first contact.
 
     Args:
@@ -279,12 +279,12 @@ def drive_path(path, before, new):
         new (n,): overwritten by the state at the end.
 
     Returns:
-        See `follow_path`; then the integrals of the proximity cost and of the state cost.
+        See `first_contact`; then the integrals of the proximity cost and of the state cost.
 
     """
     state_after(path, 1.0, new)
     total = largest_distance(path, new)
-    lowest, fraction, after = follow_path(path, before, total, new)
+    lowest, fraction, after = first_contact(path, before, total, new)
     if fraction == 0.0:
         return lowest, fraction, after, 0.0, 0.0
     driven = path.duration * fraction

@@ -10,8 +10,8 @@ from numba import float64, int64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
-from leapnav.envs.shapes.distance import shape_geometry
-from leapnav.envs.shapes.field import SHAPE_TYPE, edges_of, field_parts, header_of, shapes_of
+from leapnav.envs.shapes.distance import part_geometry
+from leapnav.envs.shapes.field import PART_TYPE, edges_of, field_parts, header_of, parts_in
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
 # Up to this number of beams it takes less time to intersect a circle with all of them, in vector instructions, than to
@@ -52,16 +52,16 @@ def _range_to_circle(dx, dy, cx, cy, r):
     return along - math.sqrt(square) if square > 0.0 and along > 0.0 else np.inf
 
 
-@kernel(float64(float64, float64, float64, float64, CONSTANT, SHAPE_TYPE))
-def _range_to_polygon(x, y, dx, dy, field, shape):
+@kernel(float64(float64, float64, float64, float64, CONSTANT, PART_TYPE))
+def _range_to_polygon(x, y, dx, dy, field, part):
     """Return the distance (m) from (x, y) in the direction (dx, dy) to a rounded polygon, infinite if there is no hit.
 
     If (x, y) is inside a polygon without rounding, the distance is negative; a rounded one must not contain (x, y).
     """
-    edges, rounding = edges_of(field, shape), shape.rounding
+    edges, rounding = edges_of(field, part), part.rounding
     # Between `enter` and `leave`, the ray is inside the half-planes of all edges, moved outwards by the rounding.
     enter, leave, entered = -np.inf, np.inf, 0
-    for k in range(shape.edges):
+    for k in range(part.edges):
         edge = edges[k]
         height = edge.nx * x + edge.ny * y - edge.offset - rounding
         rate = edge.nx * dx + edge.ny * dy
@@ -118,7 +118,7 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
     """
     count = beams.shape[1]
     dxs, dys, nearest = scratch[0], scratch[1], scratch[2]
-    shapes, arena = shapes_of(field), header_of(field).arena
+    parts, arena = parts_in(field), header_of(field).arena
     to_right, to_top, to_left, to_bottom = arena[2] - x, arena[3] - y, arena[0] - x, arena[1] - y
     for k in range(count):
         dx = cos * beams[0, k] - sin * beams[1, k]
@@ -129,25 +129,25 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         dxs[k], dys[k] = dx, dy
         nearest[k] = first if first < reach else reach
     # The beams that may meet an obstacle are consecutive, if beam count + k is beam k.
-    selects = count > MAX_VECTORISED_BEAMS or (len(shapes) > 0 and shapes[-1].edges > 0)
+    selects = count > MAX_VECTORISED_BEAMS or (len(parts) > 0 and parts[-1].edges > 0)
     if selects:
         for k in range(count):
             dxs[count + k], dys[count + k], nearest[count + k] = dxs[k], dys[k], nearest[k]
-    for shape in shapes:
-        cx, cy = shape.x - x, shape.y - y
-        if cx * cx + cy * cy >= (shape.rim + reach) ** 2:
+    for part in parts:
+        cx, cy = part.x - x, part.y - y
+        if cx * cx + cy * cy >= (part.rim + reach) ** 2:
             continue
         first, size = 0, count
-        if shape.edges > 0 or count > MAX_VECTORISED_BEAMS:
-            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, shape.rim, count)
+        if part.edges > 0 or count > MAX_VECTORISED_BEAMS:
+            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, part.rim, count)
             size = last - first
-        if shape.edges == 0:
+        if part.edges == 0:
             rays = part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size)
-            _shorten(cx, cy, shape.rim, reach, rays[0], rays[1], rays[2])
+            _shorten(cx, cy, part.rim, reach, rays[0], rays[1], rays[2])
             continue
-        is_inside = shape.rounding > 0.0 and shape_geometry(x, y, 0.0, field, shape)[0] <= 0.0
+        is_inside = part.rounding > 0.0 and part_geometry(x, y, 0.0, field, part)[0] <= 0.0
         for k in range(first, first + size):
-            hit = 0.0 if is_inside else _range_to_polygon(x, y, dxs[k], dys[k], field, shape)
+            hit = 0.0 if is_inside else _range_to_polygon(x, y, dxs[k], dys[k], field, part)
             nearest[k] = min(nearest[k], hit)
     for k in range(count):
         hit = min(nearest[k], nearest[count + k]) if selects else nearest[k]
@@ -182,15 +182,15 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
         out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten.
 
     """
-    shapes, arena = shapes_of(field), header_of(field).arena
+    parts, arena = parts_in(field), header_of(field).arena
     out[0], out[1], out[2], out[3] = x - arena[0], y - arena[1], arena[2] - x, arena[3] - y
     out[4], out[5] = cos, sin
     out[WALL_ENTRIES:] = 0.0
     # Insertion sort into a list of the nearest shapes.
     distances = np.full(obstacles, np.inf)
     numbers = np.zeros(obstacles, np.int64)
-    for number in range(len(shapes)):
-        distance = shape_geometry(x, y, 0.0, field, shapes[number])[0]
+    for number in range(len(parts)):
+        distance = part_geometry(x, y, 0.0, field, parts[number])[0]
         rank = obstacles
         while rank > 0 and distance < distances[rank - 1]:
             rank -= 1
@@ -198,15 +198,15 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
             for k in range(obstacles - 1, rank, -1):
                 distances[k], numbers[k] = distances[k - 1], numbers[k - 1]
             distances[rank], numbers[rank] = distance, number
-    for k in range(min(obstacles, len(shapes))):
-        shape = shapes[numbers[k]]
-        edges = edges_of(field, shape)
+    for k in range(min(obstacles, len(parts))):
+        part = parts[numbers[k]]
+        edges = edges_of(field, part)
         row = WALL_ENTRIES + k * (2 + 2 * vertices)
-        out[row], out[row + 1] = 1.0, shape.rounding
+        out[row], out[row + 1] = 1.0, part.rounding
         for j in range(vertices):
-            dx, dy = shape.x - x, shape.y - y
-            if shape.edges > 0:
-                edge = edges[j % shape.edges]
+            dx, dy = part.x - x, part.y - y
+            if part.edges > 0:
+                edge = edges[j % part.edges]
                 dx, dy = edge.x - x, edge.y - y
             out[row + 2 + 2 * j] = cos * dx + sin * dy
             out[row + 3 + 2 * j] = cos * dy - sin * dx

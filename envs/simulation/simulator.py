@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.shapes.clearance import clearances, footprint_clearance, footprint_clearances
 from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.envs.simulation import stepping
-from leapnav.envs.simulation.bodies import ContactWorld, MotorBodies, resolve_overlap
+from leapnav.envs.simulation.bodies import ContactWorld, MotorBodies, VelocityFunction, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
 from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION, coast, no_state_cost
 from leapnav.envs.simulation.sensing import check_map
@@ -26,7 +26,7 @@ from leapnav.envs.simulation.state import (
     EPISODE,
     N_GUIDE_POINTS,
     Episode,
-    SharedFields,
+    FieldStore,
     Simulation,
     guide_points,
 )
@@ -59,7 +59,7 @@ class BatchSimulator:
         self.layout = ObservationLayout(settings)
         n, m = settings.model.sizes()
         self.episodes, self.states = np.zeros(count, EPISODE), np.zeros((count, n))
-        self.fields = SharedFields(count)
+        self.fields = FieldStore(count)
         self._geodesic = settings.observation == "geodesic"
         width = 2 * m + 3 + settings.lidar_beams if settings.disturbed else 0
         self._noise = np.zeros((count, NOISE_ROWS if settings.disturbed else 1, width))
@@ -237,7 +237,7 @@ class BatchSimulator:
         if self._bodies is None:
             invalid = stepping.drive(actions, active, self._packed, self._addresses)
         else:
-            invalid = stepping.command(actions, active, self._packed)
+            invalid = stepping.begin_periods(actions, active, self._packed)
         if invalid >= 0:
             robot = "" if len(self.states) == 1 else f" for robot {invalid}"
             expected = in_words(actions.shape[1])
@@ -266,14 +266,14 @@ class BatchSimulator:
             self._contacts[i] = ContactWorld(self.fields[i], discs, self.settings.motor, self._masses[i])
         duration = float(episode["remaining"])
         substeps = math.ceil(duration / MAX_CONTACT_STEP)
-        command = self._command(i, duration / substeps)
+        steer = self._velocity_function(i, duration / substeps)
         before, pose = state.copy(), state[:3]
         if self.settings.motors:
             velocity = np.array([episode["vx"], episode["vy"], episode["spin"]])
         else:
-            velocity = np.array(command(0.0, 0.0, float(pose[2]), 0.0))
+            velocity = np.array(steer(0.0, 0.0, float(pose[2]), 0.0))
         world = self._contacts[i]
-        lowest, speeds, turn_rates, proximity = world.drive(pose, velocity, command, duration, substeps)
+        lowest, squared_speed, squared_turn_rate, proximity = world.simulate(pose, velocity, steer, duration, substeps)
         if world.field is not self.fields[i]:  # obstacles have moved; the next world begins with them at rest
             self.fields[i] = world.field
             del self._contacts[i]
@@ -286,7 +286,7 @@ class BatchSimulator:
         # The effort is that of the actual motion, or of the controls, which are held. Further states change also in
         # contact; the state cost is that at both ends of the period.
         if self.settings.commands_motion:
-            episode["effort"] += stepping.effort(sim.weights[i], np.sqrt([speeds, turn_rates]))
+            episode["effort"] += stepping.effort(sim.weights[i], np.sqrt([squared_speed, squared_turn_rate]))
         else:
             episode["effort"] += stepping.effort(sim.weights[i], controls) * duration
         if model.state_cost is not None:
@@ -296,7 +296,7 @@ class BatchSimulator:
         episode["pose_clearance"] = footprint_clearance(*pose.tolist(), discs, self.fields[i])[0]
         episode["clearance"] = min(episode["clearance"], lowest)
 
-    def _command(self, i: int, step: float) -> Callable[[float, float, float, float], tuple[float, float, float]]:
+    def _velocity_function(self, i: int, step: float) -> VelocityFunction:
         """Return the function from the velocity of a robot in contact to that of its next step without contact."""
         sim, motor, model, state = self._simulation, self.settings.motor, self.settings.model, self.states[i]
         controls, packed = sim.controls[i].copy(), sim.settings[0]["motor"]
@@ -347,7 +347,7 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     model = settings.model
     kernels = [clearances, footprint_clearances, stepping.start_episodes, stepping.end_periods, observe_robots]
     if settings.motors:
-        kernels += [stepping.command, stepping.push_bodies, coast, no_state_cost]
+        kernels += [stepping.begin_periods, stepping.push_bodies, coast, no_state_cost]
     else:
         kernels += [stepping.drive, model.advance, model.state_cost or no_state_cost]
     if settings.shaped:  # the optima of banks, which guide the robots, are checked

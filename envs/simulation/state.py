@@ -83,7 +83,7 @@ def guide_points(goal: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
     return guides
 
 
-class SharedFields:
+class FieldStore:
     """The packed obstacle field of each robot; robots with the same scenario share one array.
 
     Attributes:
@@ -120,7 +120,7 @@ PLACES = int64[:, ::1]
 
 @kernel(CONSTANT(PLACES, int64))
 def field_of(places, i):
-    """Return the packed obstacle field of robot i, see `SharedFields`."""
+    """Return the packed obstacle field of robot i, see `FieldStore`."""
     return vector_at(places[i, 0], places[i, 1])
 
 

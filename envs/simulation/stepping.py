@@ -134,7 +134,7 @@ def _begin_periods(actions, active, sim):
 
 
 @kernel(int64(MATRIX, FLAGS, PACKED))
-def command(actions, active, packed):
+def begin_periods(actions, active, packed):
     """Begin a period of robots with motors, see `_begin_periods`."""
     return _begin_periods(actions, active, Simulation(*packed))
 
@@ -283,7 +283,10 @@ def at_goal(i, sim):
     if math.hypot(state[0] - goal[0], state[1] - goal[1]) > settings.position_tolerance:
         return False
     for k in range(3, len(goal)):
-        if not math.isnan(goal[k]) and abs(state[k] - goal[k]) > settings.motion_tolerance:
+        difference = state[k] - goal[k]
+        if settings.heading_states >> k & 1:
+            difference = wrapped(difference)
+        if not math.isnan(goal[k]) and abs(difference) > settings.motion_tolerance:
             return False
     return math.isnan(goal[2]) or abs(wrapped(state[2] - goal[2])) <= settings.heading_tolerance
 

@@ -21,7 +21,6 @@ from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario, check_headings
 from leapnav.envs.utils import colors
-from leapnav.envs.utils.records import as_tuples
 from leapnav.experts.acting.policy import NoOptimumError
 from leapnav.play.solving import PlaySolver, bank_scenario
 
@@ -124,7 +123,7 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
         return {"scenario": scenario.to_dict()}
 
     def parts(content: dict[str, Any]) -> dict[str, Any]:
-        obstacle = Obstacle.model_validate(as_tuples(content.get("obstacle")))
+        obstacle = Obstacle.model_validate(content.get("obstacle"))
         return {"parts": [{part.kind: part.model_dump()} for part in obstacle.shape.parts()]}
 
     def follow(content: dict[str, Any]) -> dict[str, Any]:
