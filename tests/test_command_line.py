@@ -1,4 +1,4 @@
-"""Choices, completion, interruptions and durations of the command line."""
+"""Choices, completion and interruptions of the command line."""
 
 import shutil
 import subprocess
@@ -6,12 +6,11 @@ from typing import get_args
 
 import pytest
 
-from leapnav import durations
 from leapnav.cli import main
 from leapnav.commands.options import Family, FamilyOrAll, Horizon, PolicyName, parse_environment
 from leapnav.envs import FAMILIES
 from leapnav.envs.settings import HORIZONS
-from leapnav.training import BCConfig, PPOConfig, shipped_policies
+from leapnav.training import shipped_policies
 from leapnav.training.policies.files import BASELINES
 
 
@@ -69,20 +68,6 @@ def test_an_interruption_says_how_to_resume(words, hint, tmp_path, monkeypatch, 
     assert main(words) == 130
     line = capsys.readouterr().err.splitlines()[-1]
     assert line == f"leapnav: interrupted{f'; {hint}' if hint else ''}"
-
-
-def test_long_work_is_announced_and_short_work_is_not(capsys, tmp_path):
-    durations.announce(59.0, "the work")
-    assert capsys.readouterr().out == ""
-    durations.announce(600.0, "the work")
-    assert capsys.readouterr().out.startswith("the work takes about 10 min")
-    assert durations.in_words(4 * 3600) == "4 hours"
-    few, many = (durations.of_scenarios("rooms", count, workers=2) for count in (100, 10_000))
-    assert many == pytest.approx(100 * few)
-    bc, given = BCConfig(out=tmp_path), BCConfig(out=tmp_path, demos=(tmp_path,))
-    assert durations.of_training(bc, 2) > durations.of_training(given, 2) > 0
-    assert durations.of_training(PPOConfig(out=tmp_path), 2) > 600
-    assert durations.of_evaluation(["mine=expert", "clutter"], 200) > durations.of_evaluation(["clutter"], 200)
 
 
 def test_arguments_of_the_environment_are_json_or_text():

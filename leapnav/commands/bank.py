@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from leapnav.commands.options import Family, ParallelOptions, TaskOptions
-from leapnav.durations import SECONDS_PER_SECOND_OPINION, announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -64,7 +63,6 @@ class Build(TaskOptions, ParallelOptions):
                 for name, reason in bank.given.get(kind, {}).items():
                     print(f"{name}: {kind}: {reason}")
         else:
-            announce(of_scenarios(self.family, self.count, self.processes), "finding the optima")
             bank = build_bank(self.family, self.count, self.out, seed=self.seed, **self.task, **self.parallel)
         rejected = ", ".join(f"{count} rejected: {reason}" for reason, count in bank.rejected.items())
         kind = "sampled" if bank.given is None else "given"
@@ -134,7 +132,6 @@ class Verify(ParallelOptions):
 
         check_outputs(self.json)
         bank = _checked(self.file)
-        announce(SECONDS_PER_SECOND_OPINION * len(bank) / self.processes, "searching every scenario again")
         opinions = verify_bank(bank, **self.parallel)
         improved = [opinion for opinion in opinions if opinion.improvement > MIN_IMPROVEMENT]
         for opinion in improved:

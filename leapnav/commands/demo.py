@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from leapnav.durations import SECONDS_OF_DEMO, announce
 from leapnav.training.config import CloningConfig
 
 RESULTS = (
@@ -28,11 +27,6 @@ class Demo:
 
     def run(self) -> int:
         """Run the demo."""
-        from leapnav.commands.installation.compile import compile_missing
-
-        if not (self.out / "scores.json").exists():
-            announce(SECONDS_OF_DEMO, "the demo")
-        compile_missing()
         run_demo(self.out)
         return 0
 

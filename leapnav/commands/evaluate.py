@@ -17,7 +17,6 @@ from leapnav.commands.options import (
     Robot,
     parse_environment,
 )
-from leapnav.durations import announce, of_evaluation
 from leapnav.outputs import check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -91,8 +90,6 @@ class Evaluate(ParallelOptions):
             banks = [ScenarioBank(self.bank)]
         else:
             banks = default_banks(specs, self.family, self.split, self.robot, self.horizon, self.obstacles)
-        n_scenarios = sum(len(bank) if self.count is None else min(self.count, len(bank)) for bank in banks)
-        announce(of_evaluation(self.policies, n_scenarios), "the evaluation")
         comparison = compare_policies(specs, banks, count=self.count, seed=self.seed, **self.parallel)
         print_scores(comparison)
         if self.json is not None:

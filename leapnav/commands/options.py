@@ -67,11 +67,6 @@ class ParallelOptions:
         """The options as arguments of functions."""
         return {"workers": self.workers, "dask": self.dask}
 
-    @property
-    def processes(self) -> int:
-        """Number of processes on this machine, for estimates of the duration."""
-        return 1 if self.dask else max(self.workers, 1)
-
 
 def parse_environment(words: Sequence[str]) -> dict[str, Any] | None:
     """Return the arguments of an environment given as KEY=VALUE, with values in JSON or plain text; None without any.

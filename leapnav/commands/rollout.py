@@ -9,7 +9,6 @@ from typing import Literal
 import tyro
 
 from leapnav.commands.options import FamilyOrAll, ParallelOptions, TaskOptions
-from leapnav.durations import announce, of_scenarios
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 # Maximum deviation of a replay: other versions of the libraries may round the last digits differently.
@@ -48,9 +47,6 @@ class Rollout(TaskOptions, ParallelOptions):
         from leapnav.experts.data.demonstrations import dataset_id
         from leapnav.experts.data.rollouts import rollout
 
-        announce(
-            of_scenarios(self.family, self.count, self.processes) * (1 + self.recoveries / 4), "finding the optima"
-        )
         summary = rollout(
             self.family,
             self.count,

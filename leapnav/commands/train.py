@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from leapnav.durations import announce, of_training
 from leapnav.training.config import ALGORITHMS, BCConfig, DAggerRunConfig, PPOConfig, RunConfig, SACConfig, read_config
 
 if TYPE_CHECKING:
@@ -31,12 +30,9 @@ class TrainCommand:
 
     def run(self) -> int:
         """Train a policy and print its scores."""
-        config, workers = self.config, os.cpu_count() or 1
-        if not config.resume:
-            announce(of_training(config, workers), "this run")
         for evaluation in self._train():
             print(_describe(evaluation))
-        print(f"wrote {config.out} (next: leapnav evaluate {config.out} expert --html report.html)")
+        print(f"wrote {self.config.out} (next: leapnav evaluate {self.config.out} expert --html report.html)")
         return 0
 
     @property
