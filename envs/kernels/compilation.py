@@ -16,6 +16,9 @@ from leapnav.envs.kernels.decorator import DECLARATIONS
 from leapnav.envs.utils.progress import progress_bar
 
 MIN_KERNELS = 6  # for each process, whose start takes two seconds
+# Level of LLVM's optimisation. All kernels compile in 0.77 of the time of level 3, the default, and are as fast. At level
+# 1 they compile in 0.73 of the time, but the checks of proofs take 1.2 times as long.
+LLVM_LEVEL = "2"
 PAUSE = 0.1  # s, while other processes compile
 _FOUND: set[Any] = set()  # kernels that are known to be in the cache
 LABEL = "Compiling, once per installation"
@@ -39,7 +42,7 @@ def prepare(*kernels: Any, jobs: int | None = None) -> int:
     names = [f"{one.py_func.__module__}:{one.py_func.__qualname__}" for one in waiting]
     command = [sys.executable, "-P", "-c", WORK, *(name for name in names if name.startswith("leapnav."))]
     count = min(jobs or usable_cores(), math.ceil(len(waiting) / MIN_KERNELS)) if len(waiting) >= MIN_KERNELS else 0
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = {"NUMBA_OPT": LLVM_LEVEL, **os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     quiet = subprocess.DEVNULL
     helpers = [subprocess.Popen(command, stdout=quiet, stderr=quiet, env=environment) for _ in range(count)]
     try:
