@@ -40,10 +40,10 @@ class DemoSettings:
     training_seed: int = 1000
     recoveries: int = 4
     lidar_beams: int = 128
-    test_scenarios: int = 200
+    test_scenarios: int = 100
     workers: int = 2
-    # Two thirds of the default number of epochs, which takes a third off the longest step of the demo.
-    cloning: CloningConfig = field(default_factory=lambda: CloningConfig(epochs=8))
+    # Half of the default number of epochs, which takes half off the longest step of the demo.
+    cloning: CloningConfig = field(default_factory=lambda: CloningConfig(epochs=6))
 
 
 def run_demo(out: Path, settings: DemoSettings | None = None) -> None:
