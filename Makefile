@@ -12,7 +12,6 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
 # Without the tools of the developers, unless they are installed already.
 demo: $(if $(wildcard .venv/installed),.venv/installed,.venv/package)
-	$(BIN)/leapnav compile
 	$(BIN)/leapnav demo
 
 # Compiles what is not in the cache, on all cores.

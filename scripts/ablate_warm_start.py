@@ -49,8 +49,6 @@ def variants(clone: Path, demos: Path) -> dict[str, PPOConfig | SACConfig]:
         "PPO: actor; critic trained first": replace(full, start=CLONE_ONLY),
         "PPO: actor, critic": replace(full, start=WarmStartConfig(gradient=False)),
         "PPO: actor, critic, gradient": full,
-        "PPO: actor, critic, gradient; divergence 0.1": replace(full, divergence=0.1),
-        "PPO: actor, critic, gradient; jump-start 0.8": replace(full, jump_start=0.8),
         "SAC from scratch": SACConfig.tuned("clutter", total_timesteps=SAC_STEPS, lidar_beams=32, **intervals),
         "SAC: actor": replace(sac, start=CLONE_ONLY, demonstrations=0.0, imitation=0.0),
         "SAC: actor, critic, gradient": replace(sac, demonstrations=0.0, imitation=0.0),

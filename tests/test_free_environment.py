@@ -311,7 +311,7 @@ def test_dagger_and_a_warm_start_run(tmp_path):
     (evaluation,) = train_dagger(run, progress=False)
     assert len(evaluation.episodes) == 200
     demos = tmp_path / "dagger" / "demonstrations"
-    changes = {"warm_start": (demos, tmp_path / "dagger"), "total_timesteps": 512, "n_envs": 4, "jump_start": 0.5}
+    changes = {"warm_start": (demos, tmp_path / "dagger"), "total_timesteps": 512, "n_envs": 4}
     del common["family"]
     config = PPOConfig.tuned("open", out=tmp_path / "ppo", **common, **changes)
     (evaluation,) = train_ppo(config, progress=False)

@@ -213,10 +213,8 @@ def run(name, out, demos, resume):
 def warm(out, demos, **changes):
     start = WarmStartConfig(critic_epochs=1, slopes=100)
     extra = {
-        "divergence": 0.1,
         "critic_first": 0.2,
         "last_std": 0.1,
-        "jump_start": 0.5,
         "reward": "cost",
         "warm_start": (demos,),
         "cloning": QUICK,
@@ -304,14 +302,12 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
         ({"seed": -1}, r"seed: expected an integer from 0"),
         ({"family": "moon"}, r"family: expected one of .*got 'moon'"),
         ({"hidden": (0,)}, r"hidden: expected widths of at least 1"),
-        ({"jump_start": 3.0}, r"jump_start: expected a number in \[0, 1\], got 3.0"),
         ({"critic_first": 1.0}, r"critic_first: expected a number in \[0, 1\), got 1.0"),
         (
             {"last_std": 0.1, "ent_coef": 0.01},
             "ent_coef: expected 0, because last_std > 0 fixes the noise and its entropy, got 0.01",
         ),
         ({"lidar_beams": 7}, "lidar_beams: expected an even number >= 2, got 7"),
-        ({"divergence": 0.1}, r"divergence: expected 0 without a warm start of the actor .*, got 0.1"),
         ({"cloning": CloningConfig(epochs=0)}, r"cloning.epochs: expected a positive number, got 0"),
         ({"cloning": CloningConfig(seed=3)}, r"cloning.seed: expected 0, got 3; set the seed of the run"),
         ({"start": WarmStartConfig(slopes=0)}, r"start.slopes: expected a positive number, got 0"),
@@ -322,7 +318,6 @@ def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):
             {"levels": "uniform", "family": "all"},
             "level_bank: expected a bank for levels='uniform' of 'all'",
         ),
-        ({"levels": "max_mc", "jump_start": 0.5}, r"jump_start: expected 0 with levels='max_mc', got 0.5"),
     ],
 )
 def test_invalid_settings_are_reported_before_the_run_directory_is_created(changes, message, tmp_path):

@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from leapnav.envs import NavigateEnv, ScenarioBank, sample_scenario
+from leapnav.envs import NavigateEnv, sample_scenario
 from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import ExpertPolicy
 from leapnav.experts.data.rollouts import rollout
@@ -14,8 +14,7 @@ from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_vec_e
 from leapnav.training.config import WarmStartConfig
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.policies.actors import mean_action
-from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
-from leapnav.training.robots.jump_start import JumpStart
+from leapnav.training.policies.timed_noise import TimedNoisePolicy
 from leapnav.training.robots.rewards import ScaledReward
 
 
@@ -149,34 +148,9 @@ def test_without_values_for_the_critic_the_actor_is_not_changed(dataset):
     np.testing.assert_array_equal(model.policy.parameters_to_vector(), before)
 
 
-@pytest.mark.parametrize("quiet", [0.0, 10.0])
-def test_the_divergence_from_the_reference_is_that_of_two_gaussians(quiet):
-    env = NavigateEnv("open")
-    weights = {"divergence_weight": 2.0, "entropy_weight": 0.5, "quiet": quiet}
-    policy = KLRegularizedPolicy(env.observation_space, env.action_space, lambda _: 1e-3, **weights, **small())
-    observations = th.as_tensor(np.stack([env.reset(seed=seed)[0] for seed in range(5)]))
-    actions = th.zeros(5, 2)
-    policy.set_reference()
-    entropy = policy.get_distribution(observations).entropy()
-    assert th.allclose(policy.evaluate_actions(observations, actions)[2], 0.5 * entropy)
-    before = policy.get_distribution(observations).distribution
-    with th.no_grad():
-        policy.action_net.bias += 0.3
-        policy.log_std += 0.2
-    now = policy.get_distribution(observations).distribution
-    ratio, distance = (now.stddev / before.stddev).square(), (now.mean - before.mean) / before.stddev
-    divergence = 0.5 * (ratio - 1 - ratio.log() + distance.square()).sum(dim=1)
-    found = policy.evaluate_actions(observations, actions)[2]
-    assert th.allclose(found, 0.5 * now.entropy().sum(dim=1) - 2.0 * divergence, atol=1e-5)
-    assert policy.divergence == pytest.approx(divergence.mean().item(), rel=1e-5)
-    # The optimiser does not change the reference.
-    moved = {id(p) for group in policy.optimizer.param_groups for p in group["params"]}
-    assert not any(id(p) in moved for p in policy.reference_actor.parameters())
-
-
 def test_exploration_fades_before_the_horizon(tmp_path):
     env = NavigateEnv("open")
-    policy = KLRegularizedPolicy(
+    policy = TimedNoisePolicy(
         env.observation_space, env.action_space, lambda _: 1e-3, quiet=2.0, log_std_init=0.0, **small()
     )
     observations = th.as_tensor(np.stack([env.reset(seed=0)[0]] * 3))
@@ -188,64 +162,8 @@ def test_exploration_fades_before_the_horizon(tmp_path):
     assert th.allclose(likelihoods, again)
     assert values.shape == (3, 1)
     policy.save(tmp_path / "policy")
-    loaded = KLRegularizedPolicy.load(tmp_path / "policy")
+    loaded = TimedNoisePolicy.load(tmp_path / "policy")
     assert th.equal(loaded.get_distribution(observations).distribution.stddev, spread)
-
-
-def test_a_divergence_keeps_ppo_close_to_its_reference():
-    distances = []
-    for weight in (0.0, 10.0):
-        venv = make_vec_env(n_envs=4, family="open", seed=0)
-        kwargs = {**small(), "log_std_init": -1.0}
-        model = PPO(
-            KLRegularizedPolicy,
-            venv,
-            n_steps=64,
-            batch_size=64,
-            ent_coef=1.0,
-            learning_rate=1e-3,
-            policy_kwargs=kwargs,
-            seed=0,
-        )
-        model.policy.set_reference()
-        model.policy.divergence_weight = weight
-        model.learn(1024)
-        observations = th.as_tensor(venv.reset())
-        with th.no_grad():
-            distances.append(float(model.policy._divergence(observations).mean()))
-    assert distances[1] < 0.3 * distances[0]
-
-
-def test_a_jump_start_begins_on_the_optimum_with_the_time_that_is_left():
-    bank = ScenarioBank.shipped("open", "train")
-    robots = make_vec_env(n_envs=8, family="open", split="fresh", seed=0)
-    venv = JumpStart(robots, [bank], max_fraction=0.9, probability=1.0, seed=0)
-    venv.reset()
-    names = {bank[i].name: i for i in range(len(bank))}
-    jumped = 0
-    for _ in range(500):
-        observations, _, dones, _ = venv.step(np.zeros((8, 2), np.float32))
-        for i in np.flatnonzero(dones):
-            scenario = robots.get_attr("scenario")[i]
-            index = names[scenario.name]
-            reference = bank.reference(index)
-            gone = bank[index].horizon - scenario.horizon
-            at = np.interp(gone, reference.times, reference.states[:, 0])
-            assert scenario.start[0] == pytest.approx(at, abs=1e-3)
-            assert observations[i, 4] == pytest.approx(scenario.horizon, abs=1e-4)
-            jumped += gone > 0
-    assert jumped > 5
-
-
-def test_a_jump_start_fraction_of_zero_changes_nothing():
-    one = make_vec_env(n_envs=4, family="open", seed=0)
-    other = JumpStart(
-        make_vec_env(n_envs=4, family="open", seed=0), [ScenarioBank.shipped("open", "train")], max_fraction=0.0
-    )
-    np.testing.assert_array_equal(one.reset(), other.reset())
-    for _ in range(300):
-        found = [venv.step(np.zeros((4, 2), np.float32))[0] for venv in (one, other)]
-        np.testing.assert_array_equal(*found)
 
 
 def test_batches_hold_their_share_of_demonstrations(dataset):

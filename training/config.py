@@ -271,10 +271,6 @@ class _LearnerConfig(RunConfig):
     """Settings of the warm start; the seed is that of the run."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
     """Settings of the clone made by a warm start; the seed is that of the run."""
-    jump_start: float = 0.0
-    """Maximum fraction of an episode driven by the expert at the start of the run (linear decay to zero); 0: none."""
-    jump_start_until: float = 0.5
-    """Fraction of the run after which the expert does not drive."""
     evaluate_every: int = 200_000
     """Environment steps between evaluations."""
     checkpoint_every: int = 200_000
@@ -334,10 +330,6 @@ class PPOConfig(_LearnerConfig):
     """Time before the horizon at which the action noise starts to decrease, to 30 % of its standard deviation (s)."""
     critic_first: float = 0.0
     """Fraction of the run, from its start, in which only the critic learns."""
-    divergence: float = 0.0
-    """Initial weight of the divergence from the clone (linear decay to zero); 0: none."""
-    divergence_until: float = 0.5
-    """Fraction of the run after which the weight of the divergence is zero."""
 
 
 @dataclass(frozen=True, kw_only=True)

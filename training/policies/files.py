@@ -74,8 +74,7 @@ def save_policy(
             "trained with"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    # The reference of the KL divergence is part of the run, not of the policy.
-    weights = {name: value for name, value in policy.state_dict().items() if not name.startswith("reference_")}
+    weights = policy.state_dict()
     if half:
         weights = {name: value.half() for name, value in weights.items() if is_actor_weight(name)}
     # Torch stores the name of the file in the file; that of a buffer is always the same.

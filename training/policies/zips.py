@@ -34,12 +34,12 @@ KINDS: dict[str, tuple[str, list[int]]] = {
     "stable_baselines3.sac.policies": ("sac", [256, 256]),
     "stable_baselines3.td3.policies": ("td3", [400, 300]),
     "sb3_contrib.tqc.policies": ("tqc", [256, 256]),
-    "leapnav.training.policies.kl_regularized": ("actor-critic", [64, 64]),
+    "leapnav.training.policies.timed_noise": ("actor-critic", [64, 64]),
 }
 # Settings of the policy that do not change its deterministic action.
 IGNORED = frozenset({"log_std_init", "ortho_init", "optimizer_class", "optimizer_kwargs", "normalize_images"}) | {
     *("n_critics", "n_quantiles"),  # of the critics, which are not loaded
-    *("quiet", "entropy_weight", "divergence_weight"),  # of KLRegularizedPolicy
+    "quiet",  # of TimedNoisePolicy
 }
 ADVICE = "trust=True (--trust) loads it with Stable-Baselines3, which executes code from the file"
 

@@ -69,8 +69,6 @@ def _check_levels(config: PPOConfig) -> None:
     included = ScenarioBank.shipped_families(config.robot, config.horizon, config.obstacles, "train")
     if config.level_bank is None and config.family not in included:
         raise ValueError(f"level_bank: expected a bank for levels={config.levels!r} of {config.family!r}, got none")
-    if config.jump_start > 0:
-        raise ValueError(f"jump_start: expected 0 with levels={config.levels!r}, got {config.jump_start!r}")
 
 
 def _check_entropy_coefficient(name: str, value: Any) -> None:
@@ -117,8 +115,8 @@ _CHECKS: dict[str, Callable[[str, Any], object]] = {
     **dict.fromkeys(_COUNTS, partial(check_integer, minimum=1)),
     **dict.fromkeys(("learning_starts",), partial(check_integer, minimum=0)),
     **dict.fromkeys(("learning_rate", "reward_scale", "clip_range", "std", "control_period"), check_positive),
-    **dict.fromkeys(("divergence", "imitation", "penalty", "last_std", "quiet", "disturbance"), check_not_negative),
-    **dict.fromkeys(("jump_start", "jump_start_until", "divergence_until", "gamma", "gae_lambda"), check_fraction),
+    **dict.fromkeys(("imitation", "penalty", "last_std", "quiet", "disturbance"), check_not_negative),
+    **dict.fromkeys(("gamma", "gae_lambda"), check_fraction),
     **dict.fromkeys(("demonstrations", "critic_first"), partial(check_fraction, one=False)),
     "ent_coef": _check_entropy_coefficient,
 }

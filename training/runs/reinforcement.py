@@ -20,7 +20,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import families_of
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_choice
@@ -31,10 +30,9 @@ from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.learning.warm_start import warm_start
 from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
 from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
-from leapnav.training.policies.kl_regularized import KLRegularizedPolicy
 from leapnav.training.policies.momentum import MomentumSACPolicy
 from leapnav.training.policies.network import network
-from leapnav.training.robots.jump_start import JumpStart
+from leapnav.training.policies.timed_noise import TimedNoisePolicy
 from leapnav.training.robots.level_samplers import VALUE_SCORES, PrioritizedSampler, UniformSampler
 from leapnav.training.robots.level_scoring import LevelScoring
 from leapnav.training.robots.rewards import GradedMiss, ScaledReward
@@ -80,7 +78,7 @@ def train_ppo(
 
     def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
         return PPO(
-            KLRegularizedPolicy,
+            TimedNoisePolicy,
             venv,
             n_steps=config.n_steps,
             batch_size=config.batch_size,
@@ -89,11 +87,10 @@ def train_ppo(
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
             clip_range=config.clip_range,
-            ent_coef=1.0,  # the policy applies the weights of the entropy and of the divergence
+            ent_coef=config.ent_coef,
             policy_kwargs={
                 **network(config.hidden),
                 "log_std_init": math.log(config.std),
-                "entropy_weight": config.ent_coef,
                 "quiet": config.quiet,
                 "effort_weights": momentum_of(config),
             },
@@ -169,11 +166,6 @@ def _train(
     demos, start = _resolve_warm_start(config)
     if demos and config.reward != "cost":
         raise ValueError(f"reward: expected 'cost', the reward of demonstrations, got {config.reward!r}")
-    if isinstance(config, PPOConfig) and config.divergence > 0 and not (config.warm_start and config.start.actor):
-        raise ValueError(
-            f"divergence: expected 0 without a warm start of the actor (warm_start, start.actor), "
-            f"got {config.divergence!r}"
-        )
     dataset = Dataset.of(demos).observed(observed_settings(config)) if demos else None
     venv = make_training_env(config)
     if wrapper is not None:
@@ -248,10 +240,6 @@ def make_training_env(config: Config) -> VecEnv:
         **task,
     )
     venv: VecEnv = robots
-    if config.jump_start > 0:
-        kinds = config.robot, config.horizon, config.obstacles
-        banks = [ScenarioBank.shipped(family, "train", *kinds) for family in families_of(config.family)]
-        venv = JumpStart(robots, banks, config.jump_start, seed=config.seed)
     if config.graded_miss:
         venv = GradedMiss(venv)
     return ScaledReward(venv, config.reward_scale)
@@ -305,9 +293,8 @@ def _warm_start(
             reward_scale=config.reward_scale,
             progress=progress,
         )
-    if isinstance(config, PPOConfig) and isinstance(model.policy, KLRegularizedPolicy):
+    if isinstance(config, PPOConfig):
         set_noise(model.policy, config.std)
-        model.policy.set_reference()
 
 
 def _load_model(kind: Any, folder: Path, venv: VecEnv, dataset: Dataset | None, config: Config) -> BaseAlgorithm:
@@ -397,18 +384,13 @@ class _RunCallback(BaseCallback):
     def _apply_schedules(self, completed: float) -> None:
         """Set everything that depends on the completed fraction of the run."""
         config, policy = self._config, self.model.policy
-        if isinstance(config, PPOConfig) and isinstance(policy, KLRegularizedPolicy):
-            policy.divergence_weight = _linear_decay(config.divergence, config.divergence_until, completed)
-            self.logger.record("train/divergence", policy.divergence)
+        if isinstance(config, PPOConfig) and isinstance(policy, TimedNoisePolicy):
             for parameter in actor_parameters(policy):
                 parameter.requires_grad_(completed >= config.critic_first)
             policy.log_std.requires_grad_(completed >= config.critic_first and config.last_std == 0)
             if config.last_std > 0:
                 std = config.std + min(1.0, completed) * (config.last_std - config.std)
                 set_noise(policy, std)
-        for wrapper in _stateful_wrappers(self._venv):
-            if isinstance(wrapper, JumpStart):
-                wrapper.max_fraction = _linear_decay(config.jump_start, config.jump_start_until, completed)
 
     def save_checkpoint(self) -> None:
         """Replace the checkpoint."""
@@ -423,8 +405,3 @@ class _RunCallback(BaseCallback):
         with (folder / "robots.pkl").open("wb") as file:
             action_generator = self.model.action_space.np_random.bit_generator.state
             pickle.dump(([wrapper.state_dict() for wrapper in _stateful_wrappers(self._venv)], action_generator), file)
-
-
-def _linear_decay(initial: float, until: float, completed: float) -> float:
-    """Return a weight that decreases linearly to zero at the completed fraction `until` of the run."""
-    return initial * max(0.0, 1.0 - completed / until) if until > 0 else 0.0
