@@ -85,38 +85,12 @@ def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
     scenario = sample_scenario("open", 7)
     steps = np.arange(round(scenario.horizon / 0.05) + 1)
     states = np.array(scenario.start) * np.ones((len(steps), 1))
-    left = [
-        taken.scenario.horizon
-        for taken in Labeller(EnvironmentSettings(), DAggerConfig(), quick=True)._by_schedule(
-            driven(scenario, states), np.random.default_rng(0)
-        )
-    ]
+    labeller = Labeller(EnvironmentSettings(), DAggerConfig(), quick=True)
+    parts = labeller.label(driven(scenario, states), np.random.default_rng(0))
+    left = [Scenario.from_json(part.scenarios[0]).horizon for part in parts]
     assert left and left == sorted(left, reverse=True)
     assert not find_optimum(rest_of(driven(scenario, states), len(steps) - 25, 0.05)).success
     assert left[-1] > find_optimum(scenario).horizon / 4
-
-
-def test_takeovers_by_regret_are_where_the_cost_increases():
-    """No takeover along the optimum, some where the robot waits for seconds, and none without a near miss."""
-    scenario = sample_scenario("clutter", 7)
-    optimum = find_optimum(scenario)
-    times = np.arange(0.0, optimum.horizon + 1e-9, 0.05)
-    settings, config = EnvironmentSettings(), DAggerConfig(takeovers="regret", lead=0.5)
-    labeller, rng = Labeller(settings, config, quick=True), np.random.default_rng(0)
-    costs = optimum.cost - optimum.cost_to_go(times)
-    along = driven(scenario, optimum.evaluate(times)[0], success=True, costs=costs)
-    assert labeller.label(along, rng) == []
-    # The robot follows the optimum for 3 s, waits for 4 s, and misses the goal.
-    moved = np.minimum(times, np.where(times < 7.0, 3.0, times - 4.0))
-    waiting = driven(scenario, optimum.evaluate(moved)[0], costs=optimum.cost - optimum.cost_to_go(moved))
-    taken = labeller.label(waiting, rng)
-    assert taken and all(len(samples) == 10 for samples in taken)
-    starts = [Scenario.from_json(samples.scenarios[0]).horizon for samples in taken]
-    assert scenario.horizon - max(starts) > 0.0
-    for samples in taken:
-        rest = Scenario.from_json(samples.scenarios[0])
-        assert find_optimum(rest).cost == pytest.approx(-samples.returns[0], rel=1e-6)
-        assert samples.rewards.sum() == pytest.approx(samples.returns[0] + find_optimum(rest).cost_to_go(0.5), rel=1e-6)
 
 
 def test_dagger_is_the_same_with_any_number_of_workers(env, monkeypatch):

@@ -1,4 +1,4 @@
-"""Policies with memory: stacked observations and an LSTM."""
+"""Policies with a memory of stacked observations."""
 
 import json
 from dataclasses import replace
@@ -33,10 +33,8 @@ from leapnav.training.policies.actors import copy_actor
 from leapnav.training.policies.memory import LAGS, history_length, stack_frames
 from leapnav.training.policies.onnx_export import export_onnx
 
-KINDS = ("stack", "lstm")
 
-
-def with_memory(env, kind, seed=0):
+def with_memory(env, kind="stack", seed=0):
     return make_policy(env.observation_space, env.action_space, seed, SMALL, memory=kind)
 
 
@@ -59,9 +57,8 @@ def act(policy, observations, starts=None):
     return np.array(actions)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_memory_begins_again_with_each_episode(kind, env):
-    policy = with_memory(env, kind)
+def test_the_memory_begins_again_with_each_episode(env):
+    policy = with_memory(env)
     one, other, third = (observed(env, seed, 70) for seed in range(3))
     alone = [act(policy, episode) for episode in (one, other, third)]
     # The second robot begins its third episode after 30 steps of the second.
@@ -76,10 +73,9 @@ def test_the_memory_begins_again_with_each_episode(kind, env):
     assert np.abs(without - alone[0]).max() > 1e-3  # the memory matters
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_policy_learns_from_what_it_observes_while_driving(kind, env, dataset):
+def test_a_policy_learns_from_what_it_observes_while_driving(env, dataset):
     """The inputs of a fit are those with which `predict` computes actions, also where only later steps have labels."""
-    policy = with_memory(env, kind)
+    policy = with_memory(env)
     episodes = dataset[np.isin(dataset.episodes, (3, 4, 5))]
     unlabelled = episodes.episodes == 4
     unlabelled[np.flatnonzero(unlabelled)[-20:]] = False
@@ -114,17 +110,15 @@ def test_the_displacements_are_those_of_the_robot():
         assert found[:, k] == pytest.approx([ahead / 2, left / 2, np.sin(turned), np.cos(turned) - 1], abs=1e-4)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_policy_is_fitted_with_the_symmetries(kind, env, dataset):
-    policy = with_memory(env, kind)
+def test_a_policy_is_fitted_with_the_symmetries(env, dataset):
+    policy = with_memory(env)
     losses = behaviour_clone(policy, dataset, replace(QUICK, epochs=6), progress=False)
     assert losses[-1].training < 0.7 * losses[0].training
     assert losses[-1].validation < 1.0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_schedule_of_a_fit_has_as_many_steps_as_there_are_batches(kind, env, dataset):
-    fit = Cloning(with_memory(env, kind), dataset, replace(QUICK, batch_size=150))
+def test_the_schedule_of_a_fit_has_as_many_steps_as_there_are_batches(env, dataset):
+    fit = Cloning(with_memory(env), dataset, replace(QUICK, batch_size=150))
     batches = []
     fit.run_epoch(lambda: batches.append(1))
     assert len(batches) == fit.batches
@@ -140,9 +134,8 @@ def test_a_policy_with_stacked_frames_is_loaded_by_stable_baselines(env, tmp_pat
 
 
 @pytest.mark.parametrize("half", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_policy_with_memory_is_saved_and_exported(kind, half, env, tmp_path):
-    policy = with_memory(env, kind)
+def test_a_policy_with_memory_is_saved_and_exported(half, env, tmp_path):
+    policy = with_memory(env)
     save_policy(policy, tmp_path / "policy", half=half)
     loaded = load_policy(tmp_path / "policy", env)
     assert type(loaded) is type(policy) and policy_environment(tmp_path / "policy")["lidar_beams"] == 32
@@ -151,13 +144,9 @@ def test_a_policy_with_memory_is_saved_and_exported(kind, half, env, tmp_path):
     np.testing.assert_allclose(expected, act(policy, observations), atol=1e-2 if half else 1e-6)
     described = json.loads(export_onnx(loaded, tmp_path / "policy.onnx").read_text())
     session = InferenceSession(str(tmp_path / "policy.onnx"))
-    states = {
-        name: np.zeros((1, *described[name]["shape"][1:]), np.float32)
-        for name in (("history",) if kind == "stack" else ("hidden", "cell"))
-    }
-    if kind == "stack":
-        assert described["history"]["start"] == "the first observation in every row"
-        states["history"][:] = observations[0]
+    states = {"history": np.zeros((1, *described["history"]["shape"][1:]), np.float32)}
+    assert described["history"]["start"] == "the first observation in every row"
+    states["history"][:] = observations[0]
     names = ["action", *(described[name]["next"] for name in states)]
     for observation, action in zip(observations, expected, strict=True):
         found, *following = session.run(names, {"observation": observation[None], **states})
@@ -165,12 +154,11 @@ def test_a_policy_with_memory_is_saved_and_exported(kind, half, env, tmp_path):
         states = dict(zip(states, following, strict=True))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_learners_history_precedes_each_takeover(kind, env):
+def test_the_learners_history_precedes_each_takeover(env):
     scenario = sample_scenario("clutter", 7)
     poses = np.linspace(scenario.start, scenario.goal, 121)
     episode = DrivenEpisode(scenario, poses, np.zeros(len(poses)), False, True)
-    settings, length = EnvironmentSettings(), history_length(with_memory(env, kind))
+    settings, length = EnvironmentSettings(), history_length(with_memory(env))
     labelled = Labeller(settings, DAggerConfig(lead=1.0), quick=True, history=length)
     plain = Labeller(settings, DAggerConfig(lead=1.0), quick=True)
     parts, without = (one.label(episode, np.random.default_rng(0)) for one in (labelled, plain))
@@ -186,9 +174,8 @@ def test_the_learners_history_precedes_each_takeover(kind, env):
         assert np.isnan(part.returns[:before]).all() and (part.episodes == 0).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_dagger_aggregates_for_a_policy_with_memory(kind, env, dataset, tmp_path):
-    policy = with_memory(env, kind)
+def test_dagger_aggregates_for_a_policy_with_memory(env, dataset, tmp_path):
+    policy = with_memory(env)
     behaviour_clone(policy, dataset, QUICK, progress=False)
     venv = make_vec_env(n_envs=4, family="open", split="fresh")
     from leapnav.experts import ExpertPolicy
@@ -214,9 +201,9 @@ def test_runs_with_memory(tmp_path, capsys):
 
 
 def test_what_has_no_memory_is_refused(env):
-    with pytest.raises(ValueError, match="memory: expected one of none, stack, lstm, got 'gru'"):
+    with pytest.raises(ValueError, match="memory: expected one of none, stack, got 'gru'"):
         with_memory(env, "gru")
-    with pytest.raises(ValueError, match="memory: expected 'none' for a policy with momentum, got 'lstm'"):
-        make_policy(env.observation_space, env.action_space, effort_weights=(1.0, 1.0), memory="lstm")
+    with pytest.raises(ValueError, match="memory: expected 'none' for a policy with momentum, got 'stack'"):
+        make_policy(env.observation_space, env.action_space, effort_weights=(1.0, 1.0), memory="stack")
     with pytest.raises(ValueError, match="policy: expected the memory 'none', got 'stack'"):
         copy_actor(with_memory(env, "stack"), with_memory(env, "none"))

@@ -26,7 +26,7 @@ HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
-MemoryName = Literal["none", "stack", "lstm"]
+MemoryName = Literal["none", "stack"]
 TEST_BANK = "test.bank"  # file in the directory of a run of a family without an included bank
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
@@ -82,12 +82,6 @@ class DAggerConfig:
     """Maximum number of episodes per round."""
     successes: float = 1.0
     """Successful episodes with one takeover each, per failed episode."""
-    takeovers: Literal["schedule", "regret"] = "schedule"
-    """Where the expert takes over: "schedule": at fixed times before a failure and at random times of successful
-    episodes; "regret": where the cost so far plus the optimal cost to go has increased by more than the threshold, or
-    will within 3 s, in failed episodes and in successful ones that were near misses."""
-    regret_threshold: float = 0.3
-    """Regret that is large enough for a takeover, in the unit of the cost."""
     lead: float = 3.0
     """Time that the expert drives after a takeover (s)."""
     epochs: int = 2
@@ -213,8 +207,7 @@ class _ImitationConfig(RunConfig):
     """Settings shared by the runs of imitation learning."""
 
     memory: MemoryName = "none"
-    """Memory of the policy: of the observations 0.4, 1.2 and 2.8 s ago ("stack"), or an LSTM as the first hidden layer
-    ("lstm", with the extra `contrib`)."""
+    """Memory of the policy: none, or of the observations 0.4, 1.2 and 2.8 s ago ("stack")."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ class DemoSettings:
     lidar_beams: int = 128
     test_scenarios: int = 100
     workers: int = 2
-    # Half of the default number of epochs, which takes half off the longest step of the demo.
+    # Half of the default number: the fit is the longest step of the demo.
     cloning: CloningConfig = field(default_factory=lambda: CloningConfig(epochs=6))
 
 

@@ -84,9 +84,9 @@ def default_configurations() -> dict[str, RunConfig]:
 
 
 def probes() -> dict[str, RunConfig]:
-    """Return default configurations that show, after a command line has been parsed, what it contains.
+    """Return default configurations with which a command line is parsed first, to find the settings that it contains.
 
-    The observation is not lidar, and the warm start is `NOT_GIVEN`; they are these values only if they are not given.
+    With these defaults, the observation is lidar, and the warm start not `NOT_GIVEN`, only if the command line says so.
     """
     found: dict[str, Any] = default_configurations()
     for name, config in found.items():

@@ -25,13 +25,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.progress import advance, progress_bar, stop_early
-from leapnav.envs.utils.validation import check_at_least, check_choice, check_not_negative, check_positive
+from leapnav.envs.utils.validation import check_at_least, check_not_negative, check_positive
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.config import CloningConfig, DAggerConfig
 from leapnav.training.learning.cloning import Cloning, check_observations
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.driving import DrivenEpisode, drive_episodes
-from leapnav.training.learning.takeovers import TAKEOVERS, Labeller, label_episodes
+from leapnav.training.learning.takeovers import Labeller, label_episodes
 from leapnav.training.policies.actors import policy_of
 from leapnav.training.policies.memory import history_length
 from leapnav.training.robots.vec_env import NavigateVecEnv
@@ -270,7 +270,6 @@ def check_dagger(config: DAggerConfig) -> None:
     """Raise ValueError unless the settings of DAgger are valid; the message names the setting and its value."""
     for name in ("rounds", "max_failures", "max_episodes", "epochs", "last_epochs"):
         check_at_least(name, getattr(config, name), 1)
-    check_choice("takeovers", config.takeovers, TAKEOVERS)
     check_not_negative("successes", config.successes)
-    for name in ("learning_rate", "lead", "regret_threshold"):
+    for name in ("learning_rate", "lead"):
         check_positive(name, getattr(config, name))

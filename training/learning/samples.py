@@ -1,4 +1,4 @@
-"""The samples of a dataset as the inputs of a policy: single observations, stacked observations, or sequences."""
+"""The samples of a dataset as the inputs of a policy: single or stacked observations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from leapnav.training.policies.actors import mean_action
 from leapnav.training.policies.memory import LAGS, memory_of
 
 SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
-SORTED_BATCHES = 16  # batches among which sequences are exchanged, such that those of a batch have similar lengths
 
 Symmetry = Callable[..., tuple[th.Tensor, th.Tensor]]
 
@@ -28,10 +27,9 @@ class Batch:
     """Samples as tensors.
 
     Attributes:
-        observations: input of `mean_action`: (B, d), stacked (B, k d), or sequences (S, T, d).
+        observations: input of `mean_action`: (B, d), or stacked (B, k d).
         actions (B, m): the expert's actions.
         slopes, weights (B, m): see `action_slopes`; cost weights of the actions.
-        labelled (S, T): the steps of the sequences that have the B actions; None if there are no sequences.
 
     """
 
@@ -39,15 +37,13 @@ class Batch:
     actions: th.Tensor
     slopes: th.Tensor
     weights: th.Tensor
-    labelled: th.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.actions)
 
     def actions_of(self, policy: BasePolicy) -> th.Tensor:
         """Compute the mean actions (B, m) of a policy, with gradients."""
-        actions = mean_action(policy, self.observations)
-        return actions if self.labelled is None else actions[self.labelled]
+        return mean_action(policy, self.observations)
 
 
 class Samples:
@@ -125,47 +121,9 @@ class StackedSamples(Samples):
         return Batch(observations.reshape(len(chosen), -1), *columns)
 
 
-class Sequences(Samples):
-    """Samples for a policy with an LSTM: whole episodes, of which some steps have labels."""
-
-    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
-        super().__init__(dataset, chosen, device)
-        starts, lengths = _sequences(dataset)
-        self._labelled = th.as_tensor(dataset.labelled, device=device)
-        kept = chosen[starts] & (np.add.reduceat(dataset.labelled, starts) > 0)
-        self._starts, self._lengths = (th.as_tensor(values[kept], device=device) for values in (starts, lengths))
-
-    def _size(self, size: int) -> int:
-        """Return how many sequences have about `size` labels."""
-        return max(1, round(size * len(self._starts) / max(1, len(self))))
-
-    def n_batches(self, size: int) -> int:  # noqa: D102 (see `Samples`)
-        return math.ceil(len(self._starts) / self._size(size))
-
-    def shuffled(self, size: int, rng: th.Generator) -> Iterator[th.Tensor]:  # noqa: D102 (see `Samples`)
-        per_batch, batches = self._size(size), []
-        for portion in th.randperm(len(self._starts), generator=rng).split(SORTED_BATCHES * per_batch):
-            batches += portion[self._lengths[portion].argsort(stable=True)].split(per_batch)
-        for k in th.randperm(len(batches), generator=rng).tolist():
-            yield batches[k]
-
-    def in_order(self, size: int) -> Iterator[th.Tensor]:  # noqa: D102 (see `Samples`)
-        yield from th.arange(len(self._starts)).split(self._size(size))
-
-    def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:  # noqa: D102 (see `Samples`)
-        starts, lengths = self._starts[chosen], self._lengths[chosen]
-        steps = th.arange(int(lengths.max()), device=starts.device)
-        exists = steps < lengths[:, None]
-        rows = starts[:, None] + th.minimum(steps, lengths[:, None] - 1)  # the last step fills the shorter ones
-        labelled = exists & self._labelled[rows]
-        observations = self._observations[rows.flatten()]
-        observations, *columns = self._transformed(rows[labelled], observations, symmetries)
-        return Batch(observations.reshape(*rows.shape, -1), *columns, labelled=labelled)
-
-
 def samples_class(policy: BasePolicy) -> type[Samples]:
     """Return the class of the samples for a policy."""
-    return {"none": Samples, "stack": StackedSamples, "lstm": Sequences}[memory_of(policy)]
+    return {"none": Samples, "stack": StackedSamples}[memory_of(policy)]
 
 
 def _sequences(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:

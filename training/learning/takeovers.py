@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -20,16 +19,13 @@ from leapnav.training.config import DAggerConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.driving import DrivenEpisode
 
-TAKEOVERS = ("schedule", "regret")
-# Times of the scheduled takeovers before a collision (s), denser shortly before it. In an episode that misses its goal
+# Times of the takeovers before a collision (s), denser shortly before it. In an episode that misses its goal
 # the number of takeovers is the same, at uniformly distributed times. With a free horizon, a robot that misses its goal
 # has mostly stopped, between two paths of similar cost: the times are then those before a time shortly after the stop.
 TAKEOVER_TIMES = np.array([8.0, 6.5, 5.0, 4.0, 3.25, 2.5, 2.0, 1.5, 1.1, 0.8, 0.5, 0.3])
 STOP_DISTANCE, AFTER_STOP = 0.1, 0.6  # m (and rad) from the last state; s
 RELATIVE_SPREAD = 0.2  # half-width of the random factor of these times around 1
 MIN_TIME_LEFT = 1.0  # s before the horizon, after which the expert does not take over
-SEARCH_INTERVAL = 0.75  # s between the states at which the regret is computed
-REGRET_WINDOW = 3.0  # s in which the regret is accumulated
 
 
 class Takeover(NamedTuple):
@@ -56,9 +52,14 @@ class Labeller:
         self._observer = Observer(settings)
 
     def label(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Dataset]:
-        """Return the samples of the takeovers of an episode, in order of time."""
-        choose = self._by_regret if self._config.takeovers == "regret" else self._by_schedule
-        return [self._samples(episode, taken) for taken in choose(episode, rng)]
+        """Return the samples of the takeovers in order of time, up to the first one without an optimum."""
+        found = []
+        for step in scheduled_steps(episode, self._settings.control_period, rng):
+            taken = self._search(episode, step)
+            if taken is None:
+                break
+            found.append(self._samples(episode, taken))
+        return found
 
     def _samples(self, episode: DrivenEpisode, taken: Takeover) -> Dataset:
         """Return the samples of a takeover, after those of the learner's states before it."""
@@ -78,48 +79,6 @@ class Labeller:
             return None
         optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
         return Takeover(step, scenario, optimum) if optimum.success else None
-
-    def _by_schedule(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Takeover]:
-        """Return the takeovers at the scheduled times, until the first one without an optimum."""
-        chosen = []
-        for step in scheduled_steps(episode, self._settings.control_period, rng):
-            found = self._search(episode, step)
-            if found is None:
-                break
-            chosen.append(found)
-        return chosen
-
-    def _by_regret(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Takeover]:
-        """Return the takeovers where the regret of the following or the previous decisions exceeds the threshold.
-
-        If the goal cannot be reached any more, the last decisions before count as such, also without regret before.
-        """
-        period, threshold = self._settings.control_period, self._config.regret_threshold
-        every = max(1, round(SEARCH_INTERVAL / period))
-        steps = range(int(rng.integers(1, every + 1)), len(episode.states) - 1, every)
-        if episode.success:  # a near miss, or not: the regret of the whole episode
-            first = self._search(episode, 0)
-            if first is None or episode.costs[-1] - first.optimum.cost <= threshold:
-                return []
-        found: list[Takeover] = []
-        for step in steps:
-            searched = self._search(episode, step)
-            if searched is None:
-                break
-            found.append(searched)
-        values = np.array([episode.costs[taken.step] + taken.optimum.cost for taken in found])
-        window = max(1, round(REGRET_WINDOW / SEARCH_INTERVAL))
-        chosen = []
-        # The cost so far plus the optimal cost to go increases by the regret. If the goal cannot be reached any more,
-        # the last decisions have an infinite regret.
-        lost = math.inf if not episode.success else episode.costs[-1]
-        following = np.append(values, [lost] * window)
-        for k, searched in enumerate(found):
-            ahead = following[k + 1 : k + 1 + window].max() - values[k]
-            behind = values[k] - values[max(0, k - window) : k + 1].min()
-            if max(ahead, behind) > threshold:
-                chosen.append(searched)
-        return chosen
 
 
 def scheduled_steps(episode: DrivenEpisode, period: float, rng: np.random.Generator) -> list[int]:

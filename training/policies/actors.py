@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import nn
 
-from leapnav.training.policies.memory import is_recurrent, memory_of, recurrent_actions
+from leapnav.training.policies.memory import memory_of
 from leapnav.training.policies.network import NavigationFeatures
 
 
@@ -36,8 +36,7 @@ def _actor(policy: BasePolicy) -> Any:
 def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
     """Return the parameters of the actor: of an on-policy algorithm those of the mean action, without the noise."""
     if isinstance(policy, ActorCriticPolicy):
-        memory = [cast(Any, policy).lstm_actor] if is_recurrent(policy) else []
-        modules = policy.pi_features_extractor, *memory, policy.mlp_extractor.policy_net, policy.action_net
+        modules = policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net
         return [parameter for module in modules for parameter in module.parameters()]
     return list(_actor(policy).parameters())
 
@@ -47,15 +46,12 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
 
     Args:
         policy: the policy.
-        observations: (B, d); for a policy with stacked frames (B, k d); for one with an LSTM sequences (S, T, d) from
-            the start of an episode on.
+        observations: (B, d); for a policy with stacked frames (B, k d).
 
     Returns:
-        The actions (B, m) or (S, T, m).
+        The actions (B, m).
 
     """
-    if is_recurrent(policy):
-        return recurrent_actions(policy, observations)
     if isinstance(policy, ActorCriticPolicy):
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
         return policy.action_net(policy.mlp_extractor.forward_actor(features))

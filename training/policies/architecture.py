@@ -15,13 +15,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from leapnav.envs.utils.validation import check_choice
-from leapnav.training.policies.memory import (
-    MEMORIES,
-    FrameStackPolicy,
-    memory_of,
-    recurrent_arguments,
-    recurrent_policy_class,
-)
+from leapnav.training.policies.memory import MEMORIES, FrameStackPolicy, memory_of
 from leapnav.training.policies.momentum import MomentumPolicy, MomentumSACPolicy
 from leapnav.training.policies.network import NavigationFeatures, check_spaces
 
@@ -40,7 +34,7 @@ class Architecture:
         extractor: "navigation" (`NavigationFeatures`) or "flatten" (the observation itself).
         activation: name of the activation function in `torch.nn`.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`, or None.
-        memory: "none", "stack" or "lstm", see `leapnav.training.policies.memory`.
+        memory: "none" or "stack", see `leapnav.training.policies.memory`.
 
     """
 
@@ -56,7 +50,7 @@ class Architecture:
         """Create an untrained policy on the CPU.
 
         Raises:
-            ModuleNotFoundError: a TQC policy or one with an LSTM needs the extra `contrib`.
+            ModuleNotFoundError: a TQC policy needs the extra `contrib`.
             ValueError: an attribute is unknown, or the spaces do not fit the extractor.
 
         """
@@ -71,16 +65,12 @@ class Architecture:
             "activation_fn": ACTIVATIONS[self.activation],
             "features_extractor_class": EXTRACTORS[self.extractor],
         }
-        if self.memory == "lstm":
-            arguments |= recurrent_arguments(self.hidden, self.critic)
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
         return self._policy_class()(observation_space, action_space, lambda _: 3e-4, **arguments)
 
     def _policy_class(self) -> Any:
         """Return the class of the policy."""
-        if self.memory == "lstm":
-            return recurrent_policy_class()
         if self.memory == "stack":
             return FrameStackPolicy
         return _policy_class(self.kind, has_momentum=self.effort_weights is not None)
@@ -109,8 +99,6 @@ class Architecture:
         if getattr(given, "use_sde", False):
             raise ValueError("model: expected a policy without state-dependent exploration, got use_sde=True")
         hidden, critic = widths(given.net_arch)
-        if memory == "lstm":
-            hidden, critic = ((given.lstm_actor.hidden_size, *rest) for rest in (hidden, critic))
         return cls(kind, hidden, critic, extractor, activation, getattr(given, "effort_weights", None), memory)
 
 
@@ -131,7 +119,7 @@ def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 def is_actor_weight(name: str) -> bool:
     """Return whether a weight belongs to the mean action or its noise."""
-    return name.startswith(("actor.", "lstm_actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))
+    return name.startswith(("actor.", "mlp_extractor.policy_net.", "action_net.", "log_std"))
 
 
 def _name_of(what: str, known: Mapping[str, type], value: object) -> str:

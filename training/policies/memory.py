@@ -1,4 +1,4 @@
-"""Policies with memory: of earlier observations (frame stacking), or of an LSTM.
+"""Policies with memory: of earlier observations (frame stacking).
 
 What the lidar does not show now may have been visible before: the other side of a wall, or the way from which the robot
 has come. A policy with memory carries it in the `state` of `predict`, as the recurrent policies of sb3-contrib do.
@@ -6,7 +6,6 @@ has come. A policy with memory carries it in the `state` of `predict`, as the re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -14,32 +13,21 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from torch import nn
 
-MEMORIES = ("none", "stack", "lstm")
+MEMORIES = ("none", "stack")
 # Ages of the earlier observations in the input of a network with stacked frames (control periods), newest first: 0.4,
 # 1.2 and 2.8 s at the default control period of 0.05 s.
 LAGS = (8, 24, 56)
-WHOLE_EPISODE = 1_000_000  # more control periods than an episode has
 
 
 def history_length(policy: BasePolicy) -> int:
     """Return the number of earlier observations on which the action of a policy can depend."""
-    if isinstance(policy, FrameStackPolicy):
-        return max(LAGS)
-    return WHOLE_EPISODE if is_recurrent(policy) else 0
-
-
-def is_recurrent(policy: BasePolicy) -> bool:
-    """Return whether a policy has an LSTM, as those of sb3-contrib."""
-    return isinstance(getattr(policy, "lstm_actor", None), nn.LSTM)
+    return max(LAGS) if isinstance(policy, FrameStackPolicy) else 0
 
 
 def memory_of(policy: BasePolicy) -> str:
     """Return the kind of the memory of a policy, one of `MEMORIES`."""
-    if isinstance(policy, FrameStackPolicy):
-        return "stack"
-    return "lstm" if is_recurrent(policy) else "none"
+    return "stack" if isinstance(policy, FrameStackPolicy) else "none"
 
 
 class StackedFeatures(BaseFeaturesExtractor):
@@ -171,60 +159,3 @@ def next_history(current: Any, history: Any) -> Any:
     """Return the history (N, H, d), oldest first, with the current observations (N, 1, d)."""
     concatenate = th.cat if isinstance(current, th.Tensor) else np.concatenate
     return concatenate([history[:, 1:], current], 1)
-
-
-def recurrent_policy_class() -> Any:
-    """Return the class of the policies with an LSTM.
-
-    Raises:
-        ModuleNotFoundError: the extra `contrib` is not installed.
-
-    """
-    try:
-        from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError('an LSTM needs sb3-contrib: pip install "leapnav[contrib]"') from None
-    return RecurrentActorCriticPolicy
-
-
-def recurrent_arguments(hidden: Sequence[int], critic: Sequence[int]) -> dict[str, Any]:
-    """Return the arguments of a recurrent policy whose first hidden layer is an LSTM.
-
-    The critic has no memory; sb3-contrib gives its first layer the width of the LSTM.
-    """
-    return {
-        "lstm_hidden_size": hidden[0],
-        "enable_critic_lstm": False,
-        "net_arch": {"pi": list(hidden[1:]), "vf": list(critic[1:])},
-    }
-
-
-def recurrent_actions(policy: Any, observations: th.Tensor) -> th.Tensor:
-    """Compute the mean actions (S, T, m) of a recurrent policy for sequences (S, T, d) from their first step on."""
-    features = policy.pi_features_extractor(observations.flatten(0, 1)).unflatten(0, observations.shape[:2])
-    outputs, _ = policy.lstm_actor(features.transpose(0, 1))
-    return policy.action_net(policy.mlp_extractor.forward_actor(outputs.transpose(0, 1)))
-
-
-def recurrent_step(
-    policy: Any, observations: th.Tensor, hidden: th.Tensor, cell: th.Tensor
-) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """Compute the mean actions (N, m) and the next states (N, h) of a recurrent policy, without `torch.nn.LSTM`.
-
-    Its operator has no counterpart in ONNX with a variable number of robots; these elementary operations have.
-
-    Args:
-        policy: the policy.
-        observations: (N, d).
-        hidden, cell: (N, h), states of the LSTM, zeros at the start of an episode.
-
-    """
-    lstm = policy.lstm_actor
-    features = policy.pi_features_extractor(observations)
-    gates = nn.functional.linear(features, lstm.weight_ih_l0, lstm.bias_ih_l0)
-    gates = gates + nn.functional.linear(hidden, lstm.weight_hh_l0, lstm.bias_hh_l0)
-    inputs, forget, candidate, output = gates.chunk(4, dim=1)
-    cell_now = th.sigmoid(forget) * cell + th.sigmoid(inputs) * th.tanh(candidate)
-    hidden_now = th.sigmoid(output) * th.tanh(cell_now)
-    actions = policy.action_net(policy.mlp_extractor.forward_actor(hidden_now))
-    return actions, hidden_now, cell_now

@@ -14,12 +14,7 @@ from torch import nn
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, parts_of
 from leapnav.envs.utils.validation import check_choice
 from leapnav.experts.data.demonstrations import ENVIRONMENT
-from leapnav.training.policies.memory import (
-    MEMORIES,
-    FrameStackPolicy,
-    recurrent_arguments,
-    recurrent_policy_class,
-)
+from leapnav.training.policies.memory import MEMORIES, FrameStackPolicy
 from leapnav.training.policies.momentum import MomentumPolicy
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
@@ -207,11 +202,9 @@ def make_policy(
         hidden: widths of the actor's hidden layers.
         critic: widths of the critic's hidden layers; None: those of the actor.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`; None: without.
-        memory: "none"; "stack", of earlier observations; or "lstm", whose first hidden layer is an LSTM. See
-            `leapnav.training.policies.memory`.
+        memory: "none", or "stack", of earlier observations; see `leapnav.training.policies.memory`.
 
     Raises:
-        ModuleNotFoundError: an LSTM needs the extra `contrib`.
         ValueError: the spaces are not those of the environment with a lidar, or `memory` is unknown or combined with
             momentum.
 
@@ -226,9 +219,6 @@ def make_policy(
         kind, arguments = MomentumPolicy, {**arguments, "effort_weights": effort_weights}
     elif memory == "stack":
         kind = FrameStackPolicy
-    elif memory == "lstm":
-        kind = recurrent_policy_class()
-        arguments |= recurrent_arguments(hidden, hidden if critic is None else critic)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         return kind(observation_space, action_space, lr_schedule=lambda _: 3e-4, log_std_init=-2.0, **arguments)

@@ -24,7 +24,7 @@ from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.training.policies.actors import mean_action, policy_of
 from leapnav.training.policies.files import load_policy, policy_environment
-from leapnav.training.policies.memory import LAGS, memory_of, next_history, recurrent_step, stack_frames
+from leapnav.training.policies.memory import LAGS, memory_of, next_history, stack_frames
 from leapnav.training.policies.momentum import add_momentum
 
 INPUT, OUTPUT = "observation", "action"
@@ -99,28 +99,11 @@ class _StackedActor(_Actor):
         return self.action(stack_frames(current, history)), next_history(current, history)
 
 
-class _RecurrentActor(_Actor):
-    """The action of a policy with an LSTM, and its next states."""
-
-    outputs = (OUTPUT, "next_hidden", "next_cell")
-
-    def __init__(self, policy: BasePolicy) -> None:
-        super().__init__(policy)
-        width = self.policy.lstm_actor.hidden_size
-        self.states = {"hidden": (width,), "cell": (width,)}
-
-    def forward(
-        self, observation: th.Tensor, hidden: th.Tensor, cell: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        action, hidden, cell = recurrent_step(self.policy, observation, hidden, cell)
-        return action.clamp(-1.0, 1.0), hidden, cell
-
-
 def _actor(policy: BasePolicy) -> _Actor:
     """Return the module to export."""
     if getattr(policy, "effort_weights", None) is not None:
         return _MomentumActor(policy)
-    return {"none": _PlainActor, "stack": _StackedActor, "lstm": _RecurrentActor}[memory_of(policy)](policy)
+    return {"none": _PlainActor, "stack": _StackedActor}[memory_of(policy)](policy)
 
 
 def export_onnx(
