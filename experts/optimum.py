@@ -10,8 +10,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from leapnav.envs.kernels import prepare
+from leapnav.envs.kernels.compilation import GENERATED
 from leapnav.envs.kernels.decorator import kernels_of
-from leapnav.envs.robots import Unicycle
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
@@ -32,6 +33,7 @@ from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 from leapnav.experts.solve import solve
+from leapnav.experts.transcription.direct import generated_functions
 
 # Factor of the number of candidates for a robot that cannot rotate in place: the costs of its lattice paths differ from
 # those of the extremals by up to 20 %. Of 400 test scenarios of the car, 13 optima would be missed without this factor,
@@ -109,7 +111,7 @@ class Optimum(Extremal):
         return heading_winding(self.states[:, 2])
 
 
-# The modules with the kernels of a search, and those whose kernels are called only for robots other than the unicycle.
+# The modules with the kernels of a search.
 SEARCH_MODULES = (
     "leapnav.envs.shapes",
     "leapnav.experts.numerics",
@@ -117,20 +119,14 @@ SEARCH_MODULES = (
     "leapnav.experts.search",
     "leapnav.experts.solvers.newton",
     "leapnav.experts.transcription",
-)
-OTHER_ROBOTS = (
-    "leapnav.experts.search.general_paths",
-    "leapnav.experts.transcription.descent",
-    "leapnav.experts.transcription.midpoint",
-    "leapnav.experts.transcription.riccati",
+    GENERATED,
 )
 
 
-@computed_once()
-def _compile_kernels(is_unicycle: bool) -> None:
-    """Compile the kernels of a search that are not in the cache."""
-    others = set(kernels_of(*OTHER_ROBOTS)) if is_unicycle else set()
-    prepare(*(one for one in kernels_of(*SEARCH_MODULES) if one not in others))
+@computed_once(maxsize=64)
+def _compile_kernels(*_: FunctionPointer) -> None:
+    """Compile the kernels of a search that are not in the cache, once for the generated functions of a problem."""
+    prepare(*kernels_of(*SEARCH_MODULES))
 
 
 class Effort(NamedTuple):
@@ -182,8 +178,8 @@ def find_optimum(
     if not isinstance(cast(object, scenario), Scenario):
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     candidates = check_integer("candidates", candidates, 1)
-    _compile_kernels(type(scenario.robot) is Unicycle and scenario.robot.footprint is None)
     problem = OptimalControlProblem.from_scenario(scenario)
+    _compile_kernels(*generated_functions(problem))
     if problem.horizon is None and problem.starts_at_goal:
         return as_optimum(failure(problem, Status.ZERO_HORIZON))
     horizon = math.inf if scenario.horizon is None else scenario.horizon

@@ -4,12 +4,9 @@ from helpers import best_known, scenario_fields
 
 from leapnav.envs import Scenario
 from leapnav.experts import OptimalControlProblem, Trajectory, find_optimum
-from leapnav.experts.numerics.flow import EndCondition
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
-from leapnav.experts.transcription.arcs import DiscreteProblem
-from leapnav.experts.transcription.arcs_descent import descend
-from leapnav.experts.transcription.direct import discretise, optimise
+from leapnav.experts.transcription.direct import DirectPath, discretise, optimise
 
 BEST_KNOWN = best_known()
 
@@ -52,19 +49,20 @@ def test_it_converges_to_the_extremal_with_order_two(scenario):
     assert np.abs(direct.costates - costates).max() < 0.02 * np.abs(costates).max()
 
 
-def test_every_step_of_the_path_is_an_exact_arc_and_ends_at_the_goal():
-    scenario = BEST_KNOWN[0][0]
-    problem, path = first_candidate(scenario)
-    direct = optimise(problem, discretise(problem, path))
-    assert direct.states[0] == pytest.approx(scenario.start)
-    assert direct.states[-1] == pytest.approx(problem.goal, abs=1e-5)
-    for k, (v, omega) in enumerate(direct.controls):
-        h = direct.times[k + 1] - direct.times[k]
-        fine = np.linspace(0.0, h, 20_001)
-        heading = direct.states[k, 2] + omega * fine
-        x = direct.states[k, 0] + np.trapezoid(v * np.cos(heading), fine)
-        y = direct.states[k, 1] + np.trapezoid(v * np.sin(heading), fine)
-        assert (x, y, heading[-1]) == pytest.approx(direct.states[k + 1], abs=1e-5)
+@pytest.mark.parametrize("robot", ["unicycle", "differential_drive", "dynamic_unicycle", "car"])
+def test_every_step_of_the_path_is_one_of_the_midpoint_rule_and_ends_at_the_goal(robot):
+    scenario = find_optimum(Scenario.from_dict({**BEST_KNOWN[0][0].to_dict(), "robot": {"model": robot}}))
+    problem, times = scenario.problem, np.linspace(0.0, scenario.horizon, 65)
+    direct = optimise(problem, discretise(problem, Trajectory(times, scenario.evaluate(times)[0])))
+    assert direct.converged
+    assert direct.states[0] == pytest.approx(problem.start)
+    fixed = ~problem.arrays.free
+    assert direct.states[-1, fixed] == pytest.approx(problem.arrays.goal[fixed], abs=1e-5)
+    steps, q, u = np.diff(direct.times)[:, None], direct.states[:-1], direct.controls
+    drift, fields = problem.dynamics(q)
+    middle = q + 0.5 * steps * (drift + np.einsum("kij,kj->ki", fields, u))
+    drift, fields = problem.dynamics(middle)
+    assert q + steps * (drift + np.einsum("kij,kj->ki", fields, u)) == pytest.approx(direct.states[1:], abs=1e-4)
 
 
 def test_controls_stay_within_the_robot_s_limits():
@@ -106,26 +104,36 @@ def test_weights_in_other_units_change_the_cost_and_not_the_path():
 
 def test_an_infeasible_problem_does_not_converge():
     """Three metres in a second at two metres a second."""
-    limits, field = np.array([2.0, 3.0]), Scenario.from_dict(scenario_fields(obstacles=[])).field
-    limits.flags.writeable = False
-    states = np.linspace([2.0, 5.0, 0.0], [5.0, 5.0, 0.0], 33)
-    controls, costates = np.full((32, 2), [2.0, 0.0]), np.zeros((33, 3))
-    problem = DiscreteProblem(
-        h=np.full(32, 1 / 32),
-        end=EndCondition(goal=np.array([5.0, 5.0, 0.0]), free=np.zeros(3, bool), free_time=False),
-        turn_weight=0.5,
-        unit=1.0,
-        limits=limits,
-        field=field,
-    )
-    converged, _, violation = descend(problem, states, controls, costates, 1e-3, 40)
-    assert not converged or violation > 0.5
+    fields = scenario_fields(obstacles=[], start=[2.0, 5.0, 0.0], goal=[5.0, 5.0, 0.0], horizon=1.0)
+    problem = OptimalControlProblem.from_scenario(Scenario.from_dict(fields))
+    times, states = np.linspace(0.0, 1.0, 33), np.linspace(problem.start, problem.goal, 33)
+    controls = np.full((32, 2), [2.0, 0.0])
+    guess = DirectPath(times, states, controls, np.zeros((33, 3)), np.inf, np.inf, False)
+    direct = optimise(problem, guess)
+    assert not direct.converged or direct.violation > 0.5
 
 
-@pytest.mark.parametrize("robot", ["unicycle", "differential_drive"])
-def test_the_scale_of_the_cost_has_no_effect_on_arcs(robot):
-    scenario = Scenario.from_dict({**best_known()[0][0].to_dict(), "robot": {"model": robot}})
-    problem, path = first_candidate(scenario)
-    first, second = (optimise(problem, discretise(problem, path), cost_scale=scale) for scale in (None, 3.0))
-    assert first.converged
-    assert first.cost == second.cost
+def test_the_derivatives_of_a_step_are_those_of_finite_differences():
+    """For the car, whose step is the most curved."""
+    fields = {**scenario_fields(), "robot": {"model": "car"}}
+    problem = OptimalControlProblem.from_scenario(Scenario.from_dict(fields))
+    functions, data, rng = problem.compiled_dynamics, problem.arrays.data, np.random.default_rng(0)
+    n, m, h = problem.system.n, problem.system.m, 0.2
+    lam, point = rng.normal(size=n), 0.3 * rng.normal(size=n + m)
+
+    def end(point):
+        found = np.empty(n)
+        functions.step(point[:n].copy(), point[n:].copy(), h, data, found)
+        return found
+
+    def jacobian(point):
+        A, B, W = np.empty((n, n)), np.empty((n, m)), np.empty((n + m, n + m))
+        functions.step_derivatives(point[:n].copy(), point[n:].copy(), h, lam, data, A, B, W)
+        return np.hstack([A, B]), W
+
+    def differences(function):
+        return np.stack([(function(point + d) - function(point - d)) / 2e-6 for d in 1e-6 * np.eye(n + m)], axis=-1)
+
+    found, hessian = jacobian(point)
+    assert found == pytest.approx(differences(end), abs=1e-8)
+    assert hessian == pytest.approx(differences(lambda point: lam @ jacobian(point)[0]), abs=1e-8)

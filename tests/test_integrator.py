@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 from leapnav.envs import sample_scenario
 from leapnav.experts import OptimalControlProblem, find_optimum
 from leapnav.experts.numerics.integrator import propagate
-from leapnav.experts.numerics.linear import solve_banded, solve_dense, solve_positive
+from leapnav.experts.numerics.linear import solve_banded, solve_dense
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
@@ -124,11 +124,6 @@ def test_the_linear_solvers_agree_with_numpy():
         assert solve_dense(A.copy(), dense)
         assert banded == pytest.approx(expected, rel=1e-8, abs=1e-10)
         assert dense == pytest.approx(expected, rel=1e-8, abs=1e-10)
-        positive, columns = A @ A.T, rng.normal(size=(n, 3))
-        expected = np.linalg.solve(positive, columns)
-        assert solve_positive(positive.copy(), columns)
-        assert columns == pytest.approx(expected, rel=1e-6, abs=1e-8)
-    assert not solve_positive(-np.eye(2), np.ones((2, 1)))
     assert not solve_dense(np.zeros((2, 2)), np.ones(2))
     assert not solve_banded(np.zeros((4, 4)), np.ones(4), 1)
 

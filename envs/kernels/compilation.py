@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 import subprocess
 import sys
 import time
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-from leapnav.envs.kernels.decorator import DECLARATIONS
+from leapnav.envs.kernels.decorator import DECLARATIONS, cache_root
 from leapnav.envs.utils.progress import progress_bar
 
 MIN_KERNELS = 6  # for each process, whose start takes two seconds
@@ -20,6 +22,7 @@ MIN_KERNELS = 6  # for each process, whose start takes two seconds
 # fast. At level 1 they compile in 0.73 of the time, but the checks of proofs take 1.2 times as long.
 LLVM_LEVEL = "2"
 PAUSE = 0.1  # s, while other processes compile
+GENERATED = "leapnav_generated"  # package of the modules in the cache directory
 _FOUND: set[Any] = set()  # kernels that are known to be in the cache
 LABEL = "Compiling, once per installation"
 WORK = "import sys; from leapnav.envs.kernels import compilation; compilation.work(*sys.argv[1:])"
@@ -40,7 +43,7 @@ def prepare(*kernels: Any, jobs: int | None = None) -> int:
     """
     waiting = missing(kernels)
     names = [f"{one.py_func.__module__}:{one.py_func.__qualname__}" for one in waiting]
-    command = [sys.executable, "-P", "-c", WORK, *(name for name in names if name.startswith("leapnav."))]
+    command = [sys.executable, "-P", "-c", WORK, *(name for name in names if name.startswith("leapnav"))]
     count = min(jobs or usable_cores(), math.ceil(len(waiting) / MIN_KERNELS)) if len(waiting) >= MIN_KERNELS else 0
     environment = {"NUMBA_OPT": LLVM_LEVEL, **os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     quiet = subprocess.DEVNULL
@@ -85,7 +88,22 @@ def is_cached(one: Any) -> bool:
 
 def work(*names: str) -> None:
     """Compile the kernels with these names ("module:function"); run by the processes that `prepare` starts."""
-    _fill([getattr(import_module(name.partition(":")[0]), name.partition(":")[2]) for name in names])
+    found = []
+    for module, _, function in (name.partition(":") for name in names):
+        is_generated = module.startswith(f"{GENERATED}.")
+        found.append(getattr(import_generated(module) if is_generated else import_module(module), function))
+    _fill(found)
+
+
+def import_generated(name: str) -> ModuleType:
+    """Import a generated module, of the package GENERATED, from the cache directory."""
+    path = cache_root() / f"{name.removeprefix(GENERATED + '.')}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 def _fill(waiting: list[Any]) -> None:

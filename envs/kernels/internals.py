@@ -6,7 +6,7 @@ Function pointers: Numba accepts a kernel as an argument of another kernel, but 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 from llvmlite import ir
@@ -37,10 +37,14 @@ class FunctionPointer:
 
     def __init__(self, kernel: Any, kind: types.FunctionType) -> None:
         self._numba_type_ = kind
-        kernel.compile(kind.signature.args)
-        result = kernel.get_compile_result(kind.signature)
-        self.address: int = types.CompileResultWAP(result).__wrapper_address__()
-        self._kernel: Callable[..., Any] = kernel  # keeps the code alive
+        self._kernel = kernel  # keeps the code alive
+
+    @cached_property
+    def address(self) -> int:
+        """The address; the kernel is compiled when it is first needed."""
+        self._kernel.compile(self._numba_type_.signature.args)
+        result = self._kernel.get_compile_result(self._numba_type_.signature)
+        return types.CompileResultWAP(result).__wrapper_address__()
 
     def __wrapper_address__(self) -> int:
         return self.address

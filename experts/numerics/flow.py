@@ -1,4 +1,4 @@
-"""Types of the extremal flow, and the records that the kernels take with it."""
+"""Types of the generated functions of a problem, and the records that the kernels take with them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,20 @@ PIECE_SIGNATURE = types.int64(VECTOR, CONSTANT, CONSTANT)
 FLOW_FUNCTION = types.FunctionType(FLOW_SIGNATURE)
 CONTROL_FUNCTION = types.FunctionType(CONTROL_SIGNATURE)
 PIECE_FUNCTION = types.FunctionType(PIECE_SIGNATURE)
+
+# affine(q, data, drift, fields): fills a(q) (n,) and B(q) (n, m).
+AFFINE_SIGNATURE = NOTHING(VECTOR, CONSTANT, VECTOR, MATRIX)
+# step(q, u, h, data, end): fills the state F(q, u) (n,) after a step of duration h with constant controls u (m,).
+STEP_SIGNATURE = NOTHING(VECTOR, VECTOR, float64, CONSTANT, VECTOR)
+# step_derivatives(q, u, h, lam, data, A, B, W): fills dF/dq (n, n), dF/du (n, m), and the Hessian (n + m, n + m) of
+# lam'F in (q, u).
+STEP_DERIVATIVES_SIGNATURE = NOTHING(VECTOR, VECTOR, float64, VECTOR, CONSTANT, MATRIX, MATRIX, MATRIX)
+# state_cost(q, data, field, gradient, hessian) -> Phi(q): fills its gradient (n,) and Hessian (n, n).
+STATE_COST_SIGNATURE = float64(VECTOR, CONSTANT, CONSTANT, VECTOR, MATRIX)
+AFFINE_FUNCTION = types.FunctionType(AFFINE_SIGNATURE)
+STEP_FUNCTION = types.FunctionType(STEP_SIGNATURE)
+STEP_DERIVATIVES_FUNCTION = types.FunctionType(STEP_DERIVATIVES_SIGNATURE)
+STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
 
 
 class ExtremalFlow(NamedTuple):

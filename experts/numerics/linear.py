@@ -1,12 +1,10 @@
-"""Solvers of small linear systems (kernels): dense, banded and positive definite.
+"""Solvers of small linear systems (kernels): dense and banded.
 
 BLAS does not speed up systems of this size, and its threads make them up to 100 times slower if other processes use the
 cores.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import boolean, float64, int64
@@ -121,38 +119,4 @@ def solve_banded(rows, b, half):
         for j in range(k + 1, min(k + 2 * half, n - 1) + 1):
             b[k] -= rows[k, j - k + half] * b[j]
         b[k] /= rows[k, half]
-    return True
-
-
-@kernel(boolean(MATRIX, MATRIX))
-def solve_positive(A, B):
-    """Replace B (n, k) by A^-1 B for a positive definite A (n, n), by Cholesky factorisation in place.
-
-    Only the upper triangle of A is read. Returns False if A is not positive definite.
-    """
-    n, width = B.shape
-    for k in range(n):
-        if not A[k, k] > 0.0:
-            return False
-        A[k, k] = math.sqrt(A[k, k])
-        inverse = 1.0 / A[k, k]
-        for j in range(k + 1, n):
-            A[k, j] *= inverse
-        for i in range(k + 1, n):
-            factor = A[k, i]
-            if factor != 0.0:
-                for j in range(i, n):
-                    A[i, j] -= factor * A[k, j]
-    for k in range(n):
-        for c in range(width):
-            B[k, c] /= A[k, k]
-        for i in range(k + 1, n):
-            for c in range(width):
-                B[i, c] -= A[k, i] * B[k, c]
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            for c in range(width):
-                B[k, c] -= A[k, j] * B[j, c]
-        for c in range(width):
-            B[k, c] /= A[k, k]
     return True

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +13,7 @@ from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.pycode import PythonCodePrinter
 from sympy.simplify.cse_main import tree_cse
 
+from leapnav.envs.kernels.compilation import GENERATED, import_generated
 from leapnav.envs.kernels.decorator import cache_root
 from leapnav.envs.utils.files import write_text
 
@@ -120,9 +119,4 @@ def load(kind: str, generator: str, declaration: str, generate: Callable[[], str
     path = cache_root() / f"{name}.py"
     if not path.exists():
         write_text(path, generate())
-    spec = importlib.util.spec_from_file_location(f"leapnav_generated.{name}", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return import_generated(f"{GENERATED}.{name}")

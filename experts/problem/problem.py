@@ -19,7 +19,7 @@ from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.numerics.state_bounds import StateLimit, check_state_bounds, limit_costs, state_limits
-from leapnav.experts.problem.dynamics import minimum_norm_costates, sample_dynamics
+from leapnav.experts.problem.dynamics import least_norm_costates, least_squares_controls, sample_dynamics
 from leapnav.experts.problem.system import (
     ControlAffineSystem,
     as_expression,
@@ -337,27 +337,25 @@ class OptimalControlProblem:
         )
 
     def estimate_costates(self, path: Trajectory) -> np.ndarray:
-        """Estimate costates (N, n) along a path without costates, consistent with the minimum principle.
-
-        The control that follows the path in the least-squares sense gives the switching functions p = -R u. The result
-        is the costate of least norm with these switching functions.
-        """
+        """Return the costates (N, n) of least norm whose controls of the minimum principle follow a path."""
         times = as_vector("times", path.times)
         states = as_matrix("states", path.states, len(times), self.system.n)
         if len(times) < 2 or not (np.diff(times) > 0).all():
             raise ValueError(f"times: expected at least two increasing numbers, got {times}")
+        controls = self.follow(states, np.gradient(states, times, axis=0))
+        return least_norm_costates(self.dynamics(states)[1], -np.array(self.control_weight) * controls)
+
+    def follow(self, states: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Return the controls (N, m) with which states (N, n) have given rates (N, n), in the least-squares sense."""
         drift, fields = self.dynamics(states)
-        costates = np.empty_like(drift)
-        rates = np.gradient(states, times, axis=0)
-        minimum_norm_costates(drift, fields, rates, np.array(self.control_weight, dtype=float), costates)
-        return costates
+        return least_squares_controls(fields, rates - drift)
 
     def dynamics(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the drift a(q) (N, n) and the control vector fields B(q) (N, n, m) at states (N, n)."""
-        arrays, n, m = self.arrays, self.system.n, self.system.m
+        n, m = self.system.n, self.system.m
         states = as_matrix("states", states, None, n)
         drift, fields = np.empty((len(states), n)), np.empty((len(states), n, m))
-        sample_dynamics(arrays.flow, arrays.control, states, drift, fields)
+        sample_dynamics(self.compiled_dynamics.affine, self.arrays.data, states, drift, fields)
         return drift, fields
 
     def straight_line(self, points: int = 33) -> Trajectory:

@@ -12,7 +12,6 @@ import sympy as sp
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.transcription.direct import follow_controls
 
 TOLERANCE, MAX_ITERATIONS = 1e-6, 300
 
@@ -94,7 +93,7 @@ class Transcription:
         horizon = problem.horizon_of(path)
         times = np.linspace(0.0, horizon, self._intervals + 1)
         states = path.resample(times).states
-        controls = follow_controls(problem, states, np.gradient(states, times, axis=0))
+        controls = problem.follow(states, np.gradient(states, times, axis=0))
         guess = np.concatenate([states.ravel(), controls.ravel(), [horizon] if problem.horizon is None else []])
         zero = np.zeros(self._count)
         goal = problem.arrays.goal

@@ -8,6 +8,7 @@ import numpy as np
 
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.experts.problem.dynamics import least_squares_controls
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.transcription.direct import discretise, optimise
 
@@ -73,6 +74,7 @@ class Lifting:
             row = states[k : k + 1].copy()
             row[0, :3] = 0.5 * (poses[k] + poses[k + 1])
             (drift,), (fields,) = self._problem.dynamics(row)
-            controls = np.linalg.lstsq(fields[:3], (poses[k + 1] - poses[k]) / step - drift[:3], rcond=None)[0]
+            rates = (poses[k + 1] - poses[k]) / step - drift[:3]
+            (controls,) = least_squares_controls(fields[None, :3], rates[None])
             states[k + 1, 3:] = states[k, 3:] + step * (drift + fields @ controls)[3:]
         return states

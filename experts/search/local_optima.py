@@ -218,15 +218,15 @@ class LocalOptima:
 
     def _optimise(self, problem: OptimalControlProblem, guess: DirectPath, *, is_relaxed: bool = False) -> DirectPath:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
-        scale, relaxed_weight = self.scenario.cost.speed_weight, self._relaxed_weight if is_relaxed else None
-        path = optimise(problem, guess, cost_scale=scale, relaxed_weight=relaxed_weight)
+        relaxed_weight = self._relaxed_weight if is_relaxed else None
+        path = optimise(problem, guess, relaxed_weight=relaxed_weight)
         if problem.horizon is None:
             for _ in range(MAX_LENGTHENED):
                 # Otherwise more time would not help: the path is feasible, or the descent is slow.
                 if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):
                     break
                 guess = guess.scaled(LENGTHENING)
-                path = optimise(problem, guess, cost_scale=scale, relaxed_weight=relaxed_weight)
+                path = optimise(problem, guess, relaxed_weight=relaxed_weight)
         return path
 
     def _is_limited(self, path: DirectPath) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64
+from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CUBE, MATRIX, VECTOR
@@ -46,6 +46,21 @@ class Model(NamedTuple):
 
 
 MODEL = record_type(Model, P=CUBE, p=MATRIX, F=CUBE, step=MATRIX, gain=CUBE, end_gain=CUBE, G=MATRIX, g=VECTOR)
+
+
+@kernel(MODEL(int64, int64, int64))
+def empty_model(intervals, n, m):
+    """Return a model of a path to be filled."""
+    return Model(
+        np.empty((intervals + 1, n, n)),
+        np.empty((intervals + 1, n)),
+        np.empty((intervals + 1, n, n)),
+        np.empty((intervals, m)),
+        np.empty((intervals, m, n)),
+        np.empty((intervals, m, n)),
+        np.empty((n, n)),
+        np.empty(n),
+    )
 
 
 class Regularisation(NamedTuple):

@@ -38,7 +38,7 @@ class Compile:
 
 
 def compile_missing(jobs: int | None = None) -> dict[str, Any]:
-    """Compile the kernels that are not in the cache, and the extremal flow of the unicycle.
+    """Compile the kernels that are not in the cache, with the generated ones of the unicycle.
 
     Args:
         jobs: number of processes; None for one per core.
@@ -47,7 +47,7 @@ def compile_missing(jobs: int | None = None) -> dict[str, Any]:
         `compiled`, the number of kernels; `cache`, the directory; `seconds`.
 
     """
-    from leapnav.envs.kernels.compilation import prepare
+    from leapnav.envs.kernels.compilation import GENERATED, prepare
     from leapnav.envs.kernels.decorator import kernel_cache, kernels_of
 
     start = perf_counter()
@@ -58,15 +58,16 @@ def compile_missing(jobs: int | None = None) -> dict[str, Any]:
             except ModuleNotFoundError as error:  # a package of an extra that is not installed
                 if (error.name or "").startswith("leapnav"):
                     raise
-    count = prepare(*kernels_of("leapnav"), jobs=jobs)
-    _compile_unicycle_flow()
+    _load_unicycle()
+    count = prepare(*kernels_of("leapnav", GENERATED), jobs=jobs)
     return {"compiled": count, "cache": kernel_cache(), "seconds": perf_counter() - start}
 
 
-def _compile_unicycle_flow() -> None:
-    """Compile the extremal flow that every scenario uses, or load it from the cache."""
+def _load_unicycle() -> None:
+    """Generate the functions of the unicycle's problem, which most scenarios use."""
     from leapnav.envs.scenarios.scenario import Scenario
     from leapnav.experts.problem.problem import OptimalControlProblem
+    from leapnav.experts.transcription.direct import generated_functions
 
     scenario = Scenario(arena=(0, 0, 2, 2), start=(0.5, 1, 0), goal=(1.5, 1, 0), horizon=2)
-    OptimalControlProblem.from_scenario(scenario).arrays  # noqa: B018 (the property compiles)
+    generated_functions(OptimalControlProblem.from_scenario(scenario))
