@@ -65,6 +65,8 @@ SYSTEM = record_type(NewtonSystem, rows=MATRIX, rhs=VECTOR, costs=VECTOR, hints=
 def linearise(flow, times, factor, Z, start, end, accuracy, system):
     """Evaluate the Newton system at Z; return (norm^2, largest residual, evaluations), infinite if the flow diverged.
 
+    The components of the last node that the end conditions leave open are set to the result of the integration.
+
     All times are multiplied by `factor`. The rows are n start conditions, 2n continuity conditions per segment, and n
     end conditions. With the unknowns in the order of time the half-width of the band is 3n - 1.
 
@@ -105,6 +107,10 @@ def linearise(flow, times, factor, Z, start, end, accuracy, system):
             return np.inf, np.inf, evaluations
         system.costs[k] = cost
         system.hints[k] = hint / scale
+        if k == segments - 1:  # what the end conditions leave open is a result of the integration
+            for i in range(n):
+                at = i if free[i] else n + i
+                Z[segments, at] = z[at]
         for i in range(size):
             row = first + stride * k + i
             rhs[row] = Z[k + 1, i] - z[i]

@@ -12,7 +12,7 @@ from leapnav.envs.kernels.types import FLAGS, MATRIX, VECTOR, tuple_of
 from leapnav.experts.numerics.flow import END_CONDITION, FLOW, NEWTON_OPTIONS, EndCondition
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
-from leapnav.experts.solvers.newton import CONVERGED, solve_costate
+from leapnav.experts.solvers.newton import CONVERGED, solve_arc
 
 MIN_FRACTION = 0.05  # smallest distance in time of a node from its neighbours, relative to the sub-problem's duration
 MIN_HALF_COST_STEPS = 16  # smallest number of integration steps of the search for half of the cost
@@ -42,11 +42,7 @@ def _solve_arc(flow, z, target, end, duration, options, z_end):
 
     `end.free` marks the free components of the target.
     """
-    log = np.empty((options.max_iterations + 1, 2))
-    condition = EndCondition(target[: len(end.free)], end.free, False)
-    time = np.array([duration])
-    status, _, _, cost, evaluations = solve_costate(flow, z, condition, time, options, z_end, log)
-    return status, cost, evaluations
+    return solve_arc(flow, z, EndCondition(target[: len(end.free)], end.free, False), duration, options, z_end)
 
 
 @kernel(END_CONDITION(END_CONDITION, boolean))

@@ -14,7 +14,6 @@ import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.caching import computed_once
-from leapnav.experts.numerics.flow import NewtonOptions
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Status
@@ -23,8 +22,8 @@ from leapnav.experts.search.initial_guess import best_path
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.feasible_path import dense_path
 from leapnav.experts.solvers.multiple_shooting import polish
-from leapnav.experts.solvers.newton import CONVERGED, solve_costate
 from leapnav.experts.solvers.nodes import start_nodes
+from leapnav.experts.solvers.single_shooting import segment
 
 # ---- Lesson 1: three methods from the same initial guess
 
@@ -39,7 +38,7 @@ METHODS_SCENARIO = Scenario(
     cost={"proximity_scale": 0.3},
 )
 SEGMENTS = 8  # of multiple shooting and of Leapfrog's first path
-TOLERANCE, ACCURACY = 1e-9, 1e-13  # of Newton's method and of its integrator
+TOLERANCE = 1e-9  # of Newton's method
 MAX_NEWTON_STEPS = 30
 PATH_POINTS = 121  # of each path
 
@@ -74,8 +73,8 @@ def compare_methods() -> dict[str, Any]:
     times, nodes = start_nodes(problem, guess, SEGMENTS)
     optimum = find_optimum(scenario)
     methods = [
-        _single_shooting(problem, nodes[0]),
-        _multiple_shooting(problem, times, nodes),
+        _shooting("single shooting", problem, *segment(problem, nodes[0], problem.fixed_horizon)),
+        _shooting("multiple shooting", problem, times, nodes),
         _leapfrog(scenario, guess),
     ]
     count = max(len(method["iterates"]) for method in methods)
@@ -89,38 +88,19 @@ def compare_methods() -> dict[str, Any]:
     }
 
 
-def _single_shooting(problem: OptimalControlProblem, start: np.ndarray) -> dict[str, Any]:
-    """The iterates of Newton's method on the initial costate, from the start (2n,) of the guess."""
-    arrays, duration = problem.arrays, problem.fixed_horizon
-    span = np.array([0.0, duration])
-    iterates: list[dict[str, Any]] = []
-    code = CONVERGED
-    for limit in range(MAX_NEWTON_STEPS + 1):
-        z, end, log = start.copy(), start.copy(), np.empty((limit + 1, 2))
-        newton = NewtonOptions(TOLERANCE, ACCURACY, limit)
-        time = np.array([duration])
-        code, steps, residual, cost, _ = solve_costate(arrays.flow, z, arrays.end, time, newton, end, log)
-        if steps < limit:
-            break
-        iterates.append(_iterate(problem, span, np.stack([z, end]), cost, residual))
-    status = "converged" if code == CONVERGED else "stalled"
-    return {"name": "single shooting", "status": status, "iterates": iterates}
-
-
-def _multiple_shooting(problem: OptimalControlProblem, times: np.ndarray, guess: np.ndarray) -> dict[str, Any]:
+def _shooting(name: str, problem: OptimalControlProblem, times: np.ndarray, guess: np.ndarray) -> dict[str, Any]:
     """The iterates of Newton's method on all nodes (segments + 1, 2n)."""
     iterates: list[dict[str, Any]] = []
     status = Status.MAX_ITERATIONS
     for limit in range(MAX_NEWTON_STEPS + 1):
         nodes = guess.copy()
-        status, rows, _ = polish(problem, times, nodes, TOLERANCE, limit, fine=True)
+        status, rows, _ = polish(problem, times, nodes, TOLERANCE, limit, fine=len(times) > 2)
         if len(rows) <= limit:
             break
         iterates.append(_iterate(problem, times, nodes, rows[-1].cost, rows[-1].residual))
         if status is Status.SUCCESS:
             break
-    name = "converged" if status is Status.SUCCESS else "stalled"
-    return {"name": "multiple shooting", "status": name, "iterates": iterates}
+    return {"name": name, "status": "converged" if status is Status.SUCCESS else "stalled", "iterates": iterates}
 
 
 def _leapfrog(scenario: Scenario, guess: Trajectory) -> dict[str, Any]:
