@@ -35,6 +35,10 @@ def feedback(extremal):
     return Feedback(SCENARIO, Trajectory(extremal.times, extremal.states, extremal.costates))
 
 
+def one_step(problem, guess):
+    return solve(problem, "multiple_shooting", guess=guess, max_iterations=1, segments=8)
+
+
 def expert_value(state):
     env = NavigateEnv(scenario=SCENARIO)
     env.reset()
@@ -58,10 +62,10 @@ def step(env_class):
 
 # name: (function of the array, a valid array)
 ENTRIES = {
-    "solve: guess.states": (lambda a: solve(SCENARIO, guess=Trajectory(TIMES, a)), STATES),
-    "solve: guess.times": (lambda a: solve(SCENARIO, guess=Trajectory(a, STATES)), TIMES),
-    "solve: guess.costates": (lambda a: solve(SCENARIO, guess=Trajectory(TIMES, STATES, a)), STATES),
-    "solve: problem": (lambda a: solve(PROBLEM, guess=Trajectory(TIMES, a)), STATES),
+    "solve: guess.states": (lambda a: one_step(SCENARIO, Trajectory(TIMES, a)), STATES),
+    "solve: guess.times": (lambda a: one_step(SCENARIO, Trajectory(a, STATES)), TIMES),
+    "solve: guess.costates": (lambda a: one_step(SCENARIO, Trajectory(TIMES, STATES, a)), STATES),
+    "solve: problem": (lambda a: one_step(PROBLEM, Trajectory(TIMES, a)), STATES),
     "problem: start": (lambda a: replace(PROBLEM, start=a), STATES[0]),
     "problem: goal": (lambda a: replace(PROBLEM, goal=a), STATES[-1]),
     "problem: field": (lambda a: replace(PROBLEM, field=a), SCENARIO.field),
@@ -179,7 +183,7 @@ def test_an_edited_field_is_refused_or_usable():
         {**scenario.to_dict(), "obstacles": shapes, "start": [1, 1, 0], "goal": [9, 9, 0]}
     )
     problem = OptimalControlProblem.from_scenario(scenario)
-    nodes = np.hstack([np.linspace([1, 1, 0], [9, 9, 0], 9), np.zeros((9, 3))])
+    nodes = np.hstack([[[1, 1, 0], [9, 9, 0]], np.zeros((2, 3))])
     refused = 0
     for edited in edits_of_a_field(scenario.field, rng):
         try:
@@ -187,5 +191,5 @@ def test_an_edited_field_is_refused_or_usable():
         except ValueError:
             refused += 1
             continue
-        certify(changed, TIMES * scenario.horizon / TIMES[-1], nodes, Status.STALLED)
+        certify(changed, np.array([0.0, 0.1]), nodes, Status.STALLED)
     assert refused > 0

@@ -12,7 +12,7 @@ from leapnav.experts import ProofError, check_proof, find_optimum, lower_bound
 
 
 @pytest.mark.parametrize(
-    ("weight", "horizon", "gap"), [(0.0, 6.5, 0.05), (0.0, None, 0.05), (0.01, None, 0.05), (0.01, 6.5, 0.08)]
+    ("weight", "horizon", "gap"), [(0.0, 6.5, 0.1), (0.0, None, 0.1), (0.01, None, 0.1), (0.01, 6.5, 0.1)]
 )
 def test_obstacles_may_cost_nothing_or_little(weight: float, horizon: float | None, gap: float):
     """With the proximity weight 0 only the collision-free paths count; their cost excludes the barrier."""
@@ -37,8 +37,8 @@ def test_a_passage_that_is_too_narrow_is_blocked_at_no_proximity_cost():
     scenario = Scenario.from_dict(fields | {"obstacles": ()})
     straight = find_optimum(scenario)
     blocked = Scenario.from_dict(fields | {"obstacles": tuple(blocks)})
-    found = lower_bound(blocked, gap=0.1)
-    assert found.gap == pytest.approx(0.1, abs=1e-6)
+    found = lower_bound(blocked, gap=0.25)
+    assert found.gap == pytest.approx(0.25, abs=1e-6)
     assert found.value > 1.3 * straight.cost
     assert check_proof(found.proof) == found.value
     with pytest.raises(ProofError):

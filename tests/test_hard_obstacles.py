@@ -219,9 +219,9 @@ def test_gains_of_the_barrier_problem_are_finite():
     assert np.isfinite(gains.slopes).all() and np.isfinite(gains.control(np.array(scenario.start), 0.0)).all()
 
 
-@pytest.mark.parametrize("horizon", ["fixed", "free"])
-def test_demonstrations_succeed_and_are_replayed(tmp_path, horizon):
-    arguments = {"horizon": horizon, "obstacles": "hard", "robot": "car"}
+@pytest.mark.parametrize(("horizon", "robot"), [("fixed", "car"), ("free", "unicycle")])
+def test_demonstrations_succeed_and_are_replayed(tmp_path, horizon, robot):
+    arguments = {"horizon": horizon, "obstacles": "hard", "robot": robot}
     summary = rollout("clutter", 2, tmp_path, **arguments, recoveries=1, progress=False)
     assert summary.failed_replays == 0 and summary.demonstrations > 2
     assert (tmp_path / dataset_id("clutter", **arguments)).is_dir()

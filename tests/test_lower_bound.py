@@ -109,7 +109,7 @@ def test_a_duality_gap_is_estimated_and_limits_the_bound():
         ),
     )
     optimum = find_optimum(scenario)
-    found = lower_bound(scenario, optimum, gap=0.2, time_limit=20.0)
+    found = lower_bound(scenario, optimum, gap=0.2, time_limit=5.0)
     assert 0.05 < found.duality_gap < 0.1
     assert found.gap > found.duality_gap
     assert found.value > 0.4 * optimum.cost
