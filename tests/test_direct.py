@@ -51,9 +51,9 @@ def test_it_converges_to_the_extremal_with_order_two(scenario):
 
 @pytest.mark.parametrize("robot", ["unicycle", "differential_drive", "dynamic_unicycle", "car"])
 def test_every_step_of_the_path_is_one_of_the_midpoint_rule_and_ends_at_the_goal(robot):
-    scenario = find_optimum(Scenario.from_dict({**BEST_KNOWN[0][0].to_dict(), "robot": {"model": robot}}))
-    problem, times = scenario.problem, np.linspace(0.0, scenario.horizon, 65)
-    direct = optimise(problem, discretise(problem, Trajectory(times, scenario.evaluate(times)[0])))
+    optimum = find_optimum(Scenario.from_dict({**BEST_KNOWN[0][0].to_dict(), "robot": {"model": robot}}))
+    problem, times = optimum.problem, np.linspace(0.0, optimum.horizon, 65)
+    direct = optimise(problem, discretise(problem, Trajectory(times, optimum.evaluate(times)[0])))
     assert direct.converged
     assert direct.states[0] == pytest.approx(problem.start)
     fixed = ~problem.arrays.free

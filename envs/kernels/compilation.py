@@ -43,7 +43,8 @@ def prepare(*kernels: Any, jobs: int | None = None) -> int:
     """
     waiting = missing(kernels)
     names = [f"{one.py_func.__module__}:{one.py_func.__qualname__}" for one in waiting]
-    command = [sys.executable, "-P", "-c", WORK, *(name for name in names if name.startswith("leapnav"))]
+    importable = [name for name in names if name.startswith(("leapnav.", f"{GENERATED}."))]
+    command = [sys.executable, "-P", "-c", WORK, *importable]
     count = min(jobs or usable_cores(), math.ceil(len(waiting) / MIN_KERNELS)) if len(waiting) >= MIN_KERNELS else 0
     environment = {"NUMBA_OPT": LLVM_LEVEL, **os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     quiet = subprocess.DEVNULL

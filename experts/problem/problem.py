@@ -342,8 +342,9 @@ class OptimalControlProblem:
         states = as_matrix("states", path.states, len(times), self.system.n)
         if len(times) < 2 or not (np.diff(times) > 0).all():
             raise ValueError(f"times: expected at least two increasing numbers, got {times}")
-        controls = self.follow(states, np.gradient(states, times, axis=0))
-        return least_norm_costates(self.dynamics(states)[1], -np.array(self.control_weight) * controls)
+        drift, fields = self.dynamics(states)
+        controls = least_squares_controls(fields, np.gradient(states, times, axis=0) - drift)
+        return least_norm_costates(fields, -np.array(self.control_weight) * controls)
 
     def follow(self, states: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return the controls (N, m) with which states (N, n) have given rates (N, n), in the least-squares sense."""

@@ -82,13 +82,15 @@ class FeasiblePath:
         return ArcPath(self.times, self.nodes, self.costs)
 
     def _newton(self, iterations: int) -> NewtonOptions:
-        # With adaptive accuracy, difficult problems take 1.4 times as many evaluations, and one of six is not solved.
+        # Sweeps compare costs, which with adaptive accuracy are not those of the last iterate: without polishing, 2 of
+        # 16 scenarios would be solved instead of all.
         return NewtonOptions(self.tolerance, self.accuracy, iterations, adaptive=False)
 
     def _connect_remaining(self) -> None:
         """Connect the nodes that shooting did not connect.
 
-        Tries longer arcs without some of the nodes first, and then a search for controls by Gauss-Newton iterations.
+        Tries longer arcs without some of the nodes first, and then a search for local minima on piecewise constant
+        controls.
         """
         while not self.feasible and self.segments > 1:
             k = int(np.flatnonzero(np.isinf(self.costs))[0])

@@ -151,7 +151,8 @@ def solve_nodes(flow, times, Z, start, end, options, costs, log):
             slack = accuracy_slack(current, required, unknowns)
             if is_sufficient_decrease(trial_norm, norm, damping / 2.0, slack):
                 break
-            # With one segment, this test would accept steps to costates of 1e10.
+            # With one segment, this test would accept a step after which the method stalls: from a guess of the costate
+            # that is solved otherwise, in the problem `se2-far` of the tests.
             if segments > 1 and trial_norm < np.inf and _is_contracting(matrix, rhs, step, half, damping / 4.0):
                 break
             damping /= 2.0

@@ -28,8 +28,9 @@ FIRST_SHIFT, MAX_SHIFT = 100.0, 1e7  # of the Hessian, divided by the square of 
 # A path with more intervals is long. With 512, the barrier has more curvature than the largest shift in mazes of 500 m.
 INTERVALS_OF_PART = 64
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
-# With a penalty of 300 instead of 10, full steps are rejected where the dynamics are strongly curved: 10 of 245 paths
-# of the unicycle, 50 of 307 of the differential drive and 29 of 580 of the car do not converge; with 10, 0, 27 and 0.
+# With a penalty of 300, full steps are rejected where the dynamics are strongly curved: 10 of 245 paths of the
+# unicycle, 54 of 302 of the differential drive and 30 of 581 of the car do not converge; with 10, none, 23 of 300 and
+# none.
 END_PENALTY, PENALTY = 1e4, 10.0
 MAX_STEP_LENGTHS = 5  # step lengths that the line search tries: 1, 1/2, ...
 MAX_ACTIVE_SETS = 8  # iterations per step that determine the controls at their limits

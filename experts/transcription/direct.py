@@ -132,7 +132,7 @@ def optimise(
     """Compute a local optimum of the discretised problem from a guess.
 
     Args:
-        problem: the problem of a scenario, with the winding of the goal heading chosen.
+        problem: the problem, with the windings of its goal angles chosen. The times are those of the guess.
         guess: initial guess; its states, controls and costates need not be consistent.
         max_iterations: number of iterations after which the result has not converged, for a path of up to
             2 INTERVALS_PER_LIMIT intervals.

@@ -94,6 +94,7 @@ def _shooting(name: str, problem: OptimalControlProblem, times: np.ndarray, gues
     status = Status.MAX_ITERATIONS
     for limit in range(MAX_NEWTON_STEPS + 1):
         nodes = guess.copy()
+        # Over the whole horizon, the first extremal cannot be integrated with the fine accuracy.
         status, rows, _ = polish(problem, times, nodes, TOLERANCE, limit, fine=len(times) > 2)
         if len(rows) <= limit:
             break
