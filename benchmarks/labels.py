@@ -18,11 +18,10 @@ from rich.table import Table
 from leapnav.envs import NavigateEnv, Scenario, ScenarioBank
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import ExpertPolicy, find_optimum
 from leapnav.experts.acting.policy import NoOptimumError
 from leapnav.training import GoToGoal, evaluate
-from leapnav.training.learning.takeovers import MIN_TIME_LEFT, samples_of
+from leapnav.training.learning.takeovers import MIN_TIME_LEFT, Labeller
 
 FAMILIES = ("clutter", "polygons", "rooms", "slalom")
 LEAD = 3.0  # s
@@ -42,14 +41,14 @@ def takeovers(family: str, count: int) -> list[Scenario]:
         if episode.success or left < MIN_TIME_LEFT + LEAD:
             continue
         rest = scenario.model_copy(update={"start": tuple(episode.states[step].tolist()), "horizon": left})
-        if find_optimum(rest, thorough=False, alternatives=False).success:
+        if find_optimum(rest, "low").success:
             found.append(rest)
     return found
 
 
 def in_the_environment(env: NavigateEnv, scenario: Scenario) -> list[np.ndarray]:
     """Return the actions of the expert, which drives in the environment."""
-    expert, actions = ExpertPolicy(env, quick=True, workers=1), []
+    expert, actions = ExpertPolicy(env, effort="low", workers=1), []
 
     def act(observation, info):
         if info["time"] >= LEAD - 1e-9:
@@ -76,16 +75,14 @@ def main() -> None:
         table.add_column(column, justify="left" if column == "family" else "right")
     for family in arguments.families:
         scenarios = takeovers(family, arguments.episodes)
-        env, observer = NavigateEnv(split="fresh", lidar_beams=128), Observer(SETTINGS)
+        env, labeller = NavigateEnv(split="fresh", lidar_beams=128), Labeller(SETTINGS, LEAD, "low")
         driven = labelled = 0.0
         count = 0
         for scenario in scenarios:
             start = time.perf_counter()
             actions = in_the_environment(env, scenario)
             middle = time.perf_counter()
-            samples = samples_of(
-                observer, SETTINGS, scenario, find_optimum(scenario, thorough=False, alternatives=False), LEAD
-            )
+            samples = labeller.samples(scenario, find_optimum(scenario, "low"))
             end = time.perf_counter()
             assert len(actions) == len(samples)
             assert np.median(np.abs(samples.actions - np.array(actions))) < AGREEMENT

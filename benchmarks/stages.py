@@ -3,7 +3,7 @@
     python benchmarks/stages.py [--count N]
 
 The stages are timed by wrapping their functions, which takes less than 1 % of the time. The rest is Python between
-kernels. The columns with alternatives=False, on the same scenarios in the same run, show the search for the best path
+kernels. The columns with effort="medium", on the same scenarios in the same run, show the search for the best path
 only, and that its cost is the same.
 """
 
@@ -53,7 +53,7 @@ def measure(scenarios: list[Scenario]) -> tuple[dict[str, float], list[float], l
     find_optimum(scenarios[0])  # loads the kernels
     for scenario in scenarios:
         start = time.perf_counter()
-        alone = find_optimum(scenario, alternatives=False)
+        alone = find_optimum(scenario, "medium")
         best.append(1e3 * (time.perf_counter() - start))
         with ExitStack() as stack:
             for stage, functions in STAGES.items():
@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, help="scenarios per row")
     count = parser.parse_args().count
     table = Table(title=f"Stages of find_optimum, {count} scenarios per row, one process (ms)")
-    for column in ("family", "robot", *STAGES, "rest", "mean", "median", "alternatives=False", "ratio"):
+    for column in ("family", "robot", *STAGES, "rest", "mean", "median", "effort=medium", "ratio"):
         table.add_column(column, justify="left" if column in ("family", "robot") else "right")
     rows = [(family, "unicycle") for family in FAMILIES] + [("clutter", robot) for robot in ROBOTS]
     for family, robot in rows:

@@ -76,6 +76,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `motion` (robots with further states) | k | further state k of the robot's model, such as speed and turn rate; a heading relative to that of the robot | | -20 to 20 |
     | `motion` (`"motor"` only) | 0, 1 | velocity in the robot's frame: ahead, to the left | m/s | -20 to 20 |
     | | 2 | turn rate | rad/s | -20 to 20 |
+    | `action` (`previous_action=True` only) | k | the last action; 0 at the start of an episode | 1 | -1 to 1 |
     | `lidar` (`"lidar"` and `"geodesic"`) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
     | `detours` (`"geodesic"` only) | k | how much longer than the shortest path to the goal a path is that starts along beam k, for 0.25 m or more, or as far as there is room | m | 0 to 3 |
     | `distance` (`"geodesic"` only) | 0 | geodesic distance: length of the shortest path among the obstacles to the goal position | m | 0 to 2000 |
@@ -84,6 +85,9 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `obstacles` (`"map"` only) | per obstacle: 0 | 1; in a row without an obstacle, all entries are 0 | 1 | 0 to 1 |
     | | 1 | radius of a disc or a capsule, 0 for a polygon | m | 0 to 1000 |
     | | 2 ... | vertices in the robot's frame: ahead, to the left; for a disc, its centre; for a capsule, its ends; repeated to fill the row | m | -1000 to 1000 |
+
+    With `history=(0.4, 1.2)`, the observations 0.4 s and 1.2 s before follow in this order, each with all parts; before
+    the start of an episode, its first observation is used.
 
     `observation="lidar"` contains `lidar_beams` ranges. `"map"` contains the `map_obstacles` nearest discs, capsules
     and polygons, in order of distance, with `map_vertices` vertices each. `"state"` contains neither; it suits
@@ -177,6 +181,8 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
     | `terminate_on_collision` | True | whether a collision ends the episode |
     | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and maximum range (m) |
+    | `history` | () | ages of earlier observations in the observation, increasing (s); rounded to control periods |
+    | `previous_action` | False | whether the observation contains the last action |
     | `map_obstacles`, `map_vertices` | 8, 8 | number of discs, capsules and polygons in the map, and of vertices of each; more vertices are an error |
     | `render_mode` | None | `"rgb_array"` or `"human"` |
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numba import from_dtype
@@ -29,9 +29,12 @@ REWARDS, ACTUATIONS = ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS, HORIZONS = ("sparse", "cost"), ("fixed", "free")
 OBSTACLE_KINDS = "cost", "hard"  # see `Cost.obstacles`
 # Arguments that determine what is observed.
-SENSORS = ("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices")
+SENSORS = (
+    *("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices"),
+    *("history", "previous_action"),
+)
 MIN_PERIOD = 1e-4  # s
-MAX_COUNT = 10_000  # beams, obstacles in the map, or vertices of each
+MAX_COUNT = 10_000  # beams, obstacles in the map, vertices of each, or control periods of the history
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,8 @@ class EnvironmentSettings:
     lidar_range: float = 10.0
     map_obstacles: int = 8
     map_vertices: int = 8
+    history: tuple[float, ...] = ()
+    previous_action: bool = False
     goal_conditioned: bool = False
 
     def __post_init__(self) -> None:
@@ -137,7 +142,7 @@ class EnvironmentSettings:
         check_fraction("discount", self.discount, zero=False)
         for name, minimum in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
             check_integer(name, getattr(self, name), minimum, MAX_COUNT)
-        for name in ("terminate_on_collision", "dict_observation"):
+        for name in ("terminate_on_collision", "dict_observation", "previous_action"):
             check_flag(name, getattr(self, name))
         if self.motors and self.robot != "unicycle":
             raise ValueError(f"actuation: 'motor' needs the robot 'unicycle', got {self.robot!r}")
@@ -161,8 +166,33 @@ class EnvironmentSettings:
                 "observation: geodesic distances depend on the goal, which a goal-conditioned learner replaces; "
                 "expected 'lidar', 'state' or 'map', got 'geodesic'"
             )
+        object.__setattr__(self, "history", self._checked_history())
         object.__setattr__(self, "disturbance", _as_disturbance(self.disturbance))
         object.__setattr__(self, "motor", _as_dataclass("motor", Motor, self.motor))
+
+    def _checked_history(self) -> tuple[float, ...]:
+        """Return the history as a tuple of floats, after a check."""
+        given, longest = self.history, MAX_COUNT * self.control_period
+        if not isinstance(cast(object, given), (tuple, list)) or not all(is_number(age) for age in given):
+            raise ValueError(f"history: expected a sequence of ages in seconds, got {given!r}")
+        ages = tuple(map(float, given))
+        if not all(before < age <= longest for before, age in zip((0.0, *ages), ages, strict=False)):
+            raise ValueError(f"history: expected increasing ages in (0, {longest:g}] s, got {given!r}")
+        if ages and ages[0] < self.control_period / 2:
+            raise ValueError(f"history: expected ages of at least one control period, got {ages[0]:g}")
+        for name, conflicting in (("dict_observation", self.dict_observation), ("goal", self.goal_conditioned)):
+            if conflicting and (ages or self.previous_action):
+                option = "history" if ages else "previous_action"
+                kind = "dictionaries" if name == "dict_observation" else "those of a goal-conditioned environment"
+                raise ValueError(
+                    f"{option}: expected the default, because observations are {kind}, got {getattr(self, option)!r}"
+                )
+        return ages
+
+    @property
+    def lags(self) -> tuple[int, ...]:
+        """The ages of the history in control periods."""
+        return tuple(round(age / self.control_period) for age in self.history)
 
     @classmethod
     def of(cls, env: Any, source: Any, arguments: Mapping[str, Any]) -> Self:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
-from leapnav.envs.utils.validation import check_integer
+from leapnav.envs.utils.validation import check_choice
 from leapnav.experts.hard_limits import BARRIER_TOLERANCE, FACTOR, follow_best
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, Status
@@ -39,6 +39,7 @@ from leapnav.experts.transcription.direct import generated_functions
 # those of the extremals by up to 20 %. Of 400 test scenarios of the car, 13 optima would be missed without this factor,
 # by up to 12 %; 4 with a factor of 2; and 2 with a factor of 3, by less than 0.5 %.
 NOT_ROTATING_FACTOR = 3
+N_CANDIDATES = 12  # of a round
 N_FIRST = 3  # candidates after which, without alternatives, those that are too long are omitted
 # Distance (m) from start to goal above which many candidates are about as long as the shortest.
 PARTIAL_DISTANCE = 20.0
@@ -47,11 +48,11 @@ MAX_ROUNDS = 4  # rounds of candidates of a lattice
 REFINEMENT = 2  # of the second lattice, which is searched while a better path may have been missed
 # Distance (m) from start to goal above which shortest paths in the plane are the candidates, and their number.
 LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
-# Evaluations of the flow, per requested candidate, that may be spent on candidates that cost more than the best one.
-# With 12,000, 3 of 40 alternatives in 12 scenarios of `slalom` would be missed; 30,000 find no others.
-ALTERNATIVES_BUDGET = 20_000
-# `shortest_horizon`: candidates of each search, relative tolerance, and largest multiple of the scenario's horizon.
-N_BISECTED, HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 6, 0.02, 1000.0
+# Evaluations of the flow that may be spent on candidates that cost more than the best one. With 144,000, 3 of 40
+# alternatives in 12 scenarios of `slalom` would be missed; 360,000 find no others.
+ALTERNATIVES_BUDGET = 240_000
+# `shortest_horizon`: relative tolerance, and largest multiple of the scenario's horizon.
+HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 0.02, 1000.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,7 +62,7 @@ class Optimum(Extremal):
     Attributes:
         alternatives: the other distinct local optima that were found and certified, in order of cost; their own
             `alternatives` are empty. If each takes long, on long paths or among hundreds of obstacles, some are
-            missing; more `candidates` find more of them.
+            missing.
         doubts: solutions without a certificate that cost less than this optimum. The status is the reason for the
             missing certificate.
 
@@ -129,21 +130,12 @@ def _compile_kernels(*_: FunctionPointer) -> None:
     prepare(*kernels_of(*SEARCH_MODULES))
 
 
-class Effort(NamedTuple):
-    """The effort of a search, see `find_optimum`."""
-
-    candidates: int
-    thorough: bool
-    alternatives: bool
+Effort = Literal["low", "medium", "high"]
+EFFORTS: tuple[Effort, ...] = get_args(Effort)
 
 
 def find_optimum(
-    scenario: Scenario,
-    candidates: int = 12,
-    *,
-    thorough: bool = True,
-    alternatives: bool = True,
-    barrier_tolerance: float = BARRIER_TOLERANCE,
+    scenario: Scenario, effort: Effort = "high", *, barrier_tolerance: float = BARRIER_TOLERANCE
 ) -> Optimum:
     """Find the minimum-cost certified extremal of a scenario.
 
@@ -158,13 +150,11 @@ def find_optimum(
 
     Args:
         scenario: the scenario.
-        candidates: number of candidates per round, three times as many for a robot that cannot rotate in place. Further
-            rounds follow only while none is certified or a better candidate may have been missed. The effort for
-            alternatives grows with this number.
-        thorough: False examines the first round only. It usually contains the optimum, and a scenario without a path
-            is recognised 50 times faster; but the only path may be missed, and the status of a failure is a guess.
-        alternatives: False omits candidates and local optima that cost more than the best one, which takes 0.3 to 0.5
-            of the time; `alternatives` then contains only what was found on the way.
+        effort: "high" finds the optimum and its alternatives. "medium" finds the optimum: candidates and local optima
+            that cost more are omitted, which takes 0.3 to 0.5 of the time, and `alternatives` contains only what was
+            found on the way. "low" examines the first round of candidates only, of which there are 12, or 36 for a
+            robot that cannot rotate in place. It usually contains the optimum, and a scenario without a path is
+            recognised 50 times faster; but the only path may be missed, and the status of a failure is a guess.
         barrier_tolerance: with the proximity weight 0, largest proximity cost that remains, as a fraction of the cost.
 
     Returns:
@@ -172,12 +162,12 @@ def find_optimum(
 
     Raises:
         TypeError: `scenario` is not a Scenario.
-        ValueError: candidates < 1.
+        ValueError: the effort is unknown.
 
     """
     if not isinstance(cast(object, scenario), Scenario):
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
-    candidates = check_integer("candidates", candidates, 1)
+    check_choice("effort", effort, EFFORTS)
     problem = OptimalControlProblem.from_scenario(scenario)
     _compile_kernels(*generated_functions(problem))
     if problem.horizon is None and problem.starts_at_goal:
@@ -185,16 +175,15 @@ def find_optimum(
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
-    effort = Effort(candidates, thorough, alternatives)
     optima, failed = _search(scenario, problem, effort)
     if optima is None or (failed is not None and not optima.certified):
         return as_optimum(failure(problem, failed or Status.NO_PATH))
-    found = _result(optima, barrier_tolerance, alternatives)
+    found = _result(optima, barrier_tolerance, effort)
     if optima.certified and not found.success:  # the continuation stalled at a barrier weight
         weight = max(FACTOR * found.problem.barrier_weight, scenario.cost.proximity_weight)
         optima, _ = _search(scenario, problem.with_barrier(weight), effort)
         if optima is not None and optima.certified:
-            found = _result(optima, barrier_tolerance, alternatives)
+            found = _result(optima, barrier_tolerance, effort)
     return found
 
 
@@ -224,7 +213,7 @@ def find_reached_optimum(
     followed = None if guess is None else solve(reached, "multiple_shooting", guess=guess)
     if followed is not None and followed.success and followed.cost <= cost:
         return followed
-    found = find_optimum(reached, alternatives=False)
+    found = find_optimum(reached, "medium")
     if followed is not None and followed.success and not (found.success and found.cost <= followed.cost):
         return followed
     return found
@@ -249,7 +238,7 @@ def shortest_horizon(scenario: Scenario) -> float | None:
 
     def suffices(horizon: float) -> bool:
         changed = scenario.model_copy(update={"horizon": horizon})
-        return find_optimum(changed, N_BISECTED, thorough=False, alternatives=False).success
+        return find_optimum(changed, "low").success
 
     low, high = 0.0, scenario.horizon
     while not suffices(high):
@@ -272,17 +261,17 @@ def _search(
 
     """
     optima, shortest_time = None, np.inf
-    for build, is_optional in _lattices(scenario, effort.thorough):
+    for build, is_optional in _lattices(scenario, effort):
         if is_optional and optima is not None and optima.certified:
             break
         lattice = build()
         energy = first_energy(lattice)
         if energy > 0.0:
             if optima is None:
-                budget = ALTERNATIVES_BUDGET * effort.candidates if effort.alternatives else 0.0
+                budget = ALTERNATIVES_BUDGET if effort == "high" else 0.0
                 optima = LocalOptima(scenario, problem, energy, budget)
             found = _candidate_search(lattice.with_weight(optima.problem.proximity_weight), energy, effort)
-            for _ in range(1 if lattice.is_whole or not effort.thorough else MAX_ROUNDS):
+            for _ in range(1 if lattice.is_whole or effort == "low" else MAX_ROUNDS):
                 batch, last = _add(optima, found, effort)
                 if not batch:
                     break
@@ -292,7 +281,7 @@ def _search(
                         optima.add(_trajectories(found.take_elsewhere(N_ELSEWHERE)))
                     return optima, None
         # Lattice paths may lead through passages that are slightly too narrow, so this is checked separately.
-        if effort.thorough and (optima is None or not optima.certified) and not is_connected(scenario):
+        if effort != "low" and (optima is None or not optima.certified) and not is_connected(scenario):
             return optima, Status.NO_PATH
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if shortest_time == np.inf:
@@ -300,7 +289,7 @@ def _search(
     return optima, Status.HORIZON_TOO_SHORT if shortest_time > horizon else None
 
 
-def _lattices(scenario: Scenario, thorough: bool) -> Iterator[tuple[Callable[[], Lattice], bool]]:
+def _lattices(scenario: Scenario, effort: Effort) -> Iterator[tuple[Callable[[], Lattice], bool]]:
     """Yield functions that build the lattices to search, each with whether a certified extremal makes it unnecessary.
 
     The first one covers the surroundings of start and goal.
@@ -312,7 +301,7 @@ def _lattices(scenario: Scenario, thorough: bool) -> Iterator[tuple[Callable[[],
     yield lambda: first, False
     if first.cropped:  # the path may leave the surroundings of start and goal
         yield lambda: plane_lattice(scenario), True
-    elif thorough:  # a passage or a short path may need smaller cells, or all paths may have been in collision
+    elif effort != "low":  # a passage or a short path may need smaller cells, or all paths may have been in collision
         yield lambda: Lattice(scenario, REFINEMENT), False
         yield lambda: Lattice(scenario, REFINEMENT, strict=True), True
 
@@ -330,7 +319,7 @@ def _add(search: LocalOptima, found: CandidateSearch, effort: Effort) -> tuple[l
         The candidates, and the cost up to which all candidates are taken.
 
     """
-    count = effort.candidates * (1 if found.lattice.moves.rotating else NOT_ROTATING_FACTOR)
+    count = N_CANDIDATES * (1 if found.lattice.moves.rotating else NOT_ROTATING_FACTOR)
     if found.lattice.is_whole:
         batch = found.take(N_PLANE_PATHS, LATTICE_ERROR * found.cheapest)
         search.add(_trajectories(batch))
@@ -363,7 +352,7 @@ def _omits(lattice: Lattice, effort: Effort) -> bool:
 
     It may not if the robot cannot rotate in place, because the lengths of its lattice paths are not accurate enough.
     """
-    return not effort.alternatives and lattice.moves.rotating
+    return effort != "high" and lattice.moves.rotating
 
 
 def _shortest_time(candidate: Candidate, scenario: Scenario) -> float:
@@ -371,13 +360,14 @@ def _shortest_time(candidate: Candidate, scenario: Scenario) -> float:
     return 0.0 if scenario.horizon is None else float(shortest_durations(candidate.poses, scenario).sum())
 
 
-def _result(optima: LocalOptima, tolerance: float, alternatives: bool) -> Optimum:
+def _result(optima: LocalOptima, tolerance: float, effort: Effort) -> Optimum:
     """The best extremal with its alternatives, or the most informative failure."""
     if not optima.certified:
         worst = optima.best_failure
         return as_optimum(failure(optima.problem, Status.STALLED) if worst is None else worst)
     doubts = optima.doubts(optima.best.cost)
-    best, *others = follow_best(optima.certified, optima.scenario.cost.proximity_weight, tolerance, alternatives)
+    weight = optima.scenario.cost.proximity_weight
+    best, *others = follow_best(optima.certified, weight, tolerance, alternatives=effort == "high")
     found = tuple(map(as_optimum, others)) if best.success else ()
     return replace(as_optimum(best), alternatives=found, doubts=doubts)
 

@@ -37,6 +37,13 @@ METHODS: dict[str, Callable[[OptimalControlProblem, Trajectory, SolverOptions], 
     "leapfrog": leapfrog,
     "collocation": collocation,
 }
+# The methods of each option that not all have.
+OPTIONS = {
+    "segments": ("multiple_shooting", "leapfrog", "collocation"),
+    "polish": ("leapfrog", "collocation"),
+    "update": ("leapfrog",),
+    "order": ("leapfrog",),
+}
 # Without a guess, at most this number of initial paths is solved, until one costs more than the best by this fraction.
 MAX_INITIAL_PATHS, SIMILAR_COST = 4, 0.05
 
@@ -49,9 +56,9 @@ def solve(
     max_iterations: int = 60,
     segments: int | None = None,
     *,
-    polish: bool = True,
-    update: Literal["mean_time", "half_cost"] = "mean_time",
-    order: Literal["sequential", "red_black"] = "sequential",
+    polish: bool | None = None,
+    update: Literal["mean_time", "half_cost"] | None = None,
+    order: Literal["sequential", "red_black"] | None = None,
     barrier_tolerance: float = BARRIER_TOLERANCE,
     raise_on_failure: bool = False,
 ) -> Extremal:
@@ -74,14 +81,16 @@ def solve(
             angles.
         tol: largest residual of the boundary and continuity conditions. The certificate requires 1e-8 in any case.
         max_iterations: maximum number of Newton steps.
-        segments: number of shooting segments, of Leapfrog segments or of intervals of the first collocation mesh. None
-            derives it from the guess, and lets multiple shooting subdivide segments where necessary.
-        polish: finish Leapfrog and collocation with multiple-shooting Newton steps, which is much faster. False:
-            Leapfrog removes nodes until one sub-problem spans the whole problem, and collocation iterates to `tol`.
-        update: where Leapfrog places a node on the extremal of its sub-problem: at the mean time of the neighbouring
-            nodes, or at half the cost.
-        order: order of the nodes in a Leapfrog sweep. "red_black" updates the nodes with odd index, which are
-            independent of each other, and then those with even index.
+        segments: number of shooting segments, of Leapfrog segments or of intervals of the first collocation mesh; not
+            for single shooting. None derives it from the guess, and lets multiple shooting subdivide segments where
+            necessary.
+        polish: for Leapfrog and collocation: finish with multiple-shooting Newton steps, which is much faster; the
+            default. False: Leapfrog removes nodes until one sub-problem spans the whole problem, and collocation
+            iterates to `tol`.
+        update: for Leapfrog: where a node is placed on the extremal of its sub-problem, at the "mean_time" of the
+            neighbouring nodes (the default), or at the "half_cost".
+        order: for Leapfrog: order of the nodes in a sweep, "sequential" (the default), or "red_black": first those with
+            odd index, which are independent of each other, and then those with even index.
         barrier_tolerance: with hard limits, largest integral of the barrier as a fraction of the cost.
         raise_on_failure: raise an exception instead of returning a failure.
 
@@ -89,7 +98,7 @@ def solve(
         An `Extremal` whose status is based on its certificate.
 
     Raises:
-        ValueError, TypeError: an argument is invalid; the message names it.
+        ValueError, TypeError: an argument is invalid, or not one of the method; the message names it.
         SolveError: no success with `raise_on_failure`; the attribute `extremal` is the failed result.
 
     """
@@ -180,13 +189,17 @@ def _from_guess(
 
 
 def _options(
-    method: str, tol: float, max_iterations: int, segments: int | None, polish: bool, update: Any, order: Any
+    method: str, tol: float, max_iterations: int, segments: int | None, polish: bool | None, update: Any, order: Any
 ) -> SolverOptions:
     check_choice("method", method, METHODS)
     check_positive("tol", tol)
     check_at_least("max_iterations", max_iterations, 1)
     if segments is not None:
         segments = check_integer("segments", segments, 1)
+    for name, value in (("segments", segments), ("polish", polish), ("update", update), ("order", order)):
+        if value is not None and method not in OPTIONS[name]:
+            raise ValueError(f"{name}: expected none for the method {method!r}, got {value!r}")
+    polish, update, order = polish is not False, update or "mean_time", order or "sequential"
     check_choice("update", update, ("mean_time", "half_cost"))
     check_choice("order", order, ("sequential", "red_black"))
     return SolverOptions(tol, max_iterations, segments, polish, update, order)

@@ -11,6 +11,7 @@ from leapnav.cli import main
 from leapnav.envs import ScenarioBank
 from leapnav.experts import ExpertPolicy
 from leapnav.training import (
+    PolicyFactory,
     RandomPolicy,
     compare,
     evaluate,
@@ -36,7 +37,7 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
             "function": towards_the_goal,
             "object": RandomPolicy(env.action_space),
             "class": ExpertPolicy,
-            "factory": lambda env: ExpertPolicy(env, feedback="gains"),
+            "factory": PolicyFactory(lambda env: ExpertPolicy(env, feedback="gains")),
             "name": "go-to-goal",
             "other observations": (lambda observation: [0.0, 0.0], {"observation": "state"}),
             "seeds": [make_policy(env.observation_space, env.action_space, seed, SMALL) for seed in (0, 1)],

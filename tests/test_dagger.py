@@ -5,27 +5,18 @@ from helpers import QUICK, fresh
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.experts import ExpertPolicy, find_optimum
-from leapnav.training import DAgger, DAggerConfig, Dataset, behaviour_clone, make_vec_env
+from leapnav.training import CloningConfig, DAgger, DAggerConfig, Dataset, behaviour_clone, evaluate
+from leapnav.training.environments.playing import PlayedEpisode
 from leapnav.training.learning.driving import DrivenEpisode
 from leapnav.training.learning.takeovers import Labeller, rest_of, scheduled_steps
-from leapnav.training.robots.rewards import ScaledReward
 
 
 def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tmp_path):
     """The samples are those of the optimum from states of the learner; rounds are stored on disk."""
     policy = fresh(env)
     behaviour_clone(policy, dataset, QUICK, progress=False)
-    venv = make_vec_env(n_envs=4, family="open", split="fresh")
     config = DAggerConfig(rounds=2, max_episodes=6, lead=1.0)
-    dagger = DAgger(
-        policy,
-        ExpertPolicy(venv, quick=True),
-        venv,
-        config,
-        cloning=QUICK,
-        dataset=dataset,
-        folder=tmp_path / "rounds",
-    )
+    dagger = DAgger(policy, "open", config, cloning=QUICK, dataset=dataset, folder=tmp_path / "rounds", robots=4)
     rounds = dagger.run(progress=False)
     assert [done.number for done in rounds] == [1, 2]
     assert all(done.episodes >= 4 for done in rounds)
@@ -49,8 +40,18 @@ def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tm
 
 def driven(scenario, states, *, success=False, collision=False, costs=None):
     """An episode with given states."""
-    costs = np.zeros(len(states)) if costs is None else costs
-    return DrivenEpisode(scenario, np.asarray(states, dtype=float), costs, success, collision)
+    count = len(states)
+    played = PlayedEpisode(
+        states=np.asarray(states, dtype=float),
+        actions=np.zeros((count - 1, 2), np.float32),
+        costs=np.zeros(count) if costs is None else costs,
+        episode_return=0.0,
+        clearance=0.1,
+        success=success,
+        collision=collision,
+        truncated=False,
+    )
+    return DrivenEpisode(scenario, played)
 
 
 def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
@@ -67,7 +68,7 @@ def test_the_expert_takes_over_before_the_failure_and_until_it_is_too_late():
         assert (rest.goal, rest.obstacles) == (scenario.goal, scenario.obstacles)
     assert len(scheduled_steps(driven(scenario, poses, success=True), 0.05, rng)) == 1
     late = driven(scenario, np.linspace(scenario.start, scenario.goal, round(scenario.horizon / 0.05) + 1))
-    assert rest_of(late, len(late.states) - 15, 0.05) is None  # less than 1 s before the horizon
+    assert rest_of(late, len(late.played.states) - 15, 0.05) is None  # less than 1 s before the horizon
 
 
 def test_with_a_free_horizon_the_expert_takes_over_where_the_robot_stops():
@@ -85,7 +86,7 @@ def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
     scenario = sample_scenario("open", 7)
     steps = np.arange(round(scenario.horizon / 0.05) + 1)
     states = np.array(scenario.start) * np.ones((len(steps), 1))
-    labeller = Labeller(EnvironmentSettings(), DAggerConfig(), quick=True)
+    labeller = Labeller(EnvironmentSettings(), DAggerConfig().lead, "low")
     parts = labeller.label(driven(scenario, states), np.random.default_rng(0))
     left = [Scenario.from_json(part.scenarios[0]).horizon for part in parts]
     assert left and left == sorted(left, reverse=True)
@@ -95,35 +96,50 @@ def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
 
 def test_dagger_is_the_same_with_any_number_of_workers(env, monkeypatch):
     monkeypatch.setattr("leapnav.training.learning.dagger.LABELLED_PER_TASK", 1)
-    monkeypatch.setattr("leapnav.training.learning.dagger.DRIVEN_PER_TASK", 2)
     found = []
     for workers in (1, 2):
         policy = fresh(env)
-        venv = make_vec_env(n_envs=2, family="open", split="fresh")
-        config = DAggerConfig(rounds=1, max_episodes=2, lead=0.5, seed=4)
-        dagger = DAgger(policy, ExpertPolicy(venv), venv, config, cloning=QUICK, workers=workers)
+        config = DAggerConfig(rounds=1, max_episodes=4, lead=0.5, seed=4)
+        dagger = DAgger(policy, "open", config, cloning=QUICK, robots=2, effort="medium", workers=workers)
         dagger.run(progress=False)
         found.append((policy.parameters_to_vector().tobytes(), dagger.dataset.observations.tobytes()))
     assert found[0] == found[1]
-    with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
-        DAgger(fresh(env), ExpertPolicy(venv), venv, workers=0)
 
 
 @pytest.mark.parametrize(
     "settings", [{"rounds": 0}, {"max_failures": 0}, {"successes": -1.0}, {"learning_rate": -1.0}, {"lead": 0.0}]
 )
-def test_bad_settings_of_dagger_are_named(settings, env, dataset):
-    venv = make_vec_env(n_envs=1, family="open", split="fresh")
+def test_bad_settings_of_dagger_are_named(settings, env):
     with pytest.raises(ValueError, match=f"{next(iter(settings))}: "):
-        DAgger(fresh(env), ExpertPolicy(venv), venv, DAggerConfig(**settings))
-    with pytest.raises(ValueError, match="expert: expected one for venv"):
-        DAgger(fresh(env), ExpertPolicy(make_vec_env(n_envs=1, family="open")), venv)
-    for arguments, name in (({"disturbance": 0.1}, "disturbances"), ({"actuation": "motor"}, "motors")):
-        robots = make_vec_env(n_envs=1, family="open", split="fresh", **arguments)
-        with pytest.raises(ValueError, match=f"venv: expected an environment without {name}"):
-            DAgger(fresh(env), ExpertPolicy(robots), robots)
-    shaped = make_vec_env(n_envs=1, family="open", split="fresh", reward="shaped")
-    with pytest.raises(ValueError, match="dataset: reward: expected that of the environment, 'shaped', got 'cost'"):
-        DAgger(fresh(env), ExpertPolicy(shaped), shaped, dataset=dataset)
-    with pytest.raises(TypeError, match="venv: expected one from"):
-        DAgger(fresh(env), ExpertPolicy(venv), ScaledReward(venv, 2.0))
+        DAgger(fresh(env), "open", DAggerConfig(**settings))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"workers": 0}, "workers: expected at least 1, got 0"),
+        ({"robots": 0}, "robots: expected at least 1, got 0"),
+        ({"effort": "some"}, "effort: expected one of low, medium, high, got 'some'"),
+        ({"environment": {"disturbance": 0.1}}, "environment: expected one without disturbances"),
+        ({"environment": {"actuation": "motor"}}, "environment: expected one without motors"),
+        ({"environment": {"reward": "shaped"}}, "dataset: reward: expected that of the environment, 'shaped', got"),
+    ],
+)
+def test_bad_arguments_of_dagger_are_named(arguments, message, env, dataset):
+    with pytest.raises(ValueError, match=message):
+        DAgger(fresh(env), "open", dataset=dataset, **arguments)
+
+
+def test_dagger_improves_a_clone(env, dataset):
+    """A few rounds raise the success of a clone of few demonstrations in the test split."""
+    policy = fresh(env)
+    few = dataset[dataset.episodes < 4]
+    behaviour_clone(policy, few, QUICK, progress=False)
+    options = {"environment": {"lidar_beams": 32}, "timed": False, "progress": False, "count": 60}
+    before = evaluate(policy, "open", **options)
+    config = DAggerConfig(rounds=2, max_failures=25, max_episodes=100, last_epochs=12, epochs=6)
+    dagger = DAgger(policy, "open", config, cloning=CloningConfig(batch_size=128), dataset=few)
+    dagger.run(progress=False)
+    after = evaluate(policy, "open", **options)
+    assert after.success > before.success + 0.15
+    assert after.soc > before.soc + 0.1

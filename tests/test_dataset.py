@@ -98,7 +98,7 @@ def test_mirroring_and_time_reversal_are_symmetries_of_the_environment():
 
 def test_time_reversal_needs_an_even_number_of_beams():
     with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
-        time_reverse(th.zeros(1, 12), th.zeros(1, 2))
+        time_reverse(th.zeros(1, 12), th.zeros(1, 2), EnvironmentSettings(lidar_beams=3))
 
 
 def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):

@@ -124,7 +124,7 @@ def test_demonstrations_survive_the_dataset(folder):
     demonstrations = load_demonstrations(folder)
     first = demonstrations[0]
     assert first.scenario == sample_scenario("clutter", 50)
-    extremal = find_optimum(first.scenario, alternatives=False)
+    extremal = find_optimum(first.scenario, "medium")
     again = demonstrate(NavigateEnv(), first.scenario, extremal)
     for name in ("observations", "actions", "rewards", "states", "costates", "cost_to_go", "running_cost"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name

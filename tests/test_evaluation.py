@@ -14,6 +14,7 @@ from leapnav.training import (
     Episode,
     Evaluation,
     GoToGoal,
+    PolicyFactory,
     RandomPolicy,
     compare,
     evaluate,
@@ -66,7 +67,9 @@ def test_the_expert_scores_one_and_random_zero():
     assert expert.soc == pytest.approx(1.0, abs=1e-3)
     assert abs(expert.regret) < 1e-3
     assert 0 < expert.milliseconds < 1000
-    random = evaluate(lambda env: RandomPolicy(NavigateEnv().action_space), "open", count=10, progress=False)
+    random = evaluate(
+        PolicyFactory(lambda env: RandomPolicy(NavigateEnv().action_space)), "open", count=10, progress=False
+    )
     assert random.success == 0.0
     assert random.soc == 0.0
     assert math.isnan(random.regret)
@@ -101,10 +104,8 @@ def test_the_episodes_are_those_of_the_single_environment():
 
 
 def test_evaluation_is_deterministic():
-    one, other = (
-        evaluate(lambda env: RandomPolicy(NavigateEnv().action_space, 4), "open", count=5, timed=False, progress=False)
-        for _ in range(2)
-    )
+    random = PolicyFactory(lambda env: RandomPolicy(NavigateEnv().action_space, 4))
+    one, other = (evaluate(random, "open", count=5, timed=False, progress=False) for _ in range(2))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a.states, b.states)
         assert a.cost == b.cost
@@ -112,7 +113,7 @@ def test_evaluation_is_deterministic():
 
 def test_regret_is_measured_against_the_pose_that_was_reached():
     """A policy that stops before the goal has a lower cost than J*; the optimum to its final pose has, too."""
-    found = evaluate(lambda env: Planned(env, 0.995), "open", count=COUNT, timed=False, progress=False)
+    found = evaluate(PolicyFactory(lambda env: Planned(env, 0.995)), "open", count=COUNT, timed=False, progress=False)
     assert found.success == 1.0
     for episode in found:
         assert episode.cost < episode.reference_cost

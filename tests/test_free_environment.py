@@ -16,12 +16,13 @@ from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES
 from leapnav.experts import ExpertPolicy, build_bank, find_optimum, find_reached_optimum
 from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
-from leapnav.training import Dataset, evaluate, load_policy, make_policy, make_vec_env, save_policy
+from leapnav.training import Dataset, evaluate, load_policy, make_vec_env, save_policy
 from leapnav.training.config import CloningConfig, DAggerConfig, DAggerRunConfig, PPOConfig, SACConfig
+from leapnav.training.effort import effort_weights
 from leapnav.training.learning.cloning import behaviour_clone
 from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.baselines import GoToGoal
-from leapnav.training.policies.momentum import add_momentum, effort_weights
+from leapnav.training.policies.navigation_policy import add_momentum
 from leapnav.training.runs.imitation import train_dagger
 from leapnav.training.runs.reinforcement import train_ppo, train_sac
 
@@ -249,10 +250,11 @@ def test_symmetries_of_observations_are_those_of_scenarios():
     fields |= {"start": flip(fields["start"]), "goal": flip(fields["goal"])}
     mirrored = env.reset(options={"scenario": Scenario.from_dict(fields)})[0]
     action = th.tensor([[0.3, 0.2]])
-    observation, turned = mirror(first, action, n_goal=FREE_GOAL_ENTRIES)
+    free = env.unwrapped.settings
+    observation, turned = mirror(first, action, free)
     assert observation[0].numpy() == pytest.approx(mirrored, abs=1e-4)
     assert turned[0].tolist() == pytest.approx([0.3, -0.2])
-    observation, _ = time_reverse(first, action, n_goal=FREE_GOAL_ENTRIES)
+    observation, _ = time_reverse(first, action, free)
     (x, y, heading), (goal_x, goal_y, goal_heading) = task.start, task.goal
     backwards = task.model_copy(
         update={"start": (x, y, heading + math.pi), "goal": (goal_x, goal_y, goal_heading + math.pi)}
@@ -379,25 +381,3 @@ def test_only_robots_without_drift_have_momentum():
         assert effort_weights(sample_scenario("open", 3, robot, "free")) is not None
         assert effort_weights(sample_scenario("open", 3, robot)) is None
     assert effort_weights(sample_scenario("open", 3, "dynamic_unicycle", "free")) is None
-
-
-def test_a_policy_with_momentum_carries_its_last_action(tmp_path):
-    env = NavigateEnv("open", split="fresh", horizon="free")
-    weights = effort_weights(sample_scenario("open", 3, horizon="free"))
-    plain, policy = (
-        make_policy(env.observation_space, env.action_space, 0, SMALL, effort_weights=w) for w in (None, weights)
-    )
-    observation = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
-    assert plain.predict(observation, deterministic=True)[1] is None
-    first, state = policy.predict(observation, None, np.ones(3, bool), deterministic=True)
-    second, state = policy.predict(observation, state, np.array([False, True, False]), deterministic=True)
-    assert (second[1] == first[1]).all()  # a new episode starts from nothing
-    one, single = policy.predict(observation[0], deterministic=True)
-    again, _ = policy.predict(observation[0], single, np.array([False]), deterministic=True)
-    assert one == pytest.approx(first[0], abs=1e-6) and again == pytest.approx(second[0], abs=1e-6)
-    save_policy(policy, tmp_path / "policy", {"horizon": "free"})
-    loaded = load_policy(tmp_path / "policy")
-    assert loaded.effort_weights == pytest.approx(weights)
-    assert loaded.predict(observation, state, deterministic=True)[0] == pytest.approx(
-        policy.predict(observation, state, deterministic=True)[0], abs=1e-6
-    )

@@ -130,7 +130,7 @@ def scenarios(draw):
 @EXPENSIVE
 @given(scenarios())
 def test_an_optimum_that_is_called_one_is_one(scenario):
-    optimum = find_optimum(scenario, thorough=False)
+    optimum = find_optimum(scenario, "low")
     assert optimum.status.name and one_line(optimum.status.value)
     if not optimum.success:
         return

@@ -14,9 +14,9 @@ from leapnav.envs.simulation.observations import observation_entries
 from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import find_optimum
 from leapnav.training import CloningConfig, Dataset, NavigationFeatures, load_policy, make_policy, policy_environment
-from leapnav.training.learning.cloning import Cloning
+from leapnav.training.learning.cloning import behaviour_clone
 from leapnav.training.learning.symmetries import mirror, time_reverse
-from leapnav.training.learning.takeovers import samples_of
+from leapnav.training.learning.takeovers import Labeller
 
 ID, GOAL = "leapnav/Navigate-v0", 9
 BEAMS = 16
@@ -129,9 +129,10 @@ def mirrored(scenario):
 
 def test_symmetries_move_the_detours_with_the_beams():
     scenario = sample_scenario("clutter", 8)
-    seen = th.as_tensor(geodesic_env(scenario).reset()[0])[None]
+    env = geodesic_env(scenario)
+    seen, settings = th.as_tensor(env.reset()[0])[None], env.settings
     action = th.tensor([[0.5, 0.2]])
-    observation, changed = mirror(seen, action, geodesic=True)
+    observation, changed = mirror(seen, action, settings)
     expected = geodesic_env(mirrored(scenario)).reset()[0]
     assert observation[0].numpy() == pytest.approx(expected, abs=0.02)
     assert changed.tolist() == [[0.5, pytest.approx(-0.2)]]
@@ -141,7 +142,7 @@ def test_symmetries_move_the_detours_with_the_beams():
             for name in ("start", "goal")
         }
     )
-    observation, changed = time_reverse(seen, action, geodesic=True)
+    observation, changed = time_reverse(seen, action, settings)
     assert observation[0].numpy() == pytest.approx(geodesic_env(turned).reset()[0], abs=1e-3)
     assert changed.tolist() == [[-0.5, pytest.approx(0.2)]]
 
@@ -150,16 +151,15 @@ def test_symmetries_move_the_detours_with_the_beams():
 def test_features_and_cloning(horizon):
     scenario = sample_scenario("open", 4, horizon=horizon)
     settings = EnvironmentSettings(observation="geodesic", lidar_beams=BEAMS, horizon=horizon)
-    samples = samples_of(Observer(settings), settings, scenario, find_optimum(scenario), 3.0)
+    samples = Labeller(settings, 3.0, "high").samples(scenario, find_optimum(scenario))
     env = geodesic_env(scenario)
     features = NavigationFeatures(env.observation_space)(th.as_tensor(samples.observations))
     assert features.shape == (60, features.shape[1]) and th.isfinite(features).all()
     assert features.shape[1] == NavigationFeatures(env.observation_space).features_dim
     policy = make_policy(env.observation_space, env.action_space, 0, (16, 16))
-    fit = Cloning(policy, samples, CloningConfig(epochs=20, batch_size=16, validation_share=0.0))
-    while not fit.finished:
-        fit.run_epoch()
-    assert fit.losses[-1].training < fit.losses[0].training
+    config = CloningConfig(epochs=20, batch_size=16, validation_share=0.0)
+    losses = behaviour_clone(policy, samples, config, progress=False)
+    assert losses[-1].training < losses[0].training
     assert isinstance(samples, Dataset)
 
 

@@ -134,7 +134,7 @@ def test_included_banks_have_collision_free_optima(family):
 def test_the_barrier_weight_of_a_stored_path_is_found():
     for robot in ("unicycle", "car", "dynamic_unicycle"):
         scenario = sample_scenario("clutter", 1, robot, obstacles="hard")
-        optimum = find_optimum(scenario, alternatives=False)
+        optimum = find_optimum(scenario, "medium")
         states, _, costates = optimum.evaluate(times := np.linspace(0.0, optimum.horizon, 120))
         stored = Trajectory(times, states.astype("f4").astype(float), costates.astype("f4").astype(float))
         problem = OptimalControlProblem.from_scenario(scenario)
@@ -182,7 +182,7 @@ def test_banks_are_built_and_checked(tmp_path):
 @pytest.mark.parametrize("family", ["clutter", "rooms"])
 def test_the_expert_reaches_the_goal_from_perturbed_starts(family, robot, horizon):
     scenario = sample_scenario(family, 6001, robot, horizon, "hard")
-    optimum = find_optimum(scenario, alternatives=False)
+    optimum = find_optimum(scenario, "medium")
     path = Trajectory(optimum.times, optimum.states, optimum.costates)
     start = np.array(scenario.start_state)
     for sign in (0.0, 1.0, -1.0):
@@ -214,7 +214,7 @@ def test_values_exclude_the_barrier():
 
 def test_gains_of_the_barrier_problem_are_finite():
     scenario = sample_scenario("clutter", 1, obstacles="hard")
-    feedback = Feedback(scenario, find_optimum(scenario, alternatives=False))
+    feedback = Feedback(scenario, find_optimum(scenario, "medium"))
     gains = feedback.gains()
     assert np.isfinite(gains.slopes).all() and np.isfinite(gains.control(np.array(scenario.start), 0.0)).all()
 
@@ -263,7 +263,7 @@ def test_solutions_state_the_remaining_barrier(tmp_path, capsys):
     followed = solver.follow(Scenario.from_dict(fields), found["id"])
     assert followed["success"] and not followed["searched"] and followed["path"]["barrier"] <= 1e-3
     assert solver.drive(scenario, "expert")["success"]
-    soft = find_optimum(sample_scenario("clutter", 1), alternatives=False)
+    soft = find_optimum(sample_scenario("clutter", 1), "medium")
     assert soft.to_dict()["barrier"] == 0.0 and plot_extremal(soft) is not None
 
 

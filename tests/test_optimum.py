@@ -316,7 +316,7 @@ def test_a_detour_beyond_the_cropped_lattice_is_found():
 def test_a_direct_path_that_has_not_converged_may_lead_to_the_optimum():
     """Its cost, 5 % higher than that of the best extremal so far, is not reliable."""
     bank = ScenarioBank.shipped("clutter", "test", "dynamic_unicycle")
-    assert find_optimum(bank[78], alternatives=False).cost == pytest.approx(bank.costs[78], rel=1e-9)
+    assert find_optimum(bank[78], "medium").cost == pytest.approx(bank.costs[78], rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_the_search_without_alternatives_finds_the_same_optimum(family, robot):
     bank = ScenarioBank.shipped(family, "test", robot)
     omitted = 0
     for index in range(0, len(bank), 25):
-        best = find_optimum(bank[index], alternatives=False)
+        best = find_optimum(bank[index], "medium")
         whole = find_optimum(bank[index])
         assert best.cost == pytest.approx(whole.cost, rel=1e-9)
         omitted += len(whole.alternatives) - len(best.alternatives)
@@ -355,7 +355,7 @@ def test_small_proximity_weights_lead_to_no_collision(family, weight):
     """The cost decreases with the weight, and the path keeps its distance from the obstacles."""
     for seed in (11, 12):
         scenario = sample_scenario(family, seed)
-        heavier = find_optimum(scenario, alternatives=False)
+        heavier = find_optimum(scenario, "medium")
         cost = scenario.cost.model_copy(update={"proximity_weight": weight})
         optimum = find_optimum(scenario.model_copy(update={"cost": cost}))
         assert optimum.success and optimum.certificate.clearance > 0
@@ -366,7 +366,7 @@ def test_small_proximity_weights_lead_to_no_collision(family, weight):
 def test_the_cost_of_the_hard_problem_excludes_the_barrier():
     scenario = with_weight(sample_scenario("rooms", 11), 0.0)
     for tolerance in (1e-2, 1e-4):
-        optimum = find_optimum(scenario, barrier_tolerance=tolerance, alternatives=False)
+        optimum = find_optimum(scenario, "medium", barrier_tolerance=tolerance)
         times = np.linspace(0.0, optimum.horizon, 20_001)
         controls = optimum.evaluate(times)[1]
         effort = 0.5 * (controls**2) @ np.array(optimum.problem.control_weight)
@@ -410,7 +410,7 @@ def test_the_hard_optimum_around_a_disc_is_the_shortest_path():
 def test_a_large_time_weight_leads_to_no_collision(robot):
     scenario = sample_scenario("clutter", 21, robot=robot, horizon="free")
     cost = scenario.cost.model_copy(update={"time_weight": 16.0})
-    assert find_optimum(scenario.model_copy(update={"cost": cost}), alternatives=False).success
+    assert find_optimum(scenario.model_copy(update={"cost": cost}), "medium").success
 
 
 def test_the_search_is_repeated_where_the_continuation_stalls(monkeypatch):
@@ -432,7 +432,7 @@ def test_the_search_is_repeated_where_the_continuation_stalls(monkeypatch):
 
 def test_the_methods_solve_a_scenario_with_hard_obstacles():
     scenario = with_weight(sample_scenario("clutter", 13), 0.0)
-    expected = find_optimum(scenario, alternatives=False)
+    expected = find_optimum(scenario, "medium")
     for method in ("multiple_shooting", "leapfrog", "collocation"):
         found = solve(scenario, method)
         assert found.success and found.barrier <= 1e-3

@@ -9,8 +9,8 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.envs import NavigateEnv
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
+from leapnav.training.environments.rewards import ScaledReward
 from leapnav.training.policies.files import _checksum
-from leapnav.training.robots.rewards import ScaledReward
 
 
 def test_the_features_have_the_promised_size_and_are_finite(env):

@@ -5,7 +5,7 @@ import pytest
 
 from leapnav.envs.scenarios.scenario import Circle, Obstacle, Scenario
 from leapnav.training import make_vec_env
-from leapnav.training.robots.rewards import GradedMiss, ScaledReward
+from leapnav.training.environments.rewards import GradedMiss, ScaledReward
 
 ARENA = (0.0, 0.0, 8.0, 8.0)
 STILL = np.zeros((1, 2), np.float32)

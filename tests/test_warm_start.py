@@ -12,10 +12,10 @@ from leapnav.experts import ExpertPolicy
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_vec_env, network, warm_start
 from leapnav.training.config import WarmStartConfig
+from leapnav.training.environments.rewards import ScaledReward
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.policies.actors import mean_action
-from leapnav.training.policies.timed_noise import TimedNoisePolicy
-from leapnav.training.robots.rewards import ScaledReward
+from leapnav.training.policies.navigation_policy import NavigationPolicy
 
 
 def small():
@@ -150,7 +150,7 @@ def test_without_values_for_the_critic_the_actor_is_not_changed(dataset):
 
 def test_exploration_fades_before_the_horizon(tmp_path):
     env = NavigateEnv("open")
-    policy = TimedNoisePolicy(
+    policy = NavigationPolicy(
         env.observation_space, env.action_space, lambda _: 1e-3, quiet=2.0, log_std_init=0.0, **small()
     )
     observations = th.as_tensor(np.stack([env.reset(seed=0)[0]] * 3))
@@ -162,7 +162,7 @@ def test_exploration_fades_before_the_horizon(tmp_path):
     assert th.allclose(likelihoods, again)
     assert values.shape == (3, 1)
     policy.save(tmp_path / "policy")
-    loaded = TimedNoisePolicy.load(tmp_path / "policy")
+    loaded = NavigationPolicy.load(tmp_path / "policy")
     assert th.equal(loaded.get_distribution(observations).distribution.stddev, spread)
 
 
@@ -205,15 +205,6 @@ def test_imitation_holds_an_actor_to_the_demonstrations(kind, dataset):
             actions = mean_action(model.policy, th.as_tensor(dataset.observations))
         error[weight] = float(np.abs(actions.numpy() - dataset.actions).mean())
     assert error[100.0] < 0.5 * error[0.0]
-
-
-def test_imitation_ignores_samples_without_a_label(dataset):
-    actions = dataset.actions.copy()
-    actions[::2] = np.nan
-    model = SAC("MlpPolicy", make_vec_env(n_envs=2, family="open"), policy_kwargs=small(), seed=0, learning_starts=0)
-    imitate(model, replace(dataset, actions=actions), 1.0)
-    model.learn(20)
-    assert all(th.isfinite(parameter).all() for parameter in model.policy.actor.parameters())
 
 
 def test_imitation_needs_the_models_observations(dataset):

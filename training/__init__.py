@@ -14,6 +14,15 @@ from leapnav.training.config import (
 )
 
 if TYPE_CHECKING:
+    from leapnav.training.environments.level_samplers import (
+        LearnabilitySampler,
+        PrioritizedSampler,
+        RegretSampler,
+        UniformSampler,
+        make_sampler,
+    )
+    from leapnav.training.environments.level_scoring import LevelScoring
+    from leapnav.training.environments.vec_env import NavigateVecEnv, make_vec_env
     from leapnav.training.learning.cloning import EpochLoss, behaviour_clone
     from leapnav.training.learning.dagger import DAgger
     from leapnav.training.learning.dataset import Dataset
@@ -22,20 +31,11 @@ if TYPE_CHECKING:
     from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
     from leapnav.training.policies.files import load_policy, policy_environment, save_policy, shipped_policies
     from leapnav.training.policies.network import NavigationFeatures, make_policy, network
-    from leapnav.training.robots.level_samplers import (
-        LearnabilitySampler,
-        PrioritizedSampler,
-        RegretSampler,
-        UniformSampler,
-        make_sampler,
-    )
-    from leapnav.training.robots.level_scoring import LevelScoring
-    from leapnav.training.robots.vec_env import NavigateVecEnv, make_vec_env
     from leapnav.training.runs.imitation import train_bc, train_dagger
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
     from leapnav.training.scoring.comparison import Comparison, compare
     from leapnav.training.scoring.decisions import Decisions, PolicyRegret, regret
-    from leapnav.training.scoring.evaluation import Policy, evaluate
+    from leapnav.training.scoring.evaluation import Policy, PolicyFactory, evaluate
     from leapnav.training.scoring.html_report import write_report
     from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores
     from leapnav.training.scoring.results import Episode, Evaluation
@@ -62,6 +62,7 @@ __all__ = [
     "NavigationFeatures",
     "PPOConfig",
     "Policy",
+    "PolicyFactory",
     "PolicyRegret",
     "PrioritizedSampler",
     "RandomPolicy",
@@ -108,20 +109,20 @@ _LAZY = {
     "policies.baselines": ("GoToGoal", "RandomPolicy"),
     "policies.files": ("load_policy", "policy_environment", "save_policy", "shipped_policies"),
     "policies.network": ("NavigationFeatures", "make_policy", "network"),
-    "robots.level_samplers": (
+    "environments.level_samplers": (
         "LearnabilitySampler",
         "PrioritizedSampler",
         "RegretSampler",
         "UniformSampler",
         "make_sampler",
     ),
-    "robots.level_scoring": ("LevelScoring",),
-    "robots.vec_env": ("NavigateVecEnv", "make_vec_env"),
+    "environments.level_scoring": ("LevelScoring",),
+    "environments.vec_env": ("NavigateVecEnv", "make_vec_env"),
     "runs.imitation": ("train_bc", "train_dagger"),
     "runs.reinforcement": ("train_ppo", "train_sac"),
     "scoring.comparison": ("Comparison", "compare"),
     "scoring.decisions": ("Decisions", "PolicyRegret", "regret"),
-    "scoring.evaluation": ("Policy", "evaluate"),
+    "scoring.evaluation": ("Policy", "PolicyFactory", "evaluate"),
     "scoring.results": ("Episode", "Evaluation"),
     "scoring.html_report": ("write_report",),
     "scoring.reports": ("plot_episodes", "plot_scores", "print_scores"),

@@ -26,7 +26,6 @@ HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
-MemoryName = Literal["none", "stack"]
 TEST_BANK = "test.bank"  # file in the directory of a run of a family without an included bank
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
@@ -144,6 +143,11 @@ class RunConfig:
     lidar_beams: int = 128
     """Number of lidar beams, an even number. Demonstrations are observed again with these beams; a policy to start from
     must have the same number. With 32 beams, narrow passages cannot be distinguished from wide ones."""
+    history: tuple[float, ...] = ()
+    """Ages of earlier observations that are part of the observation, such as 0.4, 1.2 and 2.8 (s)."""
+    previous_action: bool | None = None
+    """Whether the observation contains the last action, in whose direction the policy moves on where the network
+    hesitates (momentum); by default with a free horizon, if the robot has no drift and there is no history."""
     evaluation_scenarios: int = 100
     """Scenarios per family of the test split in an evaluation during the run; the final evaluation plays all."""
 
@@ -158,13 +162,35 @@ class RunConfig:
         robot = {} if self.robot == "unicycle" else {"robot": self.robot}
         horizon = {} if self.horizon == "fixed" else {"horizon": self.horizon}
         observation = {} if self.observation == "lidar" else {"observation": self.observation}
-        return {**observation, "lidar_beams": self.lidar_beams, **robot, **horizon}
+        history = {"history": self.history} if self.history else {}
+        previous = {} if self.effort_weights is None else {"previous_action": True}
+        return {**observation, "lidar_beams": self.lidar_beams, **robot, **horizon, **history, **previous}
+
+    @property
+    def effort_weights(self) -> tuple[float, ...] | None:
+        """The weights of a policy with momentum, see `leapnav.training.effort`; None: without.
+
+        Raises:
+            ValueError: momentum is not possible, but required by `previous_action`.
+
+        """
+        if self.previous_action is False or (self.horizon == "fixed" and not self.previous_action):
+            return None
+        from leapnav.envs.scenarios.families import sample_scenario
+        from leapnav.training.effort import effort_weights
+
+        if self.previous_action is None and self.history:
+            return None
+        found = effort_weights(sample_scenario(self.family, 0, self.robot, self.horizon, self.obstacles))
+        if self.previous_action and found is None:
+            raise ValueError("previous_action: expected a free horizon and a robot without drift, got True")
+        return found
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, start: Sequence[Path] = (), **changes: Any) -> Self:
         """Return the settings tuned for a family and a horizon (file `defaults.toml`), with changes.
 
-        A run that starts from a policy has the observation and the memory of that policy.
+        A run that starts from a policy has the observation of that policy.
 
         Args:
             family: one of the families, or "all".
@@ -203,15 +229,7 @@ class RunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ImitationConfig(RunConfig):
-    """Settings shared by the runs of imitation learning."""
-
-    memory: MemoryName = "none"
-    """Memory of the policy: none, or of the observations 0.4, 1.2 and 2.8 s ago ("stack")."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BCConfig(_ImitationConfig):
+class BCConfig(RunConfig):
     """Behaviour cloning: fit a policy to demonstrations of the expert."""
 
     demos: tuple[Path, ...] = ()
@@ -223,7 +241,7 @@ class BCConfig(_ImitationConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DAggerRunConfig(_ImitationConfig):
+class DAggerRunConfig(RunConfig):
     """Dataset aggregation (DAgger): the learner drives, the expert takes over and provides the labels."""
 
     demos: tuple[Path, ...] = ()
@@ -371,14 +389,15 @@ def _as_paths(value: Any) -> list[Path]:
 
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
-    """Return the observation, the number of beams and the memory of the policy among some paths; empty without one."""
+    """Return the settings of the observation of the policy among some paths; empty without one."""
     included = files("leapnav.training").joinpath("policies", "pretrained")
     for path in paths:
         for folder in (Path(path), included.joinpath(str(path))):
             try:
                 description = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))
-                sensors = {name: description["environment"][name] for name in ("observation", "lidar_beams")}
-                return {**sensors, "memory": description.get("memory", "none")}
+                environment = description["environment"]
+                sensors = {name: environment[name] for name in ("observation", "lidar_beams", "previous_action")}
+                return {**sensors, "history": tuple(environment["history"])}
             except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
                 continue
     return {}

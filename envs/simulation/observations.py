@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,6 +79,8 @@ def _parts(settings: EnvironmentSettings) -> Iterator[tuple[str, list[Entry]]]:
     model = settings.model
     motion = _MOTION if settings.motors else tuple(zip(model.state_names[3:], model.state_units[3:], strict=True))
     yield "motion", [Entry(f"motion.{name}", unit, *_RATE) for name, unit in motion]
+    if settings.previous_action:
+        yield "action", [Entry(f"action[{k}]", *_COSINE) for k in range(model.sizes()[1])]
     beams = settings.lidar_beams
     angles = [f"{360 * k / beams:g} deg counter-clockwise from ahead" for k in range(beams)]
     if settings.has_lidar:
@@ -108,12 +110,15 @@ def observation_entries(settings: EnvironmentSettings) -> list[Entry]:
     """
     if settings.dict_observation or settings.goal_conditioned:
         raise ValueError("environment: expected flat observations, got dict_observation or a goal-conditioned one")
-    return [entry for _, entries in _parts(settings) for entry in entries]
+    current = [entry for _, entries in _parts(settings) for entry in entries]
+    earlier = [replace(one, name=f"{one.name}, {age:g} s before") for age in settings.history for one in current]
+    return current + earlier
 
 
 def parts_of(space: spaces.Box) -> dict[str, slice]:
-    """Return the parts of the flat observations in a space of `NavigateEnv` with a lidar.
+    """Return the parts of the current observation in a space of `NavigateEnv` with a lidar.
 
+    With a history, earlier observations with the same parts follow, each of `frame_size(space)` entries.
     Stable-Baselines3 passes nothing but the space to a features extractor, so the bounds are compared with those of the
     entries of each part.
 
@@ -121,13 +126,18 @@ def parts_of(space: spaces.Box) -> dict[str, slice]:
         ValueError: the space contains other parts, such as a map.
 
     """
-    bounds = list(zip(space.low.tolist(), space.high.tolist(), strict=True))
+    bounds = _bounds_of(space)[: frame_size(space)]
     end = GOAL_ENTRIES if bounds[TIME_LEFT:GOAL_ENTRIES] == _bounds(_TIMED_GOAL[TIME_LEFT:]) else FREE_GOAL_ENTRIES
     parts = {"goal": slice(0, end)}
     first = end
     while end < len(bounds) and bounds[end] == _RATE:
         end += 1
-    parts["motion"], beams = slice(first, end), len(bounds) - end
+    parts["motion"], first = slice(first, end), end
+    while end < len(bounds) and bounds[end] == (-1.0, 1.0):
+        end += 1
+    if end > first:
+        parts["action"] = slice(first, end)
+    beams = len(bounds) - end
     if bounds[-1:] == [(0.0, MAX_GEODESIC)]:
         middle = end + beams // 2
         parts["detours"], parts["distance"] = slice(middle, len(bounds) - 1), slice(len(bounds) - 1, len(bounds))
@@ -135,6 +145,17 @@ def parts_of(space: spaces.Box) -> dict[str, slice]:
     if any(low < 0.0 for low, _ in bounds[end:]):
         raise ValueError("observation_space: expected goal, motion, lidar and detours, got other parts, such as a map")
     return {**parts, "lidar": slice(end, end + beams)}
+
+
+def frame_size(space: spaces.Box) -> int:
+    """Return the number of entries of the current observation in a flat space, the smallest period of its bounds."""
+    bounds = _bounds_of(space)
+    count = len(bounds)
+    return next(n for n in range(1, count + 1) if count % n == 0 and bounds == bounds[:n] * (count // n))
+
+
+def _bounds_of(space: spaces.Box) -> list[tuple[float, float]]:
+    return list(zip(space.low.tolist(), space.high.tolist(), strict=True))
 
 
 def _bounds(entries: Sequence[Entry]) -> list[tuple[float, float]]:
@@ -146,7 +167,7 @@ OFFSETS = np.dtype(
     [
         (name, "i8")
         for name in (
-            *("achieved_goal", "desired_goal", "time", "goal", "motion"),
+            *("achieved_goal", "desired_goal", "time", "goal", "motion", "action"),
             *("lidar", "detours", "distance", "walls", "obstacles"),
         )
     ]
@@ -160,9 +181,12 @@ class ObservationBuffers(NamedTuple):
         offsets (1,): record of OFFSETS.
         beams (2, n), scratch (3, 2 n): see `leapnav.envs.simulation.sensing.scan`.
         detours (n,): output of `leapnav.envs.geodesics.geodesic_detours`.
-        row (size,): an observation before it is rounded to float32.
-        bounds (2, size): lower and upper bounds, float32.
+        row (d,): the current observation before it is rounded to float32.
+        bounds (2, d): lower and upper bounds, float32.
         is_heading (n - 3,): which further states of the robot are headings, bool.
+        actions (count, m): the last action of each robot, 0 at the start of an episode.
+        frames (count, K, d): the last K observations of each robot, that of step k in row k % K, float32.
+        lags (h,): the control periods between the observations of the history and the current one.
 
     """
 
@@ -173,6 +197,9 @@ class ObservationBuffers(NamedTuple):
     row: np.ndarray
     bounds: np.ndarray
     is_heading: np.ndarray
+    actions: np.ndarray
+    frames: np.ndarray
+    lags: np.ndarray
 
 
 BUFFERS = record_type(
@@ -184,6 +211,9 @@ BUFFERS = record_type(
     row=VECTOR,
     bounds=float32[:, ::1],
     is_heading=FLAGS,
+    actions=MATRIX,
+    frames=float32[:, :, ::1],
+    lags=INTEGERS,
 )
 
 
@@ -192,15 +222,18 @@ class ObservationLayout:
 
     Args:
         settings: settings of the environment.
+        count: number of robots that are observed.
 
     Attributes:
         space: observation space of one robot.
         size: number of entries of a flat observation.
-        parts: the entries of each part of a flat observation.
+        frame: number of entries of the current observation, which those of the history follow.
+        parts: the entries of each part of the current observation.
+        actions (count, m): the last action of each robot.
 
     """
 
-    def __init__(self, settings: EnvironmentSettings) -> None:
+    def __init__(self, settings: EnvironmentSettings, count: int = 0) -> None:
         self._settings = settings
         self.parts: dict[str, slice] = {}
         entries: list[Entry] = []
@@ -208,7 +241,9 @@ class ObservationLayout:
             if added:
                 self.parts[name] = slice(len(entries), len(entries) + len(added))
                 entries += added
-        self.size = len(entries)
+        self.frame, lags = len(entries), np.array(settings.lags, dtype=np.int64)
+        self.size = self.frame * (1 + len(lags))
+        self.actions = np.zeros((count, settings.model.sizes()[1]))
         self._bounds = np.array([[one.low for one in entries], [one.high for one in entries]], np.float32)
         angles = 2 * math.pi * np.arange(settings.lidar_beams) / max(settings.lidar_beams, 1)
         further = settings.model.state_names[3:]
@@ -218,9 +253,12 @@ class ObservationLayout:
             beams=np.stack([np.cos(angles), np.sin(angles)]),
             scratch=np.zeros((3, 2 * settings.lidar_beams)),
             detours=np.zeros(settings.lidar_beams),
-            row=np.zeros(self.size),
+            row=np.zeros(self.frame),
             bounds=self._bounds,
             is_heading=np.array([name in settings.model.heading_states for name in further], dtype=bool),
+            actions=self.actions,
+            frames=np.zeros((count, 1 + lags.max(initial=-1), self.frame), np.float32),
+            lags=lags,
         )
         self._packed_buffers = tuple(self._buffers)
         self._slices: dict[str, slice] | None = self.parts if settings.dict_observation else None
@@ -230,9 +268,10 @@ class ObservationLayout:
         self.space: spaces.Space[Any] = self._space()
 
     def _space(self) -> spaces.Space[Any]:
-        low, high = self._bounds
         if self._slices is None:
+            low, high = np.tile(self._bounds, 1 + len(self._settings.history))
             return spaces.Box(low, high, dtype=np.float32)
+        low, high = self._bounds
         boxes: dict[str, spaces.Space[Any]] = {}
         for name, part in self._slices.items():
             boxes[name] = spaces.Box(low[part], high[part], dtype=np.float32)
@@ -267,7 +306,8 @@ def observe_robots(robots, packed, packed_buffers, out):
         robots: indices of the robots.
         packed: the episodes. The noise is used only if the settings have sensing noise.
         packed_buffers: see `ObservationBuffers`.
-        out (count, size): the rows of the robots are overwritten; float32.
+        out (count, size): the rows of the robots are overwritten; float32. A robot with a history must be observed at
+            each step of its episode.
 
     """
     sim, buffers = Simulation(*packed), ObservationBuffers(*packed_buffers)
@@ -318,6 +358,9 @@ def observe_robots(robots, packed, packed_buffers, out):
             row[at.motion + 2] = episode.spin
         for k in range(len(buffers.is_heading)):
             row[at.motion + k] = wrapped(state[3 + k] - heading) if buffers.is_heading[k] else state[3 + k]
+        if at.action >= 0:
+            for k in range(buffers.actions.shape[1]):
+                row[at.action + k] = buffers.actions[i, k]
         if at.lidar >= 0:
             for k in range(n_beams):
                 row[at.lidar + k] = scratch[2, k]
@@ -336,3 +379,8 @@ def observe_robots(robots, packed, packed_buffers, out):
             value = np.float32(row[k])
             value = bounds[0, k] if value < bounds[0, k] else value
             out[i, k] = bounds[1, k] if value > bounds[1, k] else value
+        size, lags, frames = len(row), buffers.lags, buffers.frames
+        for k in range(size if len(lags) > 0 else 0):
+            frames[i, episode.steps % frames.shape[1], k] = out[i, k]
+            for h in range(len(lags)):
+                out[i, (h + 1) * size + k] = frames[i, max(episode.steps - lags[h], 0) % frames.shape[1], k]

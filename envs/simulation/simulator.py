@@ -56,7 +56,7 @@ class BatchSimulator:
     def __init__(self, count: int, settings: EnvironmentSettings) -> None:
         prepare(*_kernels(settings))
         self.settings = settings
-        self.layout = ObservationLayout(settings)
+        self.layout = ObservationLayout(settings, count)
         n, m = settings.model.sizes()
         self.episodes, self.states = np.zeros(count, EPISODE), np.zeros((count, n))
         self.fields = FieldStore(count)
@@ -134,6 +134,7 @@ class BatchSimulator:
         self._make_room(scenarios)
         sim = self._simulation
         self.episodes[indices] = np.zeros((), EPISODE)
+        self.layout.actions[indices] = 0.0
         for i, scenario, reference in zip(indices.tolist(), scenarios, references, strict=True):
             self.fields[i], task, discs = scenario.field, scenario.task, scenario.discs
             self.states[i], sim.goals[i], sim.limits[i], sim.weights[i], sim.parameters[i] = task
@@ -242,6 +243,8 @@ class BatchSimulator:
             robot = "" if len(self.states) == 1 else f" for robot {invalid}"
             expected = in_words(actions.shape[1])
             raise ValueError(f"action: expected {expected} finite numbers, got {actions[invalid].tolist()}{robot}")
+        if self.settings.previous_action:
+            np.copyto(self.layout.actions, np.clip(actions, -1.0, 1.0), where=active[:, None])
         if self._bodies is not None:
             for substep in range(self._substeps + 1):
                 stepping.push_bodies(self._bodies.rows, self._packed, self._addresses, substep, self._substeps)

@@ -17,7 +17,7 @@ from leapnav.experts.acting.tracking import FLOW_ACCURACY, advance, control_at, 
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.numerics.step_halving import step_halving
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.optimum import Effort, find_optimum
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, ProblemArrays, Trajectory
 from leapnav.experts.solvers.newton import CONVERGED, MARGIN
@@ -76,7 +76,7 @@ class Feedback:
     Args:
         scenario: the scenario.
         path: its optimum, or an approximation of it with costates.
-        quick: use quick searches, see `find_optimum`.
+        effort: effort of the searches, see `find_optimum`.
 
     Attributes:
         searches: number of searches so far.
@@ -86,8 +86,9 @@ class Feedback:
 
     """
 
-    def __init__(self, scenario: Scenario, path: Trajectory | Extremal, *, quick: bool = False) -> None:
-        self.scenario, self._quick = scenario, quick
+    def __init__(self, scenario: Scenario, path: Trajectory | Extremal, *, effort: Effort = "medium") -> None:
+        self.scenario = scenario
+        self._effort: Effort = effort
         self.searches = 0
         self._next_search = 0.0  # s; earliest time of the next search
         self._n, self._m = scenario.robot.sizes()
@@ -241,7 +242,7 @@ class Feedback:
         scenario = self._remaining_scenario(state, time)
         if scenario is None:
             return None
-        optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
+        optimum = find_optimum(scenario, self._effort)
         if not optimum.success:
             return None
         return _solve_along(optimum.problem, optimum, time)

@@ -19,7 +19,7 @@ from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.validation import as_matrix, as_vector, check_choice
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.gains import Gains
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.optimum import EFFORTS, Effort, find_optimum
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import Trajectory
 
@@ -116,13 +116,12 @@ class ExpertPolicy:
             solution of the previous step, or found by a new search if that fails. "gains": neighbouring-extremal gains
             along the optimum from the start, much faster, and accurate close to that optimum. "none": the optimum
             from the start, without feedback.
-        quick: examine only the most promising candidates in a search, see `find_optimum`. Suitable for DAgger, which
-            needs many optima and tolerates a few missing ones.
+        effort: effort of the searches, see `find_optimum`.
         workers: number of threads for several robots; None uses one per core.
 
     Raises:
         TypeError: the environment is not one of leapnav's.
-        ValueError: `feedback` is unknown, or a reference has a wrong shape.
+        ValueError: `feedback` or `effort` is unknown, or a reference has a wrong shape.
 
     """
 
@@ -132,11 +131,12 @@ class ExpertPolicy:
         references: Mapping[Scenario, Trajectory] | None = None,
         *,
         feedback: Literal["resolve", "gains", "none"] = "resolve",
-        quick: bool = False,
+        effort: Effort = "medium",
         workers: int | None = None,
     ) -> None:
         check_choice("feedback", feedback, FEEDBACKS)
-        self._quick = quick
+        check_choice("effort", effort, EFFORTS)
+        self._effort: Effort = effort
         self._envs = unwrap(env)
         self._n, self._m = self._envs[0].settings.model.sizes()
         self._references = {s: _check_reference(s, path) for s, path in (references or {}).items()}
@@ -152,7 +152,7 @@ class ExpertPolicy:
     @property
     def settings(self) -> dict[str, Any]:
         """Keyword arguments of an equal expert for another environment."""
-        return {"feedback": self._feedback, "quick": self._quick}
+        return {"feedback": self._feedback, "effort": self._effort}
 
     @property
     def searches(self) -> int:
@@ -265,13 +265,13 @@ class ExpertPolicy:
             reference = situation.bank.reference(situation.index)
             path = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
         if path is None:
-            optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
+            optimum = find_optimum(scenario, self._effort)
             if not optimum.success:
                 message = f"scenario {scenario.name!r}: {optimum.status.name}: {optimum.status.value}"
                 raise NoOptimumError(message, scenario)
             path = optimum
         try:
-            feedback = Feedback(scenario, path, quick=self._quick)
+            feedback = Feedback(scenario, path, effort=self._effort)
             gains = feedback.gains() if self._feedback == "gains" else None
         except (ValueError, FloatingPointError) as error:
             raise NoOptimumError(str(error), scenario) from None

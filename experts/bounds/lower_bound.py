@@ -150,7 +150,7 @@ def lower_bound(
     check_at_least("threads", threads, 1)
     start = time.perf_counter()
     if optimum is None:
-        found = find_optimum(scenario, alternatives=False)
+        found = find_optimum(scenario, "medium")
         if found.status is not Status.SUCCESS:
             raise SolveError(found, scenario.name)
         optimum = found

@@ -10,16 +10,14 @@ from joblib import delayed
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
-from leapnav.experts.optimum import Optimum, find_optimum
+from leapnav.experts.optimum import Effort, Optimum, find_optimum
 from leapnav.experts.pools import process_pool
 
 
 def find_optima(
     scenarios: Iterable[Scenario],
-    candidates: int = 12,
+    effort: Effort = "high",
     *,
-    thorough: bool = True,
-    alternatives: bool = True,
     workers: int = 1,
     dask: str | None = None,
     progress: bool = True,
@@ -31,9 +29,7 @@ def find_optima(
 
     Args:
         scenarios: the scenarios.
-        candidates: see `find_optimum`.
-        thorough: see `find_optimum`.
-        alternatives: see `find_optimum`.
+        effort: see `find_optimum`.
         workers: number of processes.
         dask: address of a Dask scheduler (`tcp://host:8786`) whose workers are used instead.
         progress: whether to show a progress bar.
@@ -43,7 +39,7 @@ def find_optima(
 
     Raises:
         TypeError: one of the scenarios is not a Scenario.
-        ValueError: candidates < 1 or workers < 1.
+        ValueError: the effort is unknown, or workers < 1.
         ModuleNotFoundError: `dask` is given, and the extra `cluster` is not installed.
         OSError: the scheduler cannot be reached.
 
@@ -56,7 +52,7 @@ def find_optima(
         progress_bar(total=len(given), label="Finding optima", unit="scenarios", show=progress) as bar,
         process_pool(workers, dask, return_as="generator") as pool,
     ):
-        calls = (task(scenario, candidates, thorough=thorough, alternatives=alternatives) for scenario in given)
+        calls = (task(scenario, effort) for scenario in given)
         for optimum in cast(Iterator[Optimum], pool(calls)):
             found.append(optimum)
             bar.update()

@@ -324,7 +324,7 @@ def _shard(number: int, seed: int, **arguments: Any) -> Arrays:
 def _demonstrations(sample: Callable[[int], Scenario], seed: int, recoveries: int, noise: float) -> list[Demonstration]:
     """The demonstrations of one scenario, its optimum first; empty without a certified optimum."""
     scenario = sample(seed)
-    optimum = find_optimum(scenario, alternatives=False)
+    optimum = find_optimum(scenario, "medium")
     if not optimum.success:
         return []
     episodes: list[tuple[Scenario, Extremal]] = [(scenario, optimum)]

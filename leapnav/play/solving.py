@@ -26,7 +26,6 @@ from leapnav.play.lessons import LESSONS
 
 OPTIMUM_POINTS, OTHER_POINTS = 201, 101  # of the optimum, and of each alternative and sweep
 MAX_STORED = 64  # optima that can be initial guesses of a request
-FOLLOW_CANDIDATES = 6  # of the short search while the user drags
 MAX_SWEEPS, FIRST_SWEEPS = 40, 16  # sent to the page; the first ones are sent without omissions
 
 
@@ -60,7 +59,7 @@ class PlaySolver:
             found = None if guess is None else solve(scenario, method="multiple_shooting", guess=guess)
             if found is not None and found.success:
                 return {**self._describe(scenario, found, start), "searched": False}
-            found = find_optimum(scenario, FOLLOW_CANDIDATES, thorough=False)
+            found = find_optimum(scenario, "low")
             return {**self._describe(scenario, found, start), "searched": True}
 
     def search(self, scenario: Scenario) -> dict[str, Any]:

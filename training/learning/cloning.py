@@ -16,7 +16,6 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from torch.optim.lr_scheduler import LambdaLR
 
-from leapnav.envs.simulation.observations import ObservationLayout
 from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -28,7 +27,7 @@ from leapnav.envs.utils.validation import (
 from leapnav.experts.data.demonstrations import Demonstration
 from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
-from leapnav.training.learning.samples import Batch, Samples, Symmetry, samples_class, split_courses
+from leapnav.training.learning.samples import Batch, Samples, Symmetry, split_courses
 from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.actors import actor_parameters, policy_of, set_noise, update_target
 from leapnav.training.threads import limit_threads
@@ -68,6 +67,8 @@ def behaviour_clone(
     config: CloningConfig | None = None,
     *,
     progress: bool = True,
+    label: str = "Cloning",
+    stream: int = 0,
     on_epoch: Callable[[EpochLoss], None] | None = None,
 ) -> list[EpochLoss]:
     """Fit the mean action of a policy to the expert's actions, in place.
@@ -80,6 +81,9 @@ def behaviour_clone(
         dataset: a `Dataset`, a directory written by `leapnav rollout`, or demonstrations.
         config: settings.
         progress: show a progress bar.
+        label: label of the progress bar.
+        stream: offset added to the seed of the sample order and of the augmentation. The validation split depends on
+            the seed alone.
         on_epoch: function called with the losses after each epoch.
 
     Returns:
@@ -90,66 +94,54 @@ def behaviour_clone(
         ValueError: the dataset is empty or damaged, its observations do not fit the policy, or a setting is invalid.
 
     """
-    fit = Cloning(policy_of(model), Dataset.of(dataset), config or CloningConfig())
-    with progress_bar(total=fit.epochs * fit.batches, label="Cloning", unit="batches", show=progress) as bar:
+    fit = _Fit(policy_of(model), Dataset.of(dataset), config or CloningConfig(), stream)
+    with progress_bar(total=fit.epochs * fit.batches, label=label, unit="batches", show=progress) as bar:
         while not fit.finished:
             loss = fit.run_epoch(bar.update)
             bar.set_postfix(training=f"{loss.training:.4f}", validation=f"{loss.validation:.4f}")
             if on_epoch is not None:
                 on_epoch(loss)
-        if fit.stopped_early is not None:
-            stop_early(bar, fit.stopped_early)
+        if len(fit.losses) < fit.epochs:
+            done = f"stopped after {len(fit.losses)} of {fit.epochs} epochs"
+            stop_early(bar, f"{done}, validation loss not lower for {fit.config.patience}")
     fit.finish()
     return fit.losses
 
 
-class Cloning:
-    """A behaviour-cloning fit that runs epoch by epoch and can be saved and resumed exactly.
-
-    Args:
-        policy: the policy to fit, in place.
-        dataset: the samples.
-        config: settings.
-        stream: offset added to the seed of the sample order and of the augmentation. The validation split depends on
-            the seed alone.
+class _Fit:
+    """A fit that runs epoch by epoch; the arguments are those of `behaviour_clone`.
 
     Attributes:
+        config: settings.
         epochs: maximum number of epochs.
-        batch_size: samples per gradient step.
         batches: gradient steps per epoch.
         losses: losses of the epochs so far.
 
-    Raises:
-        ValueError: the observations of the dataset do not fit the policy, or a setting is invalid.
-
     """
 
-    def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig, stream: int = 0) -> None:
+    def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig, stream: int) -> None:
         check_cloning(config)
         check_observations(policy, dataset)
-        model = dataset.settings.model
-        n_goal = ObservationLayout(dataset.settings).parts["goal"].stop
         settings = dataset.settings
-        beams = settings.lidar_beams if settings.has_lidar else 0
-        geodesic = settings.observation == "geodesic"
-        can_reverse = model.reversal is not None and dataset.is_reversible
+        can_reverse = settings.model.reversal is not None and dataset.is_reversible
         self._symmetries = [
-            *([partial(mirror, model=model, n_goal=n_goal, geodesic=geodesic)] if model.mirror is not None else []),
-            *([partial(time_reverse, model=model, n_goal=n_goal, geodesic=geodesic)] if can_reverse else []),
+            *([partial(mirror, settings=settings)] if settings.model.mirror is not None else []),
+            *([partial(time_reverse, settings=settings)] if can_reverse else []),
         ]
+        beams = settings.lidar_beams if settings.has_lidar else 0
         if config.augment and can_reverse and beams % 2:
             raise ValueError(f"augment: expected an even number of lidar beams, got {beams}; set augment=False")
-        self.config, self.losses = config, []
+        self.config = config
+        self.losses: list[EpochLoss] = []
         self._policy = policy
         self._rng = th.Generator().manual_seed(config.seed + stream)
-        kind = samples_class(policy)
         self._train, self._held_out = (
-            kind(dataset, chosen, policy.device)
+            Samples(dataset, chosen, policy.device)
             for chosen in split_courses(dataset, config.validation_share, config.seed)
         )
         self._scale = _scale(self._train, config.loss)
-        self.batch_size = config.batch_size or _default_batch_size(len(self._train))
-        self.batches = self._train.n_batches(self.batch_size)
+        self._batch_size = config.batch_size or _default_batch_size(len(self._train))
+        self.batches = self._train.n_batches(self._batch_size)
         self.epochs = config.epochs or max(DEFAULT_EPOCHS, math.ceil(MIN_STEPS / self.batches))
         parameters = actor_parameters(policy)
         self._optimiser = th.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -165,15 +157,6 @@ class Cloning:
         validation = [loss.validation for loss in self.losses]
         return bool(patience and done > patience and min(validation[:-patience]) <= min(validation[-patience:]))
 
-    @property
-    def stopped_early(self) -> str | None:
-        """The reason why the fit has ended before its last epoch, or None."""
-        done = len(self.losses)
-        if not self.finished or done >= self.epochs:
-            return None
-        return f"stopped after {done} of {self.epochs} epochs, validation loss not lower for {self.config.patience}"
-
-    @limit_threads
     def run_epoch(self, on_batch: Callable[[], Any] = lambda: None) -> EpochLoss:
         """Run one pass over the training samples.
 
@@ -189,7 +172,7 @@ class Cloning:
         """
         config, total = self.config, 0.0
         self._policy.set_training_mode(True)
-        for chosen in self._train.shuffled(self.batch_size, self._rng):
+        for chosen in self._train.shuffled(self._batch_size, self._rng):
             batch = self._train.batch(chosen, self._random_symmetries() if config.augment else ())
             loss = self._loss(batch)
             if not th.isfinite(loss):
@@ -224,24 +207,6 @@ class Cloning:
             ]
         set_noise(self._policy, (th.stack(squares).sum(dim=0) / len(samples)).sqrt().clamp(min=MIN_STD))
         update_target(self._policy)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state of the fit, without the policy's weights: tensors and Python numbers only."""
-        return {
-            "optimiser": self._optimiser.state_dict(),
-            "scheduler": self._scheduler.state_dict(),
-            "rng": self._rng.get_state(),
-            "losses": [(loss.epoch, loss.training, loss.validation) for loss in self.losses],
-            "best": self._best,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a state returned by `state_dict`; the caller restores the policy's weights."""
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._scheduler.load_state_dict(state["scheduler"])
-        self._rng.set_state(state["rng"])
-        self.losses = [EpochLoss(*loss) for loss in state["losses"]]
-        self._best = state["best"]
 
     def _random_symmetries(self) -> list[Symmetry]:
         """Return a random combination of the robot's symmetries."""

@@ -12,7 +12,7 @@ because most collisions are decided seconds before.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -21,23 +21,22 @@ import numpy as np
 from joblib import Parallel, delayed
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecEnv
 
+from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.progress import advance, progress_bar, stop_early
-from leapnav.envs.utils.validation import check_at_least, check_not_negative, check_positive
-from leapnav.experts.acting.policy import ExpertPolicy
+from leapnav.envs.utils.validation import check_at_least, check_choice, check_not_negative, check_positive
+from leapnav.envs.vector import NavigateVectorEnv
+from leapnav.experts.optimum import EFFORTS, Effort
 from leapnav.training.config import CloningConfig, DAggerConfig
-from leapnav.training.learning.cloning import Cloning, check_observations
+from leapnav.training.learning.cloning import behaviour_clone, check_observations
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.driving import DrivenEpisode, drive_episodes
 from leapnav.training.learning.takeovers import Labeller, label_episodes
 from leapnav.training.policies.actors import policy_of
-from leapnav.training.policies.memory import history_length
-from leapnav.training.robots.vec_env import NavigateVecEnv
 from leapnav.training.threads import limit_threads
 
-DRIVEN_PER_TASK, LABELLED_PER_TASK = 256, 16  # episodes in one task of a worker
+LABELLED_PER_TASK = 16  # episodes in one task of a worker
 SCENARIO_STREAM, TAKEOVER_STREAM = 1, 2  # streams of the seed of a round
 # Properties of the environment's settings that DAgger does not support, as named in the error message.
 _UNSUPPORTED = {
@@ -75,51 +74,57 @@ class DAgger:
 
     Args:
         model: a Stable-Baselines3 algorithm or its policy, trained in place; preferably a clone of the expert.
-        expert: an `ExpertPolicy` for `venv`, preferably with `quick=True`: the scenarios that it cannot solve take most
-            of the time.
-        venv: a vector environment from `make_vec_env`, preferably with `split="fresh"`.
+        scenarios: the name of a family, from which each round draws new scenarios, or a bank.
         config: settings.
+        environment: arguments of the environment, such as `observation`, `robot` or `horizon`.
         cloning: settings of the fits, of which `epochs`, `learning_rate` and `patience` are ignored.
         dataset: initial samples: a `Dataset`, a directory written by `leapnav rollout`, or demonstrations.
         folder: directory in which the samples of each round are stored; None keeps them in memory only.
-        workers: number of processes for the labelling; it does not affect the samples.
+        robots: number of robots that a process simulates together; the scenarios depend on it.
+        effort: effort of the expert's searches, see `find_optimum`; "low" misses a few optima, and the scenarios
+            without any take most of the time of higher efforts.
+        workers: number of processes; the samples do not depend on it.
 
     Attributes:
         dataset: all samples so far.
         rounds: statistics of the rounds so far.
 
     Raises:
-        TypeError: `venv` is not from `make_vec_env`.
-        ValueError: a setting is invalid, or the environment, the expert and the observations do not fit.
+        TypeError: an argument of the environment is unknown.
+        ValueError: a setting is invalid, or the environment and the observations do not fit.
 
     """
 
     def __init__(
         self,
         model: BaseAlgorithm | BasePolicy,
-        expert: ExpertPolicy,
-        venv: VecEnv,
+        scenarios: str | ScenarioBank = "clutter",
         config: DAggerConfig | None = None,
         *,
+        environment: Mapping[str, Any] | None = None,
         cloning: CloningConfig | None = None,
         dataset: Dataset | str | os.PathLike[str] | Sequence[Any] | None = None,
         folder: str | os.PathLike[str] | None = None,
+        robots: int = 256,
+        effort: Effort = "low",
         workers: int = 1,
     ) -> None:
-        if not isinstance(venv, NavigateVecEnv):
-            raise TypeError(f"venv: expected one from leapnav.training.make_vec_env, got {type(venv).__name__}")
-        if not expert.drives(venv):
-            raise ValueError("expert: expected one for venv; make it with ExpertPolicy(venv)")
         self.config, self._cloning = config or DAggerConfig(), cloning or CloningConfig()
         check_dagger(self.config)
         check_at_least("workers", workers, 1)
-        self._policy, self._expert, self._venv, self._workers = policy_of(model), expert, venv, workers
-        _check_environment(venv.venv.settings)
+        check_at_least("robots", robots, 1)
+        check_choice("effort", effort, EFFORTS)
+        chosen = {"bank": scenarios} if isinstance(scenarios, ScenarioBank) else {"family": scenarios, "split": "fresh"}
+        env = NavigateVectorEnv(1, **chosen, **(environment or {}))
+        self._source, self._settings = env.source, env.settings
+        _check_environment(self._settings)
+        self._policy, self._robots, self._workers = policy_of(model), robots, workers
+        self._effort: Effort = effort
         self._parts: list[Dataset] = [] if dataset is None else [Dataset.of(dataset)]
         if self._parts:
             check_observations(self._policy, self._parts[0])
             for name, value in vars(self._parts[0].settings).items():
-                if value != (own := getattr(venv.venv.settings, name)):
+                if value != (own := getattr(self._settings, name)):
                     raise ValueError(f"dataset: {name}: expected that of the environment, {own!r}, got {value!r}")
         self._folder = None if folder is None else Path(folder)
         if self._folder is not None:
@@ -169,10 +174,10 @@ class DAgger:
         loss = self._fit(number, progress)
         done = Round(
             number=number + 1,
-            samples=0 if samples is None else int(samples.labelled.sum()),
+            samples=0 if samples is None else len(samples),
             episodes=len(episodes),
-            success=sum(episode.success for episode in episodes) / len(episodes),
-            collision=sum(episode.collision for episode in episodes) / len(episodes),
+            success=sum(episode.played.success for episode in episodes) / len(episodes),
+            collision=sum(episode.played.collision for episode in episodes) / len(episodes),
             loss=loss,
         )
         self.rounds.append(done)
@@ -198,24 +203,16 @@ class DAgger:
 
     def _drive(self, name: str, progress: bool) -> list[DrivenEpisode]:
         """Return the episodes that the learner drives in a round."""
-        config, robots = self.config, self._venv.venv
+        config, seed = self.config, (self.config.seed, len(self.rounds), SCENARIO_STREAM)
         episodes: list[DrivenEpisode] = []
-        failures, seed = 0, (config.seed, len(self.rounds), SCENARIO_STREAM)
-        driving = drive_episodes(
-            self._policy,
-            robots.source,
-            robots.settings,
-            seed,
-            robots=robots.num_envs,
-            per_task=min(DRIVEN_PER_TASK, config.max_episodes),
-            workers=self._workers,
-        )
+        failures, robots = 0, min(self._robots, config.max_episodes)
+        driving = drive_episodes(self._policy, self._source, self._settings, seed, robots=robots, workers=self._workers)
         label = f"{name}: driving"
         with progress_bar(total=config.max_failures, label=label, unit="failures", show=progress) as bar:
             while failures < config.max_failures and len(episodes) < config.max_episodes:
                 episodes.append(next(driving))
-                failures += not episodes[-1].success
-                advance(bar, not episodes[-1].success)
+                failures += not episodes[-1].played.success
+                advance(bar, not episodes[-1].played.success)
             if failures < config.max_failures:
                 stop_early(bar, f"{len(episodes)} episodes with {failures} failures")
         driving.close()
@@ -223,8 +220,8 @@ class DAgger:
 
     def _choose_episodes(self, episodes: Sequence[DrivenEpisode], rng: np.random.Generator) -> list[DrivenEpisode]:
         """Return all failed and some of the successful episodes, in random order."""
-        failed = [episode for episode in episodes if not episode.success]
-        succeeded = [episode for episode in episodes if episode.success]
+        failed = [episode for episode in episodes if not episode.played.success]
+        succeeded = [episode for episode in episodes if episode.played.success]
         count = round(self.config.successes * max(1, len(failed)))
         chosen = failed + [succeeded[i] for i in rng.permutation(len(succeeded))[:count]]
         return [chosen[i] for i in rng.permutation(len(chosen))]
@@ -233,8 +230,7 @@ class DAgger:
         """Return the samples of the expert after the takeovers; None if it has no optimum in any of them."""
         # The division into tasks does not depend on the number of workers, and neither do the samples.
         portions = [episodes[k : k + LABELLED_PER_TASK] for k in range(0, len(episodes), LABELLED_PER_TASK)]
-        quick, history = bool(self._expert.settings["quick"]), history_length(self._policy)
-        labeller = Labeller(self._venv.venv.settings, self.config, quick=quick, history=history)
+        labeller = Labeller(self._settings, self.config.lead, self._effort)
         seed = self.config.seed, len(self.rounds), TAKEOVER_STREAM
         tasks = (delayed(label_episodes)(labeller, portion, (*seed, number)) for number, portion in enumerate(portions))
         labelled = cast(Iterator[list[Dataset]], Parallel(self._workers, return_as="generator")(tasks))
@@ -249,12 +245,10 @@ class DAgger:
         config = self.config
         epochs = config.epochs if number + 1 < config.rounds else config.last_epochs
         settings = replace(self._cloning, epochs=epochs, learning_rate=config.learning_rate, patience=0)
-        fit = Cloning(self._policy, self.dataset, settings, stream=number + 1)
-        with progress_bar(total=fit.epochs * fit.batches, label="Fitting", unit="batches", show=progress) as bar:
-            while not fit.finished:
-                fit.run_epoch(bar.update)
-        fit.finish()
-        return min(loss.validation for loss in fit.losses)
+        losses = behaviour_clone(
+            self._policy, self.dataset, settings, progress=progress, label="Fitting", stream=number + 1
+        )
+        return min(loss.validation for loss in losses)
 
 
 def _check_environment(settings: EnvironmentSettings) -> None:
@@ -262,7 +256,7 @@ def _check_environment(settings: EnvironmentSettings) -> None:
     for name, feature in _UNSUPPORTED.items():
         if getattr(settings, name):
             raise ValueError(
-                f"venv: expected an environment without {feature}; the expert starts from states of the robot alone"
+                f"environment: expected one without {feature}; the expert starts from states of the robot alone"
             )
 
 

@@ -22,7 +22,7 @@ from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.files import atomic_path
 from leapnav.experts.data.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
 
-FORMAT = 2  # version of the file format
+FORMAT = 3  # version of the file format
 # Arguments of the environment that select the scenarios; the meaning of an observation does not depend on them.
 SCENARIO_ARGUMENTS = ("family", "split", "bank", "scenario", "robot", "horizon", "obstacles")
 
@@ -33,8 +33,7 @@ class Dataset:
 
     Attributes:
         observations (N, d): float32.
-        actions (N, m): the expert's actions, float32, in [-1, 1]; NaN in samples that contain only what was observed
-            before, for policies with memory.
+        actions (N, m): the expert's actions, float32, in [-1, 1].
         returns (N,): expert's return from the sample to the end of the episode (-cost-to-go); NaN if unknown.
         costates (N, n): gradient of the cost-to-go with respect to the state; NaN if unknown.
         states (N, n): x, y (m), heading (rad) and further states of the robot.
@@ -72,12 +71,9 @@ class Dataset:
             found = getattr(self, name).shape
             if found != (count, *shape):
                 raise ValueError(f"dataset: {name}: expected the shape {(count, *shape)}, got {found}")
-        if not np.isfinite(self.observations).all():
-            raise ValueError("dataset: observations: expected finite numbers")
-        if not self.labelled.any():
-            raise ValueError("dataset: actions: expected finite numbers")
-        if not (np.isfinite(self.actions).all(axis=1) | np.isnan(self.actions).all(axis=1)).all():
-            raise ValueError("dataset: actions: expected finite numbers, or only NaN in a sample without a label")
+        for name in ("observations", "actions"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"dataset: {name}: expected finite numbers")
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -88,6 +84,8 @@ class Dataset:
 
     def observed(self, settings: EnvironmentSettings) -> Dataset:
         """Return the same samples with the observations of other sensors, without noise.
+
+        The history of a sample and its last action are those of the samples before it in its episode.
 
         Args:
             settings: settings of an environment with these sensors. Only its sensor settings are used.
@@ -104,31 +102,11 @@ class Dataset:
             return self
         parsed = [Scenario.from_json(text) for text in self.scenarios]
         scenarios = [parsed[episode] for episode in self.episodes.tolist()]
-        observations = Observer(settings).observe(scenarios, self.states, self.times)
+        starts = np.append(True, (np.diff(self.episodes) != 0) | (np.diff(self.times) > 1.5 * CONTROL_PERIOD))
+        previous = np.where(starts[:, None], 0.0, np.nan_to_num(np.roll(self.executed, 1, axis=0)))
+        first = np.maximum.accumulate(np.where(starts, np.arange(len(self)), 0))
+        observations = Observer(settings).observe(scenarios, self.states, self.times, previous, first)
         return replace(self, observations=observations, settings=settings)
-
-    @property
-    def labelled(self) -> np.ndarray:
-        """Whether the expert's action of each sample is known (N,)."""
-        return ~np.isnan(self.actions[:, 0])
-
-    def preceded(self, observations: np.ndarray, states: np.ndarray, times: np.ndarray) -> Dataset:
-        """Return the samples of one episode after samples without a label.
-
-        Args:
-            observations: (K, d), what was observed before the first sample, in order of time.
-            states: (K, n), the states there.
-            times: (K,), relative to the same time as those of the samples (s).
-
-        """
-        columns: dict[str, Any] = {
-            name: np.concatenate([np.full((len(states), *getattr(self, name).shape[1:]), np.nan, np.float32), own])
-            for name in _COLUMNS
-            if (own := getattr(self, name)).dtype.kind == "f"
-        }
-        for name, before in (("observations", observations), ("states", states), ("times", times)):
-            columns[name][: len(states)] = before
-        return replace(self, **columns, episodes=np.full(len(states) + len(self), self.episodes[0]))
 
     @cached_property
     def _scenario_fields(self) -> list[dict[str, Any]]:

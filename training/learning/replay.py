@@ -129,11 +129,10 @@ def imitate(
     check_at_least("batch_size", batch_size, 1)
     samples = Dataset.of(dataset)
     check_observations(policy, samples)
-    labelled = np.flatnonzero(samples.labelled)
 
     def add_gradient(*_: Any) -> None:
-        # The replay buffer uses the same global generator, whose state is part of a run's checkpoint.
-        rows = labelled[np.random.randint(0, len(labelled), size=batch_size)]  # noqa: NPY002
+        # The replay buffer uses the same global generator.
+        rows = np.random.randint(0, len(samples), size=batch_size)  # noqa: NPY002
         observations, actions = (
             th.as_tensor(column[rows], dtype=th.float32, device=policy.device)
             for column in (samples.observations, samples.actions)

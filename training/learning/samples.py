@@ -1,4 +1,4 @@
-"""The samples of a dataset as the inputs of a policy: single or stacked observations."""
+"""The samples of a dataset as tensors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from stable_baselines3.common.policies import BasePolicy
 from leapnav.experts.problem.system import switching_functions
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import mean_action
-from leapnav.training.policies.memory import LAGS, memory_of
 
 SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
 
@@ -27,7 +26,7 @@ class Batch:
     """Samples as tensors.
 
     Attributes:
-        observations: input of `mean_action`: (B, d), or stacked (B, k d).
+        observations (B, d): the observations.
         actions (B, m): the expert's actions.
         slopes, weights (B, m): see `action_slopes`; cost weights of the actions.
 
@@ -47,35 +46,35 @@ class Batch:
 
 
 class Samples:
-    """The chosen samples of a dataset that have a label, for a policy without memory.
+    """The chosen samples of a dataset.
 
     Args:
         dataset: the dataset.
-        chosen: (N,), bool; with a memory, whole episodes.
+        chosen: (N,), bool.
         device: device of the tensors.
 
     """
 
     def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
-        self.rows = th.as_tensor(np.flatnonzero(chosen & dataset.labelled), device=device)
+        self._rows = th.as_tensor(np.flatnonzero(chosen), device=device)
         self._observations = _tensor(dataset.observations, device)
         columns = dataset.actions, action_slopes(dataset), dataset.weights * dataset.limits**2
         self._columns = [_tensor(column, device) for column in columns]
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self._rows)
 
     @property
     def columns(self) -> tuple[th.Tensor, ...]:
         """Actions, slopes and weights of all samples, see `Batch`."""
-        return tuple(column[self.rows] for column in self._columns)
+        return tuple(column[self._rows] for column in self._columns)
 
     def n_batches(self, size: int) -> int:
-        """Return the number of batches of about `size` samples in a pass."""
+        """Return the number of batches of `size` samples in a pass."""
         return math.ceil(len(self) / size)
 
     def shuffled(self, size: int, rng: th.Generator) -> Iterator[th.Tensor]:
-        """Yield what `batch` takes, for one pass over the samples in random order, in batches of about `size`."""
+        """Yield what `batch` takes, for one pass over the samples in random order."""
         yield from th.randperm(len(self), generator=rng).split(size)
 
     def in_order(self, size: int) -> Iterator[th.Tensor]:
@@ -84,52 +83,13 @@ class Samples:
 
     def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:
         """Return some samples, after transformations by symmetries."""
-        rows = self.rows[chosen]
-        observations, *columns = self._transformed(rows, self._observations_of(rows), symmetries)
-        return Batch(observations, *columns)
-
-    def _observations_of(self, rows: th.Tensor) -> th.Tensor:
-        """Return observations (b, d) of which those of a row are consecutive."""
-        return self._observations[rows]
-
-    def _transformed(
-        self, rows: th.Tensor, observations: th.Tensor, symmetries: Sequence[Symmetry]
-    ) -> tuple[th.Tensor, ...]:
-        """Return observations (b, d) and the columns of the rows after transformations."""
+        rows = self._rows[chosen]
+        observations = self._observations[rows]
         actions, slopes, weights = (column[rows] for column in self._columns)
         for transform in symmetries:
             _, slopes = transform(observations[:1], slopes)  # the slopes change sign with the actions
             observations, actions = transform(observations, actions)
-        return observations, actions, slopes, weights
-
-
-class StackedSamples(Samples):
-    """Samples for a policy with stacked observations, see `FrameStackPolicy`."""
-
-    def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
-        super().__init__(dataset, chosen, device)
-        first, lengths = _sequences(dataset)
-        starts = np.repeat(first, lengths)
-        rows = np.flatnonzero(chosen & dataset.labelled)
-        frames = [rows, *(np.maximum(rows - lag, starts[rows]) for lag in LAGS)]
-        self._frames = th.as_tensor(np.stack(frames, axis=1), device=device)
-
-    def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:  # noqa: D102 (see `Samples`)
-        frames = self._frames[chosen]
-        observations = self._observations[frames.flatten()]
-        observations, *columns = self._transformed(self.rows[chosen], observations, symmetries)
-        return Batch(observations.reshape(len(chosen), -1), *columns)
-
-
-def samples_class(policy: BasePolicy) -> type[Samples]:
-    """Return the class of the samples for a policy."""
-    return {"none": Samples, "stack": StackedSamples}[memory_of(policy)]
-
-
-def _sequences(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first rows and the lengths of the episodes of a dataset."""
-    starts = np.flatnonzero(np.diff(dataset.episodes, prepend=-1) != 0)
-    return starts, np.diff(starts, append=len(dataset))
+        return Batch(observations, actions, slopes, weights)
 
 
 def _tensor(values: Any, device: th.device) -> th.Tensor:

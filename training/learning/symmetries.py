@@ -12,8 +12,9 @@ from collections.abc import Callable
 
 import torch as th
 
-from leapnav.envs.robots import RobotModel, Symmetry, Unicycle
-from leapnav.envs.simulation.observations import GOAL_ENTRIES
+from leapnav.envs.robots import Symmetry
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.simulation.observations import ObservationLayout
 
 # Signs of the first entries of the observation (see the docstring of the environment) under each symmetry.
 _MIRROR_SIGNS = th.tensor([1.0, -1, 1, -1, 1, 1, -1, 1, -1])
@@ -21,21 +22,14 @@ _TIME_REVERSE_SIGNS = th.tensor([-1.0, -1, 1, 1, 1, -1, -1, 1, 1])
 
 
 def mirror(
-    observations: th.Tensor,
-    actions: th.Tensor,
-    model: type[RobotModel] = Unicycle,
-    n_goal: int = GOAL_ENTRIES,
-    *,
-    geodesic: bool = False,
+    observations: th.Tensor, actions: th.Tensor, settings: EnvironmentSettings | None = None
 ) -> tuple[th.Tensor, th.Tensor]:
     """Exchange left and right.
 
     Args:
         observations (B, d): observations with lidar ranges.
         actions (B, m): actions.
-        model: the robot's model.
-        n_goal: number of entries of the observation's part `goal`.
-        geodesic: whether the observations contain detours and the geodesic distance.
+        settings: settings of the environment of the observations; None for its defaults.
 
     Returns:
         The mirrored observations and actions.
@@ -44,30 +38,24 @@ def mirror(
         ValueError: the model has no mirror symmetry.
 
     """
-    symmetry = _require(model, "mirror", model.mirror)
+    settings = settings or EnvironmentSettings()
+    symmetry = _require(settings, "mirror", settings.model.mirror)
 
     def reflected(values: th.Tensor) -> th.Tensor:
         return th.cat([values[:, :1], values[:, 1:].flip(1)], dim=1)
 
-    return _transformed(observations, actions, _MIRROR_SIGNS[:n_goal], symmetry, reflected, geodesic)
+    return _transformed(observations, actions, settings, _MIRROR_SIGNS, symmetry, reflected)
 
 
 def time_reverse(
-    observations: th.Tensor,
-    actions: th.Tensor,
-    model: type[RobotModel] = Unicycle,
-    n_goal: int = GOAL_ENTRIES,
-    *,
-    geodesic: bool = False,
+    observations: th.Tensor, actions: th.Tensor, settings: EnvironmentSettings | None = None
 ) -> tuple[th.Tensor, th.Tensor]:
     """Exchange forwards and backwards: rotate the robot and the goal heading by 180 degrees, and negate the speed.
 
     Args:
         observations (B, d): observations with an even number of lidar ranges.
         actions (B, m): actions.
-        model: the robot's model.
-        n_goal: number of entries of the observation's part `goal`.
-        geodesic: whether the observations contain detours and the geodesic distance.
+        settings: settings of the environment of the observations; None for its defaults.
 
     Returns:
         The transformed observations and actions.
@@ -76,38 +64,42 @@ def time_reverse(
         ValueError: the number of lidar beams is odd, or the model has no such symmetry.
 
     """
-    symmetry = _require(model, "reversal", model.reversal)
+    settings = settings or EnvironmentSettings()
+    symmetry = _require(settings, "reversal", settings.model.reversal)
 
     def rotated(values: th.Tensor) -> th.Tensor:
         if values.shape[1] % 2:
             raise ValueError(f"time reversal needs an even number of lidar beams, got {values.shape[1]}")
         return values.roll(values.shape[1] // 2, dims=1)
 
-    return _transformed(observations, actions, _TIME_REVERSE_SIGNS[:n_goal], symmetry, rotated, geodesic)
+    return _transformed(observations, actions, settings, _TIME_REVERSE_SIGNS, symmetry, rotated)
 
 
-def _require(model: type[RobotModel], name: str, symmetry: Symmetry | None) -> Symmetry:
+def _require(settings: EnvironmentSettings, name: str, symmetry: Symmetry | None) -> Symmetry:
     if symmetry is None:
-        raise ValueError(f"{name}: the robot {model.name()!r} does not have this symmetry")
+        raise ValueError(f"{name}: the robot {settings.robot!r} does not have this symmetry")
     return symmetry
 
 
 def _transformed(
     observations: th.Tensor,
     actions: th.Tensor,
+    settings: EnvironmentSettings,
     signs: th.Tensor,
     symmetry: Symmetry,
     moved: Callable[[th.Tensor], th.Tensor],
-    geodesic: bool,
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Return observations with other signs of the first entries and moved values of the beams, and the actions."""
-    device = observations.device
-    signs = th.cat([signs, th.tensor(symmetry.motion, dtype=signs.dtype)]).to(device)
-    matrix = th.tensor(symmetry.controls, dtype=actions.dtype, device=device)
-    beams = observations[:, len(signs) :]
-    if geodesic:
-        count = beams.shape[1] // 2
-        parts = [moved(beams[:, :count]), moved(beams[:, count:-1]), beams[:, -1:]]
-    else:
-        parts = [moved(beams)]
-    return th.cat([observations[:, : len(signs)] * signs, *parts], dim=1), actions @ matrix.T
+    """Return observations with other signs of goal and motion and moved values of the beams, and the actions."""
+    matrix = th.tensor(symmetry.controls, dtype=actions.dtype, device=actions.device)
+    changes: dict[str, Callable[[th.Tensor], th.Tensor]] = {
+        "goal": lambda values: values * signs[: values.shape[1]].to(values),
+        "motion": lambda values: values * th.tensor(symmetry.motion).to(values),
+        "action": lambda values: values @ matrix.T.to(values),
+        "lidar": moved,
+        "detours": moved,
+        "distance": lambda values: values,
+    }
+    layout = ObservationLayout(settings)
+    frames = observations.reshape(-1, layout.frame)  # those of the history are transformed like the current one
+    changed = th.cat([changes[name](frames[:, part]) for name, part in layout.parts.items()], dim=1)
+    return changed.reshape(observations.shape), actions @ matrix.T

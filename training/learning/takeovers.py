@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,8 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.observer import Observer
 from leapnav.experts.acting.policy import plan_actions
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.optimum import Effort, find_optimum
 from leapnav.experts.problem.extremal import Extremal
-from leapnav.training.config import DAggerConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.driving import DrivenEpisode
 
@@ -28,68 +27,95 @@ RELATIVE_SPREAD = 0.2  # half-width of the random factor of these times around 1
 MIN_TIME_LEFT = 1.0  # s before the horizon, after which the expert does not take over
 
 
-class Takeover(NamedTuple):
-    """A step of an episode, the rest of the episode from there as a scenario, and its optimum."""
-
-    step: int
-    scenario: Scenario
-    optimum: Extremal
-
-
 class Labeller:
     """Choose takeovers in the episodes of a learner, and label them.
 
     Args:
         settings: settings of the environment.
-        config: settings of DAgger.
-        quick: whether the searches examine only the most promising candidates, see `find_optimum`.
-        history: maximum number of samples without a label before a takeover, for policies with memory.
+        lead: time that the expert drives after a takeover (s).
+        effort: effort of the searches, see `find_optimum`.
 
     """
 
-    def __init__(self, settings: EnvironmentSettings, config: DAggerConfig, *, quick: bool, history: int = 0) -> None:
-        self._settings, self._config, self._quick, self._history = settings, config, quick, history
+    def __init__(self, settings: EnvironmentSettings, lead: float, effort: Effort) -> None:
+        self._settings, self._lead = settings, lead
+        self._effort: Effort = effort
         self._observer = Observer(settings)
 
     def label(self, episode: DrivenEpisode, rng: np.random.Generator) -> list[Dataset]:
         """Return the samples of the takeovers in order of time, up to the first one without an optimum."""
         found = []
         for step in scheduled_steps(episode, self._settings.control_period, rng):
-            taken = self._search(episode, step)
-            if taken is None:
+            scenario = rest_of(episode, step, self._settings.control_period)
+            optimum = None if scenario is None else find_optimum(scenario, effort=self._effort)
+            if scenario is None or optimum is None or not optimum.success:
                 break
-            found.append(self._samples(episode, taken))
+            played = episode.played
+            found.append(self.samples(scenario, optimum, played.states[:step], played.actions[:step]))
         return found
 
-    def _samples(self, episode: DrivenEpisode, taken: Takeover) -> Dataset:
-        """Return the samples of a takeover, after those of the learner's states before it."""
-        lead = self._config.lead
-        samples = samples_of(self._observer, self._settings, taken.scenario, taken.optimum, lead)
-        before = episode.states[max(0, taken.step - self._history) : taken.step]
-        if len(before) == 0:
-            return samples
-        times = self._settings.control_period * np.arange(-len(before), 0)
-        observations = self._observer.observe([taken.scenario] * len(before), before, times)
-        return samples.preceded(observations, before, times)
+    def samples(
+        self,
+        scenario: Scenario,
+        optimum: Extremal,
+        states_before: np.ndarray | None = None,
+        actions_before: np.ndarray | None = None,
+    ) -> Dataset:
+        """Return the samples along the first seconds of an optimum, one per control period.
 
-    def _search(self, episode: DrivenEpisode, step: int) -> Takeover | None:
-        """Return the takeover at a step; None if there is no optimum."""
-        scenario = rest_of(episode, step, self._settings.control_period)
-        if scenario is None:
-            return None
-        optimum = find_optimum(scenario, thorough=not self._quick, alternatives=False)
-        return Takeover(step, scenario, optimum) if optimum.success else None
+        The states are those of the optimum, so neither a simulation nor further solves are necessary.
+
+        Args:
+            scenario: the scenario from the takeover on.
+            optimum: its optimum.
+            states_before (K, n), actions_before (K, m): the states of the learner in the K control periods before the
+                takeover, and its actions there; None: the episode begins with the takeover.
+
+        """
+        period = self._settings.control_period
+        actions = plan_actions(optimum, scenario, period)[: max(1, round(self._lead / period))]
+        times = np.minimum(period * np.arange(len(actions) + 1), optimum.horizon)
+        states, _, costates = optimum.evaluate(times[:-1])
+        costs = np.asarray(optimum.cost_to_go(times))
+        # The history of the observations begins with the states of the learner.
+        before = 0 if states_before is None else min(len(states_before), 1 + max(self._settings.lags, default=0))
+        driven, previous = states, np.concatenate([np.zeros_like(actions[:1]), actions[:-1]])
+        if states_before is not None and actions_before is not None and before:
+            driven = np.concatenate([states_before[-before:], states])
+            known = np.concatenate([np.zeros_like(actions[:1]), actions_before, actions[:-1]])
+            previous = known[-len(driven) :]
+        observations = self._observer.observe(
+            [scenario] * len(driven),
+            driven,
+            np.append(period * np.arange(-before, 0), times[:-1]),
+            previous,
+            np.zeros(len(driven), dtype=int),
+        )
+        return Dataset(
+            observations=observations[before:],
+            actions=actions,
+            returns=-costs[:-1],
+            costates=costates,
+            states=states,
+            times=times[:-1],
+            executed=actions,
+            rewards=np.diff(costs),
+            episodes=np.zeros(len(actions), dtype=int),
+            scenarios=(scenario.to_json(),),
+            settings=replace(self._settings, reward="cost"),
+        )
 
 
 def scheduled_steps(episode: DrivenEpisode, period: float, rng: np.random.Generator) -> list[int]:
     """Return the steps of an episode at which the expert takes over, in increasing order."""
-    count = len(episode.states) - 1
-    end, horizon = count * period, episode.scenario.horizon
-    if episode.success:
+    played, horizon = episode.played, episode.scenario.horizon
+    count = len(played.actions)
+    end = count * period
+    if played.success:
         times = rng.uniform(0.0, end, 1)
-    elif episode.collision or horizon is None:
+    elif played.collision or horizon is None:
         n_takeovers = len(TAKEOVER_TIMES)
-        decision = end if episode.collision else min(_stop_time(episode.states, period) + AFTER_STOP, end)
+        decision = end if played.collision else min(_stop_time(played.states, period) + AFTER_STOP, end)
         times = decision - TAKEOVER_TIMES * rng.uniform(1 - RELATIVE_SPREAD, 1 + RELATIVE_SPREAD, n_takeovers)
     else:
         times = np.sort(rng.uniform(0.0, end, len(TAKEOVER_TIMES)))
@@ -103,7 +129,7 @@ def rest_of(episode: DrivenEpisode, step: int, period: float) -> Scenario | None
     if horizon is not None and horizon - time < MIN_TIME_LEFT:
         return None
     try:
-        return episode.scenario.from_state(episode.states[step], time)
+        return episode.scenario.from_state(episode.played.states[step], time)
     except ScenarioError:
         return None
 
@@ -113,33 +139,6 @@ def _stop_time(states: np.ndarray, period: float) -> float:
     distances = np.linalg.norm(states[:, :3] - states[-1, :3], axis=1)
     moving = np.flatnonzero(distances > STOP_DISTANCE)
     return period * (int(moving[-1]) + 1 if len(moving) else 0)
-
-
-def samples_of(
-    observer: Observer, settings: EnvironmentSettings, scenario: Scenario, optimum: Extremal, lead: float
-) -> Dataset:
-    """Return the samples along the first `lead` seconds of an optimum, one per control period.
-
-    The states are those of the optimum, so neither a simulation nor further solves are necessary.
-    """
-    actions = plan_actions(optimum, scenario, settings.control_period)
-    actions = actions[: max(1, round(lead / settings.control_period))]
-    times = np.minimum(settings.control_period * np.arange(len(actions) + 1), optimum.horizon)
-    states, _, costates = optimum.evaluate(times[:-1])
-    costs = np.asarray(optimum.cost_to_go(times))
-    return Dataset(
-        observations=observer.observe([scenario] * len(actions), states, times[:-1]),
-        actions=actions,
-        returns=-costs[:-1],
-        costates=costates,
-        states=states,
-        times=times[:-1],
-        executed=actions,
-        rewards=np.diff(costs),
-        episodes=np.zeros(len(actions), dtype=int),
-        scenarios=(scenario.to_json(),),
-        settings=replace(settings, reward="cost"),
-    )
 
 
 def label_episodes(labeller: Labeller, episodes: Sequence[DrivenEpisode], seed: Any) -> list[Dataset]:

@@ -16,6 +16,7 @@ from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.simulation.observations import ObservationLayout
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_not_negative, check_positive
@@ -277,8 +278,13 @@ class _Slopes:
         step = rng.normal(size=subset.states.shape) * STATE_OFFSET
         parsed = {episode: Scenario.from_json(dataset.scenarios[episode]) for episode in np.unique(subset.episodes)}
         scenarios = [parsed[episode] for episode in subset.episodes.tolist()]
-        observer = Observer(dataset.settings)
-        sides = [observer.observe(scenarios, subset.states + sign * step, subset.times) for sign in (1.0, -1.0)]
+        observer, layout = Observer(dataset.settings), ObservationLayout(dataset.settings)
+        parts = [np.arange(part.start, part.stop) for name, part in layout.parts.items() if name != "action"]
+        moved = np.concatenate(parts)
+        sides = [subset.observations.copy(), subset.observations.copy()]
+        for side, sign in zip(sides, (1.0, -1.0), strict=True):  # the history and the last action are not displaced
+            observed = observer.observe(scenarios, subset.states + sign * step, subset.times)
+            side[:, moved] = observed[:, moved]
         difference = -2.0 * factors[chosen] * (subset.costates * step).sum(axis=1)
         usual = np.abs(difference) <= MAX_RELATIVE_SLOPE * np.median(np.abs(difference))
         self._sides = [_tensor(side[usual], device) for side in sides]

@@ -7,9 +7,10 @@ from typing import Any, cast
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.sac.policies import Actor
 from torch import nn
 
-from leapnav.training.policies.memory import memory_of
+from leapnav.training.policies.navigation_policy import MomentumActor
 from leapnav.training.policies.network import NavigationFeatures
 
 
@@ -42,11 +43,11 @@ def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
 
 
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
-    """Compute the deterministic actions of a policy, not clipped, with gradients.
+    """Compute the deterministic actions of a policy without momentum, not clipped, with gradients.
 
     Args:
         policy: the policy.
-        observations: (B, d); for a policy with stacked frames (B, k d).
+        observations: (B, d).
 
     Returns:
         The actions (B, m).
@@ -56,6 +57,8 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
         return policy.action_net(policy.mlp_extractor.forward_actor(features))
     actor = _actor(policy)
+    if isinstance(actor, MomentumActor):
+        return th.tanh(Actor.get_action_dist_params(actor, cast(Any, observations))[0])
     if hasattr(actor, "get_action_dist_params"):  # SAC and TQC squash a Gaussian
         return th.tanh(actor.get_action_dist_params(observations)[0])
     return actor(observations)
@@ -88,8 +91,6 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
             f"policy: expected the same squashing of the actions, got a {type(source).__name__} for a "
             f"{type(target).__name__}; start from demonstrations instead"
         )
-    if memory_of(source) != memory_of(target):
-        raise ValueError(f"policy: expected the memory {memory_of(target)!r}, got {memory_of(source)!r}")
     tensors = _actor_tensors(source), _actor_tensors(target)
     extractors = [_extractor(policy) for policy in (source, target)]
     if all(isinstance(extractor, NavigationFeatures) for extractor in extractors):

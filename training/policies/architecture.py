@@ -15,8 +15,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from leapnav.envs.utils.validation import check_choice
-from leapnav.training.policies.memory import MEMORIES, FrameStackPolicy, memory_of
-from leapnav.training.policies.momentum import MomentumPolicy, MomentumSACPolicy
+from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, has_momentum
 from leapnav.training.policies.network import NavigationFeatures, check_spaces
 
 KINDS = ("actor-critic", "sac", "td3", "tqc")
@@ -33,8 +32,7 @@ class Architecture:
         hidden, critic: widths of the hidden layers of the actor and of the critic.
         extractor: "navigation" (`NavigationFeatures`) or "flatten" (the observation itself).
         activation: name of the activation function in `torch.nn`.
-        effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`, or None.
-        memory: "none" or "stack", see `leapnav.training.policies.memory`.
+        effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`, or None.
 
     """
 
@@ -44,7 +42,6 @@ class Architecture:
     extractor: str = "navigation"
     activation: str = "ReLU"
     effort_weights: tuple[float, ...] | None = None
-    memory: str = "none"
 
     def make(self, observation_space: spaces.Box, action_space: spaces.Space) -> BasePolicy:
         """Create an untrained policy on the CPU.
@@ -59,7 +56,6 @@ class Architecture:
         check_choice("activation", self.activation, ACTIVATIONS)
         if self.extractor == "navigation":
             check_spaces(observation_space, action_space)
-        check_choice("memory", self.memory, MEMORIES)
         arguments: dict[str, Any] = {
             "net_arch": {"pi": list(self.hidden), "vf": list(self.critic), "qf": list(self.critic)},
             "activation_fn": ACTIVATIONS[self.activation],
@@ -67,13 +63,8 @@ class Architecture:
         }
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
-        return self._policy_class()(observation_space, action_space, lambda _: 3e-4, **arguments)
-
-    def _policy_class(self) -> Any:
-        """Return the class of the policy."""
-        if self.memory == "stack":
-            return FrameStackPolicy
-        return _policy_class(self.kind, has_momentum=self.effort_weights is not None)
+        kind = _policy_class(self.kind, momentum=self.effort_weights is not None)
+        return kind(observation_space, action_space, lambda _: 3e-4, **arguments)
 
     @classmethod
     def of(cls, policy: BasePolicy) -> Architecture:
@@ -92,14 +83,13 @@ class Architecture:
         if not isinstance(policy.observation_space, spaces.Box):
             got = type(policy.observation_space).__name__
             raise ValueError(f"model: expected an MlpPolicy for observations in a Box, got a {got}")
-        memory = memory_of(policy)
-        extractor_class = given.frame_extractor_class if memory == "stack" else policy.features_extractor_class
-        extractor = _name_of("features extractor", EXTRACTORS, extractor_class)
+        extractor = _name_of("features extractor", EXTRACTORS, policy.features_extractor_class)
         activation = _name_of("activation function", ACTIVATIONS, given.activation_fn)
         if getattr(given, "use_sde", False):
             raise ValueError("model: expected a policy without state-dependent exploration, got use_sde=True")
         hidden, critic = widths(given.net_arch)
-        return cls(kind, hidden, critic, extractor, activation, getattr(given, "effort_weights", None), memory)
+        weights = given.effort_weights if has_momentum(policy) else None
+        return cls(kind, hidden, critic, extractor, activation, weights)
 
 
 def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -134,10 +124,10 @@ def _is_installed(kind: str) -> bool:
     return kind != "tqc" or find_spec("sb3_contrib") is not None
 
 
-def _policy_class(kind: str, *, has_momentum: bool = False) -> Any:
+def _policy_class(kind: str, *, momentum: bool = False) -> Any:
     """Return the class of a kind of policies."""
-    if has_momentum:
-        return {"actor-critic": MomentumPolicy, "sac": MomentumSACPolicy}[kind]
+    if momentum:
+        return {"actor-critic": NavigationPolicy, "sac": MomentumSACPolicy}[kind]
     if kind == "tqc":
         from sb3_contrib.tqc.policies import TQCPolicy  # from the extra `contrib`
 

@@ -31,7 +31,7 @@ from leapnav.training.policies.architecture import KINDS, Architecture, is_actor
 from leapnav.training.policies.zips import is_zip, load_zip
 
 BASELINES = ("expert", "random", "go-to-goal")  # policies without a file
-FORMAT = 5  # version of policy.json
+FORMAT = 6  # version of policy.json
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.
 OBSERVED = (*SENSORS, "robot", "horizon", "actuation", "dict_observation")
@@ -139,6 +139,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
                 raise TypeError(f"{name} is {description[name]!r}")
         if description["kind"] not in KINDS:
             raise ValueError(f"{path}: kind: expected one of {', '.join(KINDS)}, got {description['kind']!r}")
+        description["environment"]["history"] = tuple(description["environment"]["history"])
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
     return description

@@ -11,11 +11,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, parts_of
-from leapnav.envs.utils.validation import check_choice
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, frame_size, parts_of
 from leapnav.experts.data.demonstrations import ENVIRONMENT
-from leapnav.training.policies.memory import MEMORIES, FrameStackPolicy
-from leapnav.training.policies.momentum import MomentumPolicy
+from leapnav.training.policies.navigation_policy import NavigationPolicy
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
 ROBOT_RADIUS = 0.25  # radius of the robots in all families (m); a range minus this is the clearance along a beam
@@ -29,6 +27,9 @@ class NavigationFeatures(BaseFeaturesExtractor):
     between 5 m and 10 m. A small network does not resolve such differences in metres and seconds. The features
     therefore contain logarithms, saturated values and exponentials in addition to the scaled values. With a free
     horizon, the features that depend on the time left are missing.
+
+    With a history, the features of all observations follow each other, and then the displacements between them. The
+    last action is not a feature, see `leapnav.training.policies.navigation_policy`.
     """
 
     # Features of the goal part and of each entry of the motion part, with a fixed and with a free horizon
@@ -36,6 +37,7 @@ class NavigationFeatures(BaseFeaturesExtractor):
     MOTION_FEATURES, FREE_MOTION_FEATURES = 7, 3
     BEAM_FEATURES = 3  # features of each lidar beam, and of each detour
     DISTANCE_FEATURES, FREE_DISTANCE_FEATURES = 5, 3  # features of the geodesic distance
+    DISPLACEMENT_FEATURES = 4  # features of the displacement from each observation of the history
 
     def __init__(self, observation_space: spaces.Box) -> None:
         parts = parts_of(observation_space)
@@ -50,7 +52,9 @@ class NavigationFeatures(BaseFeaturesExtractor):
         if self._distance is not None:
             features += self.DISTANCE_FEATURES if self._is_timed else self.FREE_DISTANCE_FEATURES
             beams *= 2  # the detours
-        super().__init__(observation_space, features + self.BEAM_FEATURES * beams)
+        features += self.BEAM_FEATURES * beams
+        self._frames = observation_space.shape[0] // frame_size(observation_space)
+        super().__init__(observation_space, self._frames * features + (self._frames - 1) * self.DISPLACEMENT_FEATURES)
 
     @property
     def motion_features(self) -> range:
@@ -63,6 +67,14 @@ class NavigationFeatures(BaseFeaturesExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return the features (B, features_dim) of observations (B, d)."""
+        if self._frames == 1:
+            return self._frame_features(observations)
+        frames = observations.unflatten(1, (self._frames, -1))
+        features = self._frame_features(frames.flatten(0, 1)).unflatten(0, (-1, self._frames))
+        return th.cat([features.flatten(1), _displacements(frames)], dim=1)
+
+    def _frame_features(self, observations: th.Tensor) -> th.Tensor:
+        """Return the features of observations (B, d) without a history."""
         features = self._timed_features if self._is_timed else self._free_features
         parts = [*features(observations, observations[:, self._motion]), *_range_features(observations[:, self._lidar])]
         if self._detours is not None and self._distance is not None:
@@ -137,6 +149,25 @@ class NavigationFeatures(BaseFeaturesExtractor):
         ]
 
 
+def _displacements(frames: th.Tensor) -> th.Tensor:
+    """Return the earlier poses relative to the current one, from the goal as it was seen: (B, 4 (k - 1)).
+
+    The goal pose is the same in all frames, so the poses of the robot follow from it. For each earlier frame: position
+    (x and y in units of 2 m), and the sine and the cosine (minus 1) of its heading.
+
+    Args:
+        frames: (B, k, d), newest first.
+
+    """
+    goals, headings = frames[:, :, 0:2], frames[:, :, 2:4]  # the headings of the goal minus those of the robot
+    cosine = (headings[:, :1] * headings[:, 1:]).sum(dim=2)
+    sine = headings[:, :1, 1] * headings[:, 1:, 0] - headings[:, :1, 0] * headings[:, 1:, 1]
+    # A vector of an earlier frame, rotated by the current error minus the earlier one, is one of the current frame.
+    x = goals[:, :1, 0] - (cosine * goals[:, 1:, 0] - sine * goals[:, 1:, 1])
+    y = goals[:, :1, 1] - (sine * goals[:, 1:, 0] + cosine * goals[:, 1:, 1])
+    return th.cat([x / 2, y / 2, sine, cosine - 1.0], dim=1)
+
+
 def _range_features(ranges: th.Tensor) -> list[th.Tensor]:
     """Return the features of the lidar ranges (B, beams)."""
     return [ranges / 5, th.exp(-(ranges - ROBOT_RADIUS) / 0.3), ROBOT_RADIUS / ranges.clamp(min=0.1)]
@@ -192,33 +223,27 @@ def make_policy(
     hidden: Sequence[int] = HIDDEN,
     critic: Sequence[int] | None = None,
     effort_weights: Sequence[float] | None = None,
-    memory: str = "none",
 ) -> ActorCriticPolicy:
-    """Create an untrained actor-critic policy for `leapnav/Navigate-v0`; PPO and A2C can train one without memory.
+    """Create an untrained actor-critic policy for `leapnav/Navigate-v0`, which PPO and A2C can train.
 
     Args:
         observation_space, action_space: spaces of the environment.
         seed: random seed of the weights; the global random generator is not changed.
         hidden: widths of the actor's hidden layers.
         critic: widths of the critic's hidden layers; None: those of the actor.
-        effort_weights: weights of a policy with momentum, see `leapnav.training.policies.momentum`; None: without.
-        memory: "none", or "stack", of earlier observations; see `leapnav.training.policies.memory`.
+        effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`; None:
+            without.
 
     Raises:
-        ValueError: the spaces are not those of the environment with a lidar, or `memory` is unknown or combined with
-            momentum.
+        ValueError: the spaces are not those of the environment with a lidar, or the observations of a policy with
+            momentum do not contain the last action.
 
     """
     check_spaces(observation_space, action_space)
-    check_choice("memory", memory, MEMORIES)
-    if memory != "none" and effort_weights is not None:
-        raise ValueError(f"memory: expected 'none' for a policy with momentum, got {memory!r}")
     arguments = network(hidden, critic)
     kind: Any = ActorCriticPolicy
     if effort_weights is not None:
-        kind, arguments = MomentumPolicy, {**arguments, "effort_weights": effort_weights}
-    elif memory == "stack":
-        kind = FrameStackPolicy
+        kind, arguments = NavigationPolicy, {**arguments, "effort_weights": effort_weights}
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         return kind(observation_space, action_space, lr_schedule=lambda _: 3e-4, log_std_init=-2.0, **arguments)

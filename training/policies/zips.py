@@ -34,12 +34,12 @@ KINDS: dict[str, tuple[str, list[int]]] = {
     "stable_baselines3.sac.policies": ("sac", [256, 256]),
     "stable_baselines3.td3.policies": ("td3", [400, 300]),
     "sb3_contrib.tqc.policies": ("tqc", [256, 256]),
-    "leapnav.training.policies.timed_noise": ("actor-critic", [64, 64]),
+    "leapnav.training.policies.navigation_policy": ("actor-critic", [64, 64]),
 }
 # Settings of the policy that do not change its deterministic action.
 IGNORED = frozenset({"log_std_init", "ortho_init", "optimizer_class", "optimizer_kwargs", "normalize_images"}) | {
     *("n_critics", "n_quantiles"),  # of the critics, which are not loaded
-    "quiet",  # of TimedNoisePolicy
+    "quiet",  # of NavigationPolicy
 }
 ADVICE = "trust=True (--trust) loads it with Stable-Baselines3, which executes code from the file"
 
@@ -132,13 +132,14 @@ def _architecture(path: Path, data: Mapping[str, Any]) -> Architecture:
     if data.get("use_sde") or arguments.pop("use_sde", False):
         raise ValueError(f"{path}: use_sde: expected False, got True; {ADVICE}")
     hidden, critic = widths(arguments.pop("net_arch", default))
+    weights = arguments.pop("effort_weights", None)
     activation = _class_name(arguments.pop("activation_fn", "Tanh" if kind == "actor-critic" else "ReLU"))
     extractor = _class_name(arguments.pop("features_extractor_class", "FlattenExtractor"))
     extractors = {value.__name__: name for name, value in EXTRACTORS.items()}
     if activation not in ACTIVATIONS or extractor not in extractors or arguments:
         unknown = next(iter(arguments), extractor if extractor not in extractors else activation)
         raise ValueError(f"{path}: policy_kwargs: {unknown} is not supported; {ADVICE}")
-    return Architecture(kind, hidden, critic, extractors[extractor], activation)
+    return Architecture(kind, hidden, critic, extractors[extractor], activation, weights)
 
 
 def _load_actor(path: Path, policy: BasePolicy, weights: Mapping[str, th.Tensor]) -> None:

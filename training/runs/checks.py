@@ -24,6 +24,7 @@ from leapnav.training.config import (
     LevelsName,
     PPOConfig,
     RunConfig,
+    SACConfig,
     WarmStartConfig,
 )
 from leapnav.training.learning.cloning import check_cloning
@@ -45,6 +46,8 @@ def check_config(config: RunConfig) -> None:
     if not (config.lidar_beams > 0 and config.lidar_beams % 2 == 0):
         raise ValueError(f"lidar_beams: expected an even number >= 2, got {config.lidar_beams!r}")
     EnvironmentSettings(**config.environment)
+    if isinstance(config, SACConfig) and config.algorithm == "tqc" and config.effort_weights is not None:
+        raise ValueError(f"previous_action: expected False for algorithm='tqc', got {config.previous_action!r}")
     if isinstance(config, PPOConfig) and config.last_std > 0 and config.ent_coef > 0:
         raise ValueError(
             f"ent_coef: expected 0, because last_std > 0 fixes the noise and its entropy, got {config.ent_coef!r}"

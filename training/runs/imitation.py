@@ -12,20 +12,16 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from tqdm.auto import tqdm
 
 from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.utils.progress import progress_bar, stop_early
-from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training.config import BCConfig, DAggerRunConfig, RunConfig
-from leapnav.training.learning.cloning import Cloning, behaviour_clone
+from leapnav.training.environments.vec_env import environment_seed
+from leapnav.training.learning.cloning import EpochLoss, behaviour_clone
 from leapnav.training.learning.dagger import DAgger, Round
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import copy_actor
 from leapnav.training.policies.files import load_policy
-from leapnav.training.policies.momentum import effort_weights
 from leapnav.training.policies.network import make_policy
-from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
@@ -38,7 +34,7 @@ DEMONSTRATION_STREAM = 1_000_000  # stream of the run's seed, larger than those 
 def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> list[Evaluation]:
     """Clone the expert.
 
-    With `config.resume` the run resumes after any interruption, with bitwise identical results.
+    With `config.resume` an interrupted run uses its demonstrations, and repeats the fit unless it was complete.
 
     Args:
         config: settings.
@@ -56,40 +52,34 @@ def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> li
     check_config(config)
     given = Dataset.of(config.demos) if config.demos else None
     run = Run("bc", config)
-    dataset = (given or _demonstrations(run, config.scenarios, workers, progress)).observed(observed_settings(config))
     policy = _new_policy(config)
-    return _clone(run, policy, dataset, config, progress)
-
-
-def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConfig, progress: bool) -> list[Evaluation]:
-    """Fit a policy, with an evaluation and a checkpoint after each epoch."""
-    fit = Cloning(policy, dataset, replace(config.cloning, seed=config.seed))
     checkpoint = run.load_checkpoint() if config.resume else None
     if checkpoint is not None:
-        state = th.load(checkpoint[0] / "fit.pt", weights_only=True)
-        policy.load_state_dict(state["policy"])
-        fit.load_state_dict(state["fit"])
-        run.restore_generators()
-    done = len(fit.losses) * fit.batches
-    label = f"Cloning {config.family}"
-    with progress_bar(total=fit.epochs * fit.batches, label=label, unit="batches", initial=done, show=progress) as bar:
-        while not fit.finished:
-            loss = fit.run_epoch(bar.update)
-            samples = loss.epoch * fit.batches * fit.batch_size
-            run.logger.record("loss/training", loss.training)
-            run.logger.record("loss/validation", loss.validation)
-            evaluations = run.evaluate(policy, samples)
-            show_scores(bar, evaluations, loss=f"{loss.validation:.4f}")
-            run.save_policy(policy)
-            state = {"policy": policy.state_dict(), "fit": fit.state_dict()}
-            run.save_checkpoint(lambda folder, state=state: th.save(state, folder / "fit.pt"), {"epochs": loss.epoch})
-        if fit.stopped_early is not None:
-            stop_early(bar, fit.stopped_early)
-    fit.finish()
-    samples = len(fit.losses) * fit.batches * fit.batch_size
-    evaluations = run.evaluate(policy, samples, final=True)
+        policy.load_state_dict(th.load(checkpoint[0] / "policy.pt", weights_only=True))
+        epochs = checkpoint[1]["epochs"]
+    else:
+        dataset = given or _demonstrations(run, config.scenarios, workers, progress)
+        epochs = _clone(run, policy, dataset.observed(observed_settings(config)), config, progress)
+        run.save_checkpoint(lambda folder: th.save(policy.state_dict(), folder / "policy.pt"), {"epochs": epochs})
+    evaluations = run.evaluate(policy, epochs, final=True)
     run.save_policy(policy)
     return evaluations
+
+
+def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConfig, progress: bool) -> int:
+    """Fit a policy, with an evaluation after each epoch; return the number of epochs."""
+
+    def record(loss: EpochLoss) -> None:
+        run.logger.record("loss/training", loss.training)
+        run.logger.record("loss/validation", loss.validation)
+        evaluations = run.evaluate(policy, loss.epoch)
+        if progress:
+            tqdm.write(f"epoch {loss.epoch}: {_scores(evaluations)}, loss {loss.validation:.4f}")
+        run.save_policy(policy)
+
+    settings = replace(config.cloning, seed=config.seed)
+    label = f"Cloning {config.family}"
+    return len(behaviour_clone(policy, dataset, settings, progress=progress, label=label, on_epoch=record))
 
 
 @limit_threads
@@ -118,12 +108,12 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     run = Run("dagger", config)
     dataset = dataset or _demonstrations(run, config.scenarios, workers, progress)
     dataset = dataset.observed(observed_settings(config))  # replaced, to release the memory of the other observations
-    venv = make_vec_env(n_envs=config.n_envs, **config.fresh_scenarios, **config.environment)
     dagger = DAgger(
         policy,
-        ExpertPolicy(venv, quick=True),
-        venv,
+        config.family,
         replace(config.dagger, seed=config.seed),
+        environment={**config.environment, "obstacles": config.obstacles},
+        robots=config.n_envs,
         cloning=replace(config.cloning, seed=config.seed),
         dataset=dataset,
         folder=run.folder / "rounds",
@@ -133,7 +123,6 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     if checkpoint is not None:
         policy.load_state_dict(th.load(checkpoint[0] / "policy.pt", weights_only=True))
         dagger.restore([Round(**completed) for completed in checkpoint[1]["rounds"]])
-        run.restore_generators()
     elif config.policy is None:
         behaviour_clone(policy, dataset, replace(config.cloning, seed=config.seed), progress=progress)
         _save_round(run, policy, dagger)
@@ -145,8 +134,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
             run.logger.record(f"learner/{name}", getattr(completed, name))
         evaluations = run.evaluate(policy, samples)
         if progress:
-            success, soc = _mean_scores(evaluations)
-            tqdm.write(f"round {completed.number}: success {100 * success:.1f} %, SOC {soc:.3f}")
+            tqdm.write(f"round {completed.number}: {_scores(evaluations)}")
         run.save_policy(policy)
         _save_round(run, policy, dagger)
     evaluations = run.evaluate(policy, sum(one.samples for one in dagger.rounds), final=True)
@@ -186,30 +174,16 @@ def observed_settings(config: RunConfig) -> EnvironmentSettings:
 def _new_policy(config: BCConfig | DAggerRunConfig) -> ActorCriticPolicy:
     """Return an untrained policy with the network and the observations of a run."""
     env = make_env(config)
-    # With a memory, the network itself can continue in the direction of the last actions.
-    weights = momentum_of(config) if config.memory == "none" else None
-    return make_policy(
-        env.observation_space,
-        env.action_space,
-        config.seed,
-        config.hidden,
-        effort_weights=weights,
-        memory=config.memory,
-    )
+    spaces = env.observation_space, env.action_space
+    return make_policy(*spaces, config.seed, config.hidden, effort_weights=config.effort_weights)
 
 
-def momentum_of(config: RunConfig) -> tuple[float, ...] | None:
-    """Return the weights with which policies of a run have momentum, see `effort_weights`."""
-    return effort_weights(sample_scenario(config.family, 0, config.robot, config.horizon, config.obstacles))
-
-
-def show_scores(bar: Any, evaluations: Sequence[Evaluation], **more: Any) -> None:
-    """Show success rate and SOC, means over the families, next to a progress bar."""
-    success, soc = _mean_scores(evaluations)
-    bar.set_postfix(success=f"{100 * success:.1f} %", SOC=f"{soc:.3f}", **more)
-
-
-def _mean_scores(evaluations: Sequence[Evaluation]) -> tuple[float, float]:
+def mean_scores(evaluations: Sequence[Evaluation]) -> tuple[float, float]:
     """Return success rate and SOC, means over the families."""
     success, soc = (float(np.mean([getattr(one, name) for one in evaluations])) for name in ("success", "soc"))
     return success, soc
+
+
+def _scores(evaluations: Sequence[Evaluation]) -> str:
+    success, soc = mean_scores(evaluations)
+    return f"success {100 * success:.1f} %, SOC {soc:.3f}"

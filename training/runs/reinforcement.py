@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,20 +24,19 @@ from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_choice
 from leapnav.envs.vector import NavigateVectorEnv
 from leapnav.training.config import PPOConfig, SACConfig
+from leapnav.training.environments.level_samplers import VALUE_SCORES, PrioritizedSampler, UniformSampler
+from leapnav.training.environments.level_scoring import LevelScoring
+from leapnav.training.environments.rewards import GradedMiss, ScaledReward
+from leapnav.training.environments.vec_env import environment_seed, make_vec_env
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.learning.warm_start import warm_start
 from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
 from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
-from leapnav.training.policies.momentum import MomentumSACPolicy
+from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy
 from leapnav.training.policies.network import network
-from leapnav.training.policies.timed_noise import TimedNoisePolicy
-from leapnav.training.robots.level_samplers import VALUE_SCORES, PrioritizedSampler, UniformSampler
-from leapnav.training.robots.level_scoring import LevelScoring
-from leapnav.training.robots.rewards import GradedMiss, ScaledReward
-from leapnav.training.robots.vec_env import environment_seed, make_vec_env
 from leapnav.training.runs.checks import check_config
-from leapnav.training.runs.imitation import momentum_of, observed_settings, show_scores
+from leapnav.training.runs.imitation import mean_scores, observed_settings
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
 from leapnav.training.threads import limit_threads
@@ -56,13 +54,12 @@ def train_ppo(
 ) -> list[Evaluation]:
     """Train a policy by proximal policy optimisation.
 
-    With `config.resume` the run resumes after any interruption, with bitwise identical results.
+    With `config.resume` the run resumes from its last checkpoint, with new episodes.
 
     Args:
         config: settings.
-        callback: further callbacks of Stable-Baselines3, one or a list; a resumed run does not restore their state.
-        wrapper: function that wraps the training environment; it must not change the observations. A resumed run
-            restores the state of the wrapper if it has the methods `state_dict` and `load_state_dict`.
+        callback: further callbacks of Stable-Baselines3, one or a list.
+        wrapper: function that wraps the training environment; it must not change the observations.
         progress: show progress bars.
 
     Returns:
@@ -78,7 +75,7 @@ def train_ppo(
 
     def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
         return PPO(
-            TimedNoisePolicy,
+            NavigationPolicy,
             venv,
             n_steps=config.n_steps,
             batch_size=config.batch_size,
@@ -92,7 +89,7 @@ def train_ppo(
                 **network(config.hidden),
                 "log_std_init": math.log(config.std),
                 "quiet": config.quiet,
-                "effort_weights": momentum_of(config),
+                "effort_weights": config.effort_weights,
             },
             seed=config.seed,
             device="cpu",
@@ -129,10 +126,10 @@ def train_sac(
             raise ModuleNotFoundError('TQC needs sb3-contrib: pip install "leapnav[contrib]"') from None
 
     def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
-        momentum = momentum_of(config)
+        weights = config.effort_weights
         policy, options = "MlpPolicy", network(config.hidden)
-        if momentum is not None and config.algorithm == "sac":
-            policy, options = MomentumSACPolicy, {**options, "effort_weights": momentum}
+        if weights is not None:
+            policy, options = MomentumSACPolicy, {**options, "effort_weights": weights}
         return algorithm(
             policy,
             venv,
@@ -173,8 +170,6 @@ def _train(
         if not isinstance(cast(object, venv), VecEnv):
             raise TypeError(f"wrapper: expected a function that returns a VecEnv, got {type(venv).__name__}")
     model = make(venv, dataset)
-    # Stable-Baselines3 has seeded the environment with the seed of the run itself, see `environment_seed`.
-    venv.seed(environment_seed(config.seed))
     if start is not None and config.start.actor:
         copy_actor(start, model.policy)
     run = Run(algorithm, config)
@@ -183,12 +178,12 @@ def _train(
         _warm_start(model, config, dataset, actor_copied=start is not None, progress=progress)
     else:
         model = _load_model(type(model), checkpoint[0], venv, dataset, config)
+    # Stable-Baselines3 has seeded the environment with the seed of the run itself, see `environment_seed`.
+    venv.seed(environment_seed(config.seed, model.num_timesteps))
     model.set_logger(run.logger)
     if isinstance(config, SACConfig) and config.imitation > 0 and dataset is not None:
         imitate(cast(OffPolicyAlgorithm, model), dataset, config.imitation)
-    own = _RunCallback(run, config, venv, checkpoint[1] if checkpoint else None, progress)
-    if checkpoint is not None:
-        run.restore_generators()
+    own = _RunCallback(run, config, checkpoint[1] if checkpoint else None, progress)
     remaining = config.total_timesteps - model.num_timesteps
     if remaining > 0:
         further = callback if isinstance(callback, list) else [] if callback is None else [callback]
@@ -298,25 +293,15 @@ def _warm_start(
 
 
 def _load_model(kind: Any, folder: Path, venv: VecEnv, dataset: Dataset | None, config: Config) -> BaseAlgorithm:
-    """Load the model of a checkpoint, and restore the state of the training environment."""
+    """Load the model of a checkpoint."""
     buffer = folder / "replay_buffer.pkl"
     arguments = _buffer_arguments(config, dataset) if isinstance(config, SACConfig) else {}
-    model = kind.load(folder / "model.zip", env=venv, device="cpu", force_reset=False, **arguments)
+    model = kind.load(folder / "model.zip", env=venv, device="cpu", **arguments)
     if buffer.exists():
         model.load_replay_buffer(buffer)
         if isinstance(model.replay_buffer, DemonstrationReplayBuffer):
             assert dataset is not None  # the configuration is that of the stored run
             model.replay_buffer.demonstrate(dataset, config.reward_scale)
-    with (folder / "robots.pkl").open("rb") as file:
-        wrapper_states, action_generator = pickle.load(file)
-    wrappers = _stateful_wrappers(venv)
-    if len(wrappers) != len(wrapper_states):
-        names = ", ".join(type(wrapper).__name__ for wrapper in wrappers)
-        raise ValueError(f"wrapper: the run has {len(wrapper_states)} wrappers with a state, got {names}")
-    # Loading has seeded the generator of the action space, from which the random actions before learning are drawn.
-    model.action_space.np_random.bit_generator.state = action_generator
-    for wrapper, state in zip(wrappers, wrapper_states, strict=True):
-        wrapper.load_state_dict(state)
     return model
 
 
@@ -331,31 +316,20 @@ def _buffer_arguments(config: SACConfig, dataset: Dataset | None) -> dict[str, A
     }
 
 
-def _stateful_wrappers(venv: Any) -> list[Any]:
-    """Return the wrappers and the vector environment that have a `state_dict`, outermost first."""
-    found = []
-    while isinstance(venv, VecEnv):
-        if hasattr(type(venv), "state_dict"):
-            found.append(venv)
-        venv = getattr(venv, "venv", None)
-    return found
-
-
 class _RunCallback(BaseCallback):
     """Evaluations, checkpoints, schedules and the progress bar of a run.
 
     Args:
         run: the run directory.
         config: settings of the run.
-        venv: the training environment.
         progress: the progress stored in the checkpoint; None for a new run.
         show_bar: show a progress bar.
 
     """
 
-    def __init__(self, run: Run, config: Config, venv: VecEnv, progress: dict[str, Any] | None, show_bar: bool) -> None:
+    def __init__(self, run: Run, config: Config, progress: dict[str, Any] | None, show_bar: bool) -> None:
         super().__init__()
-        self._run, self._config, self._venv = run, config, venv
+        self._run, self._config = run, config
         self._evaluated_step = -1 if progress is None else int(progress["evaluated"])
         self._checkpoint_step = 0 if progress is None else int(progress["step"])
         self.bar = progress_bar(
@@ -374,7 +348,8 @@ class _RunCallback(BaseCallback):
         # The state is complete here: the last update is done, and the next environment steps have not begun.
         step, config = self.num_timesteps, self._config
         if step // config.evaluate_every > self._evaluated_step // config.evaluate_every or self._evaluated_step < 0:
-            show_scores(self.bar, self._run.evaluate(self.model.policy, step))
+            success, soc = mean_scores(self._run.evaluate(self.model.policy, step))
+            self.bar.set_postfix(success=f"{100 * success:.1f} %", SOC=f"{soc:.3f}")
             self._run.save_policy(self.model.policy)
             self._evaluated_step = step
         if step // config.checkpoint_every > self._checkpoint_step // config.checkpoint_every:
@@ -384,7 +359,7 @@ class _RunCallback(BaseCallback):
     def _apply_schedules(self, completed: float) -> None:
         """Set everything that depends on the completed fraction of the run."""
         config, policy = self._config, self.model.policy
-        if isinstance(config, PPOConfig) and isinstance(policy, TimedNoisePolicy):
+        if isinstance(config, PPOConfig) and isinstance(policy, NavigationPolicy):
             for parameter in actor_parameters(policy):
                 parameter.requires_grad_(completed >= config.critic_first)
             policy.log_std.requires_grad_(completed >= config.critic_first and config.last_std == 0)
@@ -402,6 +377,3 @@ class _RunCallback(BaseCallback):
         self.model.save(folder / "model.zip", exclude=["replay_buffer_kwargs"])
         if isinstance(self.model, OffPolicyAlgorithm):
             self.model.save_replay_buffer(folder / "replay_buffer.pkl")
-        with (folder / "robots.pkl").open("wb") as file:
-            action_generator = self.model.action_space.np_random.bit_generator.state
-            pickle.dump(([wrapper.state_dict() for wrapper in _stateful_wrappers(self._venv)], action_generator), file)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import random
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -13,7 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, configure
@@ -168,7 +166,6 @@ class Run:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         write(partial)
-        th.save(_generator_states(), partial / "generators.pt")
         manifest = {
             "files": {path.name: digest(path) for path in sorted(partial.iterdir())},
             "progress": dict(progress),
@@ -186,8 +183,6 @@ class Run:
 
     def load_checkpoint(self) -> tuple[Path, dict[str, Any]] | None:
         """Load the checkpoint, and discard the evaluations recorded after it.
-
-        Call `restore_generators` after everything else is restored.
 
         Returns:
             The directory and the progress of the checkpoint; None if there is no checkpoint.
@@ -217,25 +212,6 @@ class Run:
         if count:
             self._write_evaluations()
         return folder, progress
-
-    def restore_generators(self) -> None:
-        """Restore the states of the global random generators of Python, NumPy and torch from the checkpoint."""
-        state = th.load(self.folder / "checkpoint" / "generators.pt", weights_only=True)
-        th.set_rng_state(state["torch"])
-        np.random.set_state(("MT19937", state["numpy"].numpy().astype(np.uint32), *state["numpy_rest"]))  # noqa: NPY002
-        random.setstate((state["python"][0], tuple(state["python"][1]), state["python"][2]))
-
-
-def _generator_states() -> dict[str, Any]:
-    """The states of the global random generators of Python, NumPy and torch."""
-    numpy_state: Any = np.random.get_state()  # noqa: NPY002 (Stable-Baselines3 draws from it)
-    _, keys, *rest = numpy_state
-    return {
-        "torch": th.get_rng_state(),
-        "numpy": th.as_tensor(keys.astype(np.int64)),
-        "numpy_rest": rest,
-        "python": list(random.getstate()),
-    }
 
 
 def _versions() -> dict[str, str]:

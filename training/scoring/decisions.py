@@ -195,8 +195,8 @@ def _optimal_cost(scenario: Scenario, state: np.ndarray, time: float) -> float:
         rest = scenario.from_state(state, time)
     except ScenarioError:  # in collision, or without time left
         return math.nan
-    for thorough in (False, True):
-        optimum = find_optimum(rest, thorough=thorough, alternatives=False)
+    for effort in ("low", "medium"):
+        optimum = find_optimum(rest, effort)
         if optimum.success:
             return float(optimum.cost)
     return math.nan

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Protocol, cast
 
@@ -28,6 +27,7 @@ from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
+from leapnav.training.environments.playing import PlayedEpisode, play_episodes
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.threads import limit_threads
 
@@ -51,8 +51,25 @@ class Policy(Protocol):
         ...
 
 
-# A policy that depends on the environment, such as `ExpertPolicy`, is given as a class, or as a function whose
-# parameter is named `env`. Any other function is a policy itself: it maps an observation to an action.
+@dataclass(frozen=True)
+class PolicyFactory:
+    """A function that makes a policy for an environment, as in `PolicyFactory(lambda env: ExpertPolicy(env))`.
+
+    A class such as `ExpertPolicy` needs no factory. Any other function is a policy itself: it maps an observation to an
+    action.
+
+    Attributes:
+        make: the function.
+
+    """
+
+    make: Callable[[Any], Policy]
+
+    def __call__(self, env: Any) -> Policy:
+        """Return the policy for an environment."""
+        return self.make(env)
+
+
 PolicyOrFactory = Policy | Callable[[Any], Any]
 
 
@@ -88,7 +105,10 @@ class FunctionPolicy:
         return np.array([self._action(row) for row in rows]) if is_batch else self._action(observation), state
 
     def _action(self, observation: Any) -> np.ndarray:
-        action = np.asarray(self._function(observation), dtype=np.float32)
+        given = self._function(observation)
+        if hasattr(given, "predict"):
+            raise TypeError("policy: expected an action from the function, got a policy; pass a PolicyFactory of it")
+        action = np.asarray(given, dtype=np.float32)
         if action.shape != (self._n_actions,) or not np.isfinite(action).all():
             raise ValueError(
                 f"policy: expected {in_words(self._n_actions)} finite numbers from the function, got {action.tolist()}"
@@ -115,9 +135,9 @@ def evaluate(
     The same policy, bank and seed give the same episodes.
 
     Args:
-        policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class or a
-            function of an environment, with a parameter `env`, that returns one, such as `ExpertPolicy`; or any other
-            function, which maps one observation to an action.
+        policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class of such
+            objects that takes an environment, such as `ExpertPolicy`, or a `PolicyFactory`; or any other function,
+            which maps one observation to an action.
         bank: a bank, or the name of a family for its test split, with the robot, horizon and obstacles of
             `environment`.
         count: number of scenarios, from the first of the bank; None: all.
@@ -140,8 +160,8 @@ def evaluate(
     check_at_least("workers", workers, 1)
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
-            "policy: expected an object with `predict`, a function of an observation, or a function of `env` that "
-            f"returns a policy, got {type(policy).__name__}"
+            "policy: expected an object with `predict`, a function of an observation, or a PolicyFactory, got "
+            f"{type(policy).__name__}"
         )
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str):
@@ -183,64 +203,27 @@ def _play_batch(
     seed: int,
 ) -> list[Episode]:
     """Play scenarios of a bank in parallel, one robot for each; the optima for the poses reached are not searched."""
-    count = len(indices)
-    venv = NavigateVectorEnv(count, bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
+    venv = NavigateVectorEnv(len(indices), bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
     policy = _policy_for(policy_or_factory, venv, venv.single_observation_space)
-    observations, _ = venv.reset(seed=seed, options={"index": list(indices)})
-    states, costs = [venv.states], [np.zeros(count)]
-    returns, clearances = np.zeros(count), np.full(count, np.inf)
-    episodes: list[Episode | None] = [None] * count
-    state, starts = None, np.ones(count, dtype=bool)
-    while any(episode is None for episode in episodes):
-        actions, state = policy.predict(observations, state, starts, deterministic=True)
-        observations, rewards, terminated, truncated, infos = venv.step(actions)
-        starts = terminated | truncated
-        playing = np.array([episode is None for episode in episodes])
-        returns += np.where(playing, rewards, 0.0)
-        # Robots whose episode has ended are already in the next one; their last step is in `final_info`.
-        last = infos.get("final_info", infos)
-        states.append(np.where(starts[:, None], _states(last), _states(infos)))
-        costs.append(np.where(starts, last["cost"], infos["cost"]))
-        clearances = np.minimum(clearances, np.where(starts, last["clearance"], infos["clearance"]))
-        for i in np.flatnonzero(starts & playing).tolist():
-            episodes[i] = _make_episode(
-                bank,
-                indices[i],
-                np.array([row[i] for row in states]),
-                np.array([row[i] for row in costs]),
-                success=bool(last["is_success"][i]),
-                collision=bool(last["collision"][i]),
-                episode_return=float(returns[i]),
-                clearance=float(clearances[i]),
-                truncated=bool(truncated[i]),
-            )
+    played = play_episodes(policy, venv, {"index": list(indices)}, seed)
     venv.close()
-    return [episode for episode in episodes if episode is not None]
+    return [_make_episode(bank, index, one) for index, one in zip(indices, played, strict=True)]
 
 
-def _states(infos: Mapping[str, Any]) -> np.ndarray:
-    """Return the states (N, n) of the robots from the infos of a step."""
-    return np.concatenate([infos["pose"], infos["motion"]], axis=1) if "motion" in infos else infos["pose"]
-
-
-def _make_episode(
-    bank: ScenarioBank, index: int, states: np.ndarray, costs: np.ndarray, *, success: bool, **outcome: Any
-) -> Episode:
-    """Combine the outcome of an episode with the reference of its scenario."""
+def _make_episode(bank: ScenarioBank, index: int, played: PlayedEpisode) -> Episode:
+    """Combine an episode with the reference of its scenario."""
     scenario, reference = bank[index], bank.reference(index)
+    outcome = {name: value for name, value in vars(played).items() if name != "actions"}
     return Episode(
         family=bank.family,
         bank=bank_identity(bank),
         index=index,
         scenario=scenario.name,
-        success=success,
-        cost=float(costs[-1]),
+        cost=float(played.costs[-1]),
         reference_cost=reference.cost,
         reached_reference=math.nan,
         reference_clearance=reference.certificate[3],
         reversing=bool(_speeds(reference).min() < -MIN_REVERSE_SPEED),
-        states=states,
-        costs=costs,
         lower_bound=math.nan if reference.lower_bound is None else reference.lower_bound,
         **outcome,
     )
@@ -284,22 +267,12 @@ def _median_milliseconds(policy_or_factory: PolicyOrFactory, bank: ScenarioBank,
     return 1e3 * float(np.median(seconds))
 
 
-def _is_factory(given: Callable[..., Any]) -> bool:
-    """Return whether a callable makes a policy for an environment."""
-    if isinstance(given, type):
-        return True
-    try:
-        return "env" in inspect.signature(given).parameters
-    except (TypeError, ValueError):  # some functions in C have no signature
-        return False
-
-
 def _policy_for(policy_or_factory: PolicyOrFactory, env: Any, observation_space: Any) -> Policy:
     """Return the policy for an environment, after a check of its observation space."""
     given: Any = policy_or_factory
     if hasattr(given, "predict") and not isinstance(given, type):
         policy: Policy = given
-    elif _is_factory(given):
+    elif isinstance(given, (type, PolicyFactory)):
         policy = given(env)
     else:
         policy = FunctionPolicy(given, observation_space, unwrap(env)[0].settings.model.sizes()[1])

@@ -16,7 +16,7 @@ from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
 from leapnav.training.policies.files import BASELINES as BASELINES
 from leapnav.training.policies.files import load_policy, policy_environment, read_description
 from leapnav.training.policies.zips import is_zip, load_zip
-from leapnav.training.scoring.evaluation import Policy, PolicyOrFactory
+from leapnav.training.scoring.evaluation import Policy, PolicyFactory, PolicyOrFactory
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def load_policy_spec(
     if place in BASELINES:
         factories: dict[str, Any] = {
             "expert": ExpertPolicy,
-            "random": lambda env: RandomPolicy(_single_action_space(env), seed),
+            "random": PolicyFactory(lambda env: RandomPolicy(_single_action_space(env), seed)),
             "go-to-goal": GoToGoal,
         }
         return PolicySpec(place, label, None, factories[place], {}, is_baseline=True)

@@ -167,14 +167,6 @@ class NavigateVecEnv(VecEnv):
             self._returns[i], self._lengths[i] = 0.0, 0
         return observations
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state for the checkpoint of a training run: the environment and the episode statistics."""
-        return {"venv": self.venv, "returns": self._returns, "lengths": self._lengths}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state returned by `state_dict` of an environment with the same arguments."""
-        self.venv, self._returns, self._lengths = state["venv"], state["returns"], state["lengths"]
-
     def close(self) -> None:
         """Close the environment."""
         self.venv.close()

@@ -10,7 +10,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.vector import NavigateVectorEnv
-from leapnav.training.robots.level_samplers import PrioritizedSampler
+from leapnav.training.environments.level_samplers import PrioritizedSampler
 
 
 class LevelScoring(BaseCallback):

@@ -1,0 +1,167 @@
+"""Policies of Stable-Baselines3 whose actions use what the observation contains: the last action, and the time left.
+
+With a free horizon and without drift, an optimal action a has an effort of at least a known size, sum(w a^2) >= 1. The
+action of a network that averages two paths of similar cost is smaller, and because neither the last action nor the time
+is an input of the network, the robot would stay there. With momentum, the missing effort is added in the direction of
+the last action, which the observation contains with `previous_action=True`. The network does not depend on it: fitted
+to demonstrations, it would repeat the last action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch as th
+from gymnasium.spaces import Box
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
+
+from leapnav.envs.simulation.observations import TIME_LEFT, parts_of
+
+# Fraction of the action noise that remains at the horizon. Without any noise the likelihoods would be infinite.
+MIN_NOISE_FRACTION = 0.3
+# Weight of the last action, per missing unit of the norm. In 500 scenarios of clutter, weights of 0, 1/2, 1, 2 and 4
+# gave a policy 96.4, 98.2, 98.4, 99.2 and 98.8 % success.
+MOMENTUM = 2.0
+MIN_NORM = 1e-6  # of an action that is scaled
+MAX_SQUASHED = 1.0 - 1e-6  # absolute value of an action whose inverse hyperbolic tangent is taken
+
+
+def add_momentum(actions: th.Tensor, previous: th.Tensor, weights: th.Tensor) -> th.Tensor:
+    """Return actions (B, m) whose effort is that of an optimal action at least.
+
+    Args:
+        actions: (B, m), of the network.
+        previous: (B, m), the last actions, 0 at the start of an episode.
+        weights: (m,), see `leapnav.training.effort`.
+
+    """
+
+    def norms(values: th.Tensor) -> th.Tensor:
+        return (weights * values.square()).sum(dim=-1, keepdim=True).clamp(min=MIN_NORM**2).sqrt()
+
+    norm = norms(actions)
+    moved = actions + MOMENTUM * (1.0 - norm).clamp(min=0.0) * previous
+    return th.where(norm < 1.0, moved / norms(moved).clamp(max=1.0), actions)
+
+
+class _Momentum:
+    """The momentum of a policy for observations with the part `action`.
+
+    Args:
+        space: the observation space.
+        weights: see `leapnav.training.effort`.
+
+    Raises:
+        ValueError: the observations do not contain the last action.
+
+    """
+
+    def __init__(self, space: Any, weights: Sequence[float]) -> None:
+        part = parts_of(space).get("action")
+        if part is None:
+            raise ValueError("effort_weights: expected None for observations without the last action, got numbers")
+        self._part, self._weights = part, tuple(map(float, weights))
+
+    def __call__(self, actions: th.Tensor, observations: th.Tensor) -> th.Tensor:
+        """Return actions (B, m) with momentum."""
+        return add_momentum(actions, observations[:, self._part], actions.new_tensor(self._weights))
+
+
+class NavigationPolicy(ActorCriticPolicy):
+    """An actor-critic policy with momentum, and with less noise near the horizon.
+
+    Args:
+        args, kwargs: arguments of `ActorCriticPolicy`.
+        effort_weights: see `leapnav.training.effort`; None: no momentum.
+        quiet: time before the horizon at which the standard deviation of the actions starts to decrease (s). It is
+            proportional to the remaining time from then on, but not below 30 %; 0: it does not decrease. An error
+            shortly before the horizon cannot be corrected, and would hide the effect of earlier actions on the return.
+            Not used with a free horizon.
+
+    """
+
+    def __init__(
+        self, *args: Any, effort_weights: Sequence[float] | None = None, quiet: float = 0.0, **kwargs: Any
+    ) -> None:
+        self.effort_weights = None if effort_weights is None else tuple(map(float, effort_weights))
+        self.quiet = quiet
+        # The current batch: the base class makes the distribution from the latent features alone.
+        self._batch: th.Tensor | None = None
+        super().__init__(*args, **kwargs)
+        space = cast(Box, self.observation_space)
+        self._momentum = None if self.effort_weights is None else _Momentum(space, self.effort_weights)
+        self._is_quiet = quiet > 0 and parts_of(space)["goal"].stop > TIME_LEFT
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {"effort_weights": self.effort_weights, "quiet": self.quiet}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def forward(self, obs: Any, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Return actions, values and log-likelihoods."""
+        self._batch = obs
+        return super().forward(obs, deterministic)
+
+    def get_distribution(self, obs: Any) -> Distribution:
+        """Return the distribution of the actions."""
+        self._batch = obs
+        return super().get_distribution(obs)
+
+    def evaluate_actions(self, obs: Any, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Return values, log-likelihoods of the actions, and the entropy."""
+        self._batch = obs
+        return super().evaluate_actions(obs, actions)
+
+    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
+        mean, log_std, batch = self.action_net(latent_pi), self.log_std, self._batch
+        assert batch is not None  # set by the methods above
+        self._batch = None
+        if self._momentum is not None:
+            mean = self._momentum(mean, batch)
+        if self._is_quiet:
+            log_std = log_std + (batch[:, TIME_LEFT, None] / self.quiet).clamp(MIN_NOISE_FRACTION, 1.0).log()
+        return cast(DiagGaussianDistribution, self.action_dist).proba_distribution(mean, log_std)
+
+
+class MomentumActor(Actor):
+    """The actor of SAC with momentum: the arguments of `Actor`, and `effort_weights`."""
+
+    def __init__(self, observation_space: Any, *args: Any, effort_weights: Sequence[float], **kwargs: Any) -> None:
+        super().__init__(observation_space, *args, **kwargs)
+        self._momentum = _Momentum(observation_space, effort_weights)
+
+    def get_action_dist_params(self, obs: Any) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        """Return the mean and the logarithm of the standard deviation of the actions before they are squashed."""
+        mean, log_std, further = super().get_action_dist_params(obs)
+        moved = self._momentum(th.tanh(mean), obs).clamp(-MAX_SQUASHED, MAX_SQUASHED)
+        return th.atanh(moved), log_std, further
+
+
+class MomentumSACPolicy(SACPolicy):
+    """A policy of SAC with momentum: the arguments of `SACPolicy`, and `effort_weights`."""
+
+    def __init__(self, *args: Any, effort_weights: Sequence[float], **kwargs: Any) -> None:
+        self.effort_weights = tuple(map(float, effort_weights))
+        super().__init__(*args, **kwargs)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "effort_weights": self.effort_weights}
+
+    def make_actor(self, features_extractor: Any = None) -> Actor:
+        """Return a new actor."""
+        arguments = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return MomentumActor(**arguments, effort_weights=self.effort_weights).to(self.device)
+
+
+def has_momentum(policy: Any) -> bool:
+    """Return whether the actions of a policy contain momentum."""
+    return getattr(policy, "effort_weights", None) is not None
+
+
+def deterministic_action(policy: Any, mean: th.Tensor, observations: th.Tensor) -> th.Tensor:
+    """Return the deterministic actions (B, m) of a policy from those of its network without momentum, clipped."""
+    if has_momentum(policy):
+        mean = _Momentum(policy.observation_space, policy.effort_weights)(mean, observations)
+    return mean.clamp(-1.0, 1.0)
