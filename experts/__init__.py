@@ -8,24 +8,21 @@ from typing import TYPE_CHECKING, Any
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.bounds.lower_bound import LowerBound, lower_bound
 from leapnav.experts.continuation import continuation
-from leapnav.experts.minimum_time import MinimumTime, minimum_time
+from leapnav.experts.minimum_time import minimum_time
 from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum, shortest_horizon
 from leapnav.experts.problem.certificate import certify, verify
-from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, SolveError, Status
+from leapnav.experts.problem.extremal import Certificate, Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.problem.system import ControlAffineSystem, differential_drive, unicycle, unicycle_with_inertia
+from leapnav.experts.problem.system import ControlAffineSystem, unicycle
 from leapnav.experts.proofs.checker import check_proof
-from leapnav.experts.proofs.proof import Proof, ProofError
+from leapnav.experts.proofs.proof import Proof
 from leapnav.experts.solve import solve
 
 if TYPE_CHECKING:
-    from leapnav.experts.bounds.plotting import plot_tube
-    from leapnav.experts.data.bank_bounds import prove_bank
     from leapnav.experts.data.banks import build_bank, build_bank_of
-    from leapnav.experts.data.cards import data_card
     from leapnav.experts.data.demonstrations import load_demonstrations
     from leapnav.experts.data.optima import find_optima
-    from leapnav.experts.data.rollouts import check_dataset, rollout
+    from leapnav.experts.data.rollouts import rollout
     from leapnav.experts.plotting import plot_extremal
 
 __all__ = [
@@ -33,25 +30,19 @@ __all__ = [
     "ControlAffineSystem",
     "ExpertPolicy",
     "Extremal",
-    "Iteration",
     "LowerBound",
-    "MinimumTime",
     "NoOptimumError",
     "OptimalControlProblem",
     "Optimum",
     "Proof",
-    "ProofError",
     "SolveError",
     "Status",
     "Trajectory",
     "build_bank",
     "build_bank_of",
     "certify",
-    "check_dataset",
     "check_proof",
     "continuation",
-    "data_card",
-    "differential_drive",
     "find_optima",
     "find_optimum",
     "find_reached_optimum",
@@ -59,13 +50,10 @@ __all__ = [
     "lower_bound",
     "minimum_time",
     "plot_extremal",
-    "plot_tube",
-    "prove_bank",
     "rollout",
     "shortest_horizon",
     "solve",
     "unicycle",
-    "unicycle_with_inertia",
     "verify",
 ]
 
@@ -73,13 +61,9 @@ __all__ = [
 _LAZY = {
     "build_bank": "leapnav.experts.data.banks",
     "build_bank_of": "leapnav.experts.data.banks",
-    "data_card": "leapnav.experts.data.cards",
-    "check_dataset": "leapnav.experts.data.rollouts",
     "find_optima": "leapnav.experts.data.optima",
     "load_demonstrations": "leapnav.experts.data.demonstrations",
     "plot_extremal": "leapnav.experts.plotting",
-    "plot_tube": "leapnav.experts.bounds.plotting",
-    "prove_bank": "leapnav.experts.data.bank_bounds",
     "rollout": "leapnav.experts.data.rollouts",
 }
 

@@ -19,7 +19,8 @@ from leapnav.envs import (
 )
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.utils.colors import OPTIMUM
-from leapnav.experts import ExpertPolicy, find_optimum, lower_bound, plot_extremal, plot_tube, solve
+from leapnav.experts import ExpertPolicy, find_optimum, lower_bound, plot_extremal, solve
+from leapnav.experts.bounds.plotting import plot_tube
 from leapnav.experts.plotting import draw_robot, draw_scenario
 from leapnav.training import evaluate, load_policy, plot_episodes, policy_environment
 

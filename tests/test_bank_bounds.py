@@ -15,8 +15,10 @@ import pytest
 from leapnav.cli import main
 from leapnav.envs import BankError, NavigateEnv, NavigateVectorEnv, ScenarioBank
 from leapnav.envs.scenarios.bank_writing import write_lower_bounds
-from leapnav.experts import ProofError, build_bank, prove_bank
+from leapnav.experts import build_bank
 from leapnav.experts.data import bank_bounds
+from leapnav.experts.data.bank_bounds import prove_bank
+from leapnav.experts.proofs.proof import ProofError
 from leapnav.training import GoToGoal, compare, evaluate, score
 from leapnav.training.scoring.reports import print_scores
 

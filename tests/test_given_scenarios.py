@@ -20,7 +20,8 @@ from leapnav.envs import (
     sample_scenario,
 )
 from leapnav.envs.scenarios.files import read_scenarios
-from leapnav.experts import build_bank_of, data_card, find_optimum, load_demonstrations, rollout
+from leapnav.experts import build_bank_of, find_optimum, load_demonstrations, rollout
+from leapnav.experts.data.cards import data_card
 from leapnav.training import evaluate, load_policy, policy_environment
 
 RING = [

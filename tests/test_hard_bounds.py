@@ -8,7 +8,8 @@ import pytest
 from helpers import DISC_AND_TRIANGLE as SCENARIO
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.experts import ProofError, check_proof, find_optimum, lower_bound
+from leapnav.experts import check_proof, find_optimum, lower_bound
+from leapnav.experts.proofs.proof import ProofError
 
 
 @pytest.mark.parametrize(

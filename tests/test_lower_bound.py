@@ -17,13 +17,14 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.shapes.field import read_header
 from leapnav.envs.shapes.proximity import proximity_value
-from leapnav.experts import LowerBound, Optimum, Proof, ProofError, check_proof, find_optimum, lower_bound, plot_tube
+from leapnav.experts import LowerBound, Optimum, Proof, check_proof, find_optimum, lower_bound
+from leapnav.experts.bounds.plotting import plot_tube
 from leapnav.experts.proofs.cells import BLOCK, CellSet, Grid, gather, make_layout, scatter
 from leapnav.experts.proofs.checker import spline_value
 from leapnav.experts.proofs.gauge import make_source
 from leapnav.experts.proofs.inequality import functionals, gradient_ratios
 from leapnav.experts.proofs.near_source import cells_near
-from leapnav.experts.proofs.proof import Spline, Stage
+from leapnav.experts.proofs.proof import ProofError, Spline, Stage
 from leapnav.experts.proofs.running_cost import running_cost
 
 VERTEX = (2.0, 3.4)

@@ -345,7 +345,8 @@ def test_a_bank_of_another_robot(tmp_path):
 
 
 def test_a_robot_of_one_s_own_is_demonstrated_and_cloned(tmp_path):
-    from leapnav.experts import check_dataset, rollout
+    from leapnav.experts import rollout
+    from leapnav.experts.data.rollouts import check_dataset
     from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_policy
 
     summary = rollout("open", 6, tmp_path / "data", robot="trailer", progress=False)

@@ -13,11 +13,10 @@ from leapnav.experts import (
     SolveError,
     Status,
     Trajectory,
-    differential_drive,
     find_optimum,
     solve,
-    unicycle_with_inertia,
 )
+from leapnav.experts.problem.system import differential_drive, unicycle_with_inertia
 from leapnav.experts.solve import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}

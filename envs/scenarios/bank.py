@@ -102,7 +102,8 @@ class ScenarioBank(Sequence[Scenario]):
         costs (n,): optimal costs J*.
         second_costs (n,): costs of the second-best local optima found, NaN if there is none.
         certificates (n, 4): boundary residual, defect, drift of H, clearance (m).
-        lower_bounds (n,): proved lower bounds of the cost, see `leapnav.experts.prove_bank`; NaN where none is known.
+        lower_bounds (n,): proved lower bounds of the cost, see `prove_bank` of
+            `leapnav.experts.data.bank_bounds`; NaN where none is known.
         draws (n,): indices of the random draws that produced the scenarios.
         horizon: kind of the horizon of all scenarios, "fixed" or "free".
         obstacles: kind of the obstacles of all scenarios, "cost" or "hard", see `Cost.obstacles`.

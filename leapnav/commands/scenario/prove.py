@@ -61,7 +61,7 @@ class Prove:
             bound.proof.save(self.proof)
             print(f"wrote {self.proof}")
         if self.plot is not None:
-            from leapnav.experts import plot_tube
+            from leapnav.experts.bounds.plotting import plot_tube
 
             plot_tube(bound, self.plot, optimum)
             print(f"wrote {self.plot}")
@@ -86,7 +86,8 @@ class CheckProof:
     def run(self) -> int:
         """Check and report."""
         from leapnav.envs.scenarios.scenario import Scenario
-        from leapnav.experts import Proof, ProofError, check_proof
+        from leapnav.experts import Proof, check_proof
+        from leapnav.experts.proofs.proof import ProofError
 
         proof = Proof.load(self.file)
         if self.scenario is not None and Scenario.from_json(self.scenario) != proof.scenario:
