@@ -201,8 +201,8 @@ def test_a_goal_at_the_start_is_no_crash_and_no_wrong_success():
 
 
 def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="candidates: expected an integer >= 1, got 0"):
-        find_optimum(BEST_KNOWN[0][0], candidates=0)
+    with pytest.raises(ValueError, match="effort: expected one of low, medium, high, got 'all'"):
+        find_optimum(BEST_KNOWN[0][0], "all")
 
 
 def test_another_path_class_is_searched_if_all_first_candidates_collide():
@@ -417,11 +417,11 @@ def test_the_search_is_repeated_where_the_continuation_stalls(monkeypatch):
     scenario = with_weight(sample_scenario("clutter", 13), 0.0)
     expected, weights = find_optimum(scenario), []
 
-    def stalls_first(extremals, *options):
+    def stalls_first(extremals, *arguments, **options):
         weights.append(extremals[0].problem.barrier_weight)
         if len(weights) == 1:
             return [replace(extremals[0], status=Status.STALLED)]
-        return follow_best(extremals, *options)
+        return follow_best(extremals, *arguments, **options)
 
     monkeypatch.setattr("leapnav.experts.optimum.follow_best", stalls_first)
     found = find_optimum(scenario)

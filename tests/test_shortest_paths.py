@@ -9,7 +9,6 @@ from scipy.sparse.csgraph import dijkstra
 from leapnav.envs.robots.moves import ANGLES, DIRECTIONS, HEADINGS, curved_moves, rotating_moves
 from leapnav.experts import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import (
     Limits,
@@ -76,22 +75,23 @@ def ends(speed):
     return node(*free[0], 3), node(*free[-1], 9)
 
 
-def trees(speed, reach, moves, general=False):
+def trees(speed, reach, moves, layers=1):
     start, goal = ends(speed)
     root, target = Nodes(np.array([start]), np.zeros(1)), Nodes(np.array([goal]), np.zeros(1))
-    metric = Metric(speed[None], speed, CELL, SPEED_WEIGHT, TURN_WEIGHT, moves.targets, moves.points, moves.weights)
+    layered = np.repeat(speed[None], layers, axis=0)
+    metric = Metric(layered, speed, CELL, SPEED_WEIGHT, TURN_WEIGHT, moves.targets, moves.points, moves.weights)
     bound = plane_costs(metric, root._replace(nodes=root.nodes // HEADINGS))
-    grow = tree if moves.rotating and not general else general_tree
-    behind = grow(metric, target, root, bound, False, Limits(reach, 0.5, np.inf))
-    ahead = grow(metric, root, target, behind[0], True, Limits(reach, 0.5, behind[2]))
+    behind = tree(metric, target, root, bound, False, Limits(reach, 0.5, np.inf))
+    ahead = tree(metric, root, target, behind[0], True, Limits(reach, 0.5, behind[2]))
     return start, goal, bound, ahead, behind
 
 
-@pytest.mark.parametrize(("kind", "general"), [("rotating", False), ("rotating", True), ("curved", True)])
+@pytest.mark.parametrize("layers", [1, HEADINGS])
+@pytest.mark.parametrize("kind", ["rotating", "curved"])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_trees_have_the_costs_of_an_independent_dijkstra(seed, kind, general):
+def test_the_trees_have_the_costs_of_an_independent_dijkstra(seed, kind, layers):
     speed = random_speed(seed)
-    start, goal, bound, (ahead, _, limit), (behind, _, same_limit) = trees(speed, 1.3, MOVES[kind], general)
+    start, goal, bound, (ahead, _, limit), (behind, _, same_limit) = trees(speed, 1.3, MOVES[kind], layers)
     edges = graph(speed, MOVES[kind])
     from_start = dijkstra(edges, indices=start)
     from_goal = dijkstra(edges.T, indices=goal)

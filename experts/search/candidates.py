@@ -21,7 +21,6 @@ import numpy as np
 
 from leapnav.envs.robots.moves import HEADINGS
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.experts.search.general_paths import general_tree
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import (
     Limits,
@@ -234,9 +233,8 @@ class CandidateSearch:
         bound = cell_costs(metric, seeds)
         fraction = self._fraction
         limits = Limits(1.0 + fraction * (self._reach - 1.0), fraction * self.slack, math.inf)
-        grow = tree if self.lattice.moves.rotating and len(metric.speed) == 1 else general_tree
-        cost_behind, behind, limit = grow(metric, ends, seeds, bound, False, limits)
-        cost_ahead, ahead, _ = grow(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
+        cost_behind, behind, limit = tree(metric, ends, seeds, bound, False, limits)
+        cost_ahead, ahead, _ = tree(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
         self._meetings, self.limit = self._meet(limit), limit
 
