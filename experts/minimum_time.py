@@ -56,14 +56,14 @@ class MinimumTime:
     levels: np.ndarray
 
 
-def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> MinimumTime:
+def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -> MinimumTime:
     """Find a path of minimum time with bounded controls, by continuation to small control weights.
 
-    The horizon, the control weights and the time weight of the task are ignored. A state cost and the proximity cost of
+    The horizon, the control weights and the time weight of the problem are ignored. A state cost and the proximity cost of
     obstacles are kept: the cost is the time plus their integral. With hard limits it is the time.
 
     Args:
-        task: a problem with control bounds, or a scenario.
+        problem: a problem with control bounds, or a scenario.
         tol: the control weights decrease until the duration exceeds the minimum time by at most this fraction, in
             (0, 1). `MinimumTime.tolerance` is the fraction that was reached.
 
@@ -71,7 +71,7 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
         The path, and when its controls switch.
 
     Raises:
-        TypeError: the task is neither a problem nor a scenario.
+        TypeError: it is neither a problem nor a scenario.
         ValueError: a control has no finite bounds, or `tol` is invalid.
         SolveError: no path was found; the attribute `extremal` is the failed result.
 
@@ -79,17 +79,17 @@ def minimum_time(task: OptimalControlProblem | Scenario, tol: float = 1e-3) -> M
     check_positive("tol", tol)
     if not tol < 1:
         raise ValueError(f"tol: expected a number below 1, got {tol!r}")
-    problem = as_problem(task)
-    bounds = np.array(problem.control_bounds if problem.control_bounds is not None else [(-np.inf, np.inf)])
+    ocp = as_problem(problem)
+    bounds = np.array(ocp.control_bounds if ocp.control_bounds is not None else [(-np.inf, np.inf)])
     if not np.isfinite(bounds).all():
-        raise ValueError(f"control_bounds: expected finite numbers, got {problem.control_bounds!r}")
+        raise ValueError(f"control_bounds: expected finite numbers, got {ocp.control_bounds!r}")
     weights = list(_weights(tol, len(bounds)))
-    problems = [_with_weight(problem, bounds, weight) for weight in weights]
-    followed = [_follow(start, problems) for start in _first(task, problems[0])]
+    problems = [_with_weight(ocp, bounds, weight) for weight in weights]
+    followed = [_follow(start, problems) for start in _first(problem, problems[0])]
     ends = [end for end in followed if end.solved]
     if not ends:
-        raise SolveError(followed[0].extremal, task.name if isinstance(task, Scenario) else "")
-    has_state_cost = problem.field is not None or problem.state_cost != 0 or problem.has_hard_limits
+        raise SolveError(followed[0].extremal, problem.name if isinstance(problem, Scenario) else "")
+    has_state_cost = ocp.field is not None or ocp.state_cost != 0 or ocp.has_hard_limits
     if has_state_cost:  # the durations alone do not rank the paths, and the control costs have different weights
         best = min(ends, key=lambda end: _cost_without_controls(end.extremal))
     else:
@@ -129,13 +129,13 @@ def _with_weight(problem: OptimalControlProblem, bounds: np.ndarray, weight: flo
     return replace(problem, horizon=None, time_weight=1.0, control_weight=control_weight)
 
 
-def _first(task: OptimalControlProblem | Scenario, problem: OptimalControlProblem) -> Sequence[Extremal]:
+def _first(given: OptimalControlProblem | Scenario, problem: OptimalControlProblem) -> Sequence[Extremal]:
     """Return the extremals from which the continuations start, or a failure; those of a scenario have its weights."""
-    if not isinstance(task, Scenario):
+    if not isinstance(given, Scenario):
         starts = islice(initial_paths(problem), MAX_PATHS)
         found = [solve(wound, "multiple_shooting", guess=path) for wound, path in starts]
         return [extremal for extremal in found if extremal.success] or [solve(problem)]
-    free = task.model_copy(update={"horizon": None, "cost": task.cost.model_copy(update={"time_weight": 1.0})})
+    free = given.model_copy(update={"horizon": None, "cost": given.cost.model_copy(update={"time_weight": 1.0})})
     optimum = find_optimum(free)
     return [optimum, *optimum.alternatives][:MAX_PATHS]
 

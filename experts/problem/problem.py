@@ -440,10 +440,10 @@ def _constant(values: Any) -> np.ndarray:
     return array
 
 
-def as_problem(task: OptimalControlProblem | Scenario) -> OptimalControlProblem:
+def as_problem(problem: OptimalControlProblem | Scenario) -> OptimalControlProblem:
     """Return the problem of a scenario, or the problem itself."""
-    if isinstance(task, Scenario):
-        return OptimalControlProblem.from_scenario(task)
-    if isinstance(task, OptimalControlProblem):
-        return task
-    raise TypeError(f"expected a Scenario or an OptimalControlProblem, got {type(cast(object, task)).__name__}")
+    if isinstance(problem, Scenario):
+        return OptimalControlProblem.from_scenario(problem)
+    if isinstance(problem, OptimalControlProblem):
+        return problem
+    raise TypeError(f"expected a Scenario or an OptimalControlProblem, got {type(cast(object, problem)).__name__}")
