@@ -25,7 +25,7 @@ test: lint .venv/examples
 # Long checks, see CONTRIBUTING.md.
 test-all: test
 	$(PYTEST) -m "slow"
-	HYPOTHESIS_PROFILE=long $(PYTEST) tests/test_fuzz.py
+	HYPOTHESIS_PROFILE=long $(PYTEST) tests/project/test_fuzz.py
 	NUMBA_BOUNDSCHECK=1 LEAPNAV_CACHE_DIR=$(CURDIR)/build/bounds-checked $(PYTEST)
 	$(BIN)/python scripts/build_banks.py --check
 	$(BIN)/python scripts/check_installations.py

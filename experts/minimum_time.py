@@ -59,8 +59,8 @@ class MinimumTime:
 def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -> MinimumTime:
     """Find a path of minimum time with bounded controls, by continuation to small control weights.
 
-    The horizon, the control weights and the time weight of the problem are ignored. A state cost and the proximity cost of
-    obstacles are kept: the cost is the time plus their integral. With hard limits it is the time.
+    The horizon, the control weights and the time weight of the problem are ignored. A state cost and the proximity cost
+    of obstacles are kept: the cost is the time plus their integral. With hard limits it is the time.
 
     Args:
         problem: a problem with control bounds, or a scenario.

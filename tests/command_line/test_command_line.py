@@ -1,12 +1,13 @@
-"""Choices, completion and interruptions of the command line."""
+"""Help, choices, completion and interruptions of the command line."""
 
 import shutil
 import subprocess
+import sys
 from typing import get_args
 
 import pytest
 
-from leapnav.cli import main
+from leapnav.cli import COMMANDS, main
 from leapnav.commands.options import Family, FamilyOrAll, Horizon, PolicyName, parse_environment
 from leapnav.envs import FAMILIES
 from leapnav.envs.settings import HORIZONS
@@ -74,3 +75,26 @@ def test_arguments_of_the_environment_are_json_or_text():
     assert parse_environment([]) is None
     found = parse_environment(["observation=map", "map_obstacles=3", "dict_observation=true"])
     assert found == {"observation": "map", "map_obstacles": 3, "dict_observation": True}
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), ["train", "ppo"], ["bank", "build"]])
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--help"])
+    assert end.value.code in (0, None)
+    assert " ".join(["usage: leapnav", *command]) in capsys.readouterr().out
+
+
+def test_the_package_is_a_command():
+    done = subprocess.run([sys.executable, "-m", "leapnav", "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "usage: leapnav" in done.stdout
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands_and_options(shell, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--tyro-print-completion", shell])
+    printed = capsys.readouterr().out
+    assert end.value.code in (0, None)
+    assert all(word in printed for word in ("solve", "evaluate", "--episodes-plot", "play"))

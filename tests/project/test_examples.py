@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 D3RLPY = ROOT / ".venv" / "examples"  # `make test` installs it there
 SCORE = r"success \d+\.\d %, collision \d+\.\d %, SOC \d\.\d+"
 # Arguments, and the last lines of the output.

@@ -15,7 +15,7 @@ import leapnav
 from leapnav.cli import parse
 from leapnav.envs import Scenario
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 CHECK_LINKS = ROOT / "scripts" / "check_links.py"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PHONE = {"width": 390, "height": 844}

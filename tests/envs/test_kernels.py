@@ -16,7 +16,7 @@ from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.decorator import kernel_cache
 from leapnav.envs.kernels.types import VECTOR
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 CALLING = """
 {imports}
