@@ -103,7 +103,7 @@ def test_broken_and_foreign_policies_are_refused(clone, tmp_path):
         load_policy(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     faults = [
-        ({**description, "format": 99}, "format: expected 5, got 99"),
+        ({**description, "format": 99}, "format: expected 6, got 99"),
         ({}, "not the description of a policy"),
         ({**description, "environment": {"id": "leapnav/Navigate-v1"}}, "a policy for leapnav/Navigate-v1"),
         ({**description, "kind": "dqn"}, "kind: expected one of actor-critic, sac, td3, tqc, got 'dqn'"),

@@ -90,7 +90,7 @@ class DAgger:
         rounds: statistics of the rounds so far.
 
     Raises:
-        TypeError: an argument of the environment is unknown.
+        TypeError: an argument of the environment is unknown, or another one has a wrong type.
         ValueError: a setting is invalid, or the environment and the observations do not fit.
 
     """
@@ -109,6 +109,12 @@ class DAgger:
         effort: Effort = "low",
         workers: int = 1,
     ) -> None:
+        if not isinstance(cast(object, scenarios), (str, ScenarioBank)):
+            raise TypeError(
+                f"scenarios: expected the name of a family or a ScenarioBank, got {type(scenarios).__name__}"
+            )
+        if not isinstance(cast(object, config), (DAggerConfig, type(None))):
+            raise TypeError(f"config: expected a DAggerConfig, got {type(config).__name__}")
         self.config, self._cloning = config or DAggerConfig(), cloning or CloningConfig()
         check_dagger(self.config)
         check_at_least("workers", workers, 1)
