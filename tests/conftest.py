@@ -70,10 +70,10 @@ def clone(dataset, tmp_path_factory):
     from leapnav.training import CloningConfig, EpochLoss, behaviour_clone, make_policy
 
     env = NavigateEnv("open")
-    policy = make_policy(env.observation_space, env.action_space, seed=0)
+    policy = make_policy(env.observation_space, env.action_space, seed=0, hidden=(128, 128))
 
     def make(out):
-        config = CloningConfig(epochs=40, batch_size=256, patience=0)
+        config = CloningConfig(epochs=30, batch_size=256, patience=0)
         losses = behaviour_clone(policy, dataset, config, progress=False)
         out.mkdir()
         th.save({"policy": policy.state_dict(), "losses": [vars(loss) for loss in losses]}, out / "clone.pt")
@@ -87,6 +87,15 @@ def clone(dataset, tmp_path_factory):
 @pytest.fixture
 def env():
     return gym.make("leapnav/Navigate-v0", family="open")
+
+
+@pytest.fixture(autouse=True)
+def _few_scenarios(monkeypatch):
+    """Final evaluations of training runs play 5 scenarios, and a test bank that they build has 5."""
+    from leapnav.training.runs import run
+
+    monkeypatch.setattr(run, "FINAL_SCENARIOS", 5)
+    monkeypatch.setattr(run, "TEST_COUNT", 5)
 
 
 @pytest.fixture(autouse=True)

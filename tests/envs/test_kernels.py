@@ -160,9 +160,11 @@ print([one.__name__ for one in prepared if sum(one.stats.cache_misses.values())]
 """
 
 
-def test_what_is_prepared_suffices_for_a_step_and_a_search(tmp_path):
+@pytest.mark.parametrize("cache", ["shared", pytest.param("empty", marks=pytest.mark.slow)])
+def test_what_is_prepared_suffices_for_a_step_and_a_search(cache, tmp_path):
     """Neither other kernels nor other types of arguments than the declared ones are compiled."""
-    assert run(USED, LEAPNAV_CACHE_DIR=str(tmp_path)).stdout == "[]\n"
+    environment = {"LEAPNAV_CACHE_DIR": str(tmp_path)} if cache == "empty" else {}
+    assert run(USED, **environment).stdout == "[]\n"
 
 
 SCRIPT = """

@@ -112,7 +112,7 @@ def test_a_run_trains_and_is_evaluated(module, tmp_path):
     )
     (evaluation,) = train_ppo(config, progress=False)
     bank = ScenarioBank(tmp_path / "run" / "test.bank")
-    assert len(evaluation) == len(bank) == 100 and bank.family == module
+    assert len(evaluation) == len(bank) == 5 and bank.family == module
     assert len(evaluate(lambda observation: np.zeros(2), bank, count=2, progress=False)) == 2
     command = ["evaluate", str(tmp_path / "run"), "--count", "2", "--html", str(tmp_path / "report.html")]
     assert main(command) == 0

@@ -153,22 +153,22 @@ def lidar(scenario, x, y, heading, count=64, reach=5.0):
 
 
 @each_shape
-@pytest.mark.parametrize("count", [64, 100])
+@pytest.mark.parametrize("count", [16, 25])
 def test_lidar_ranges_end_at_the_boundary(shape, count):
     scenario = scenario_of(shape)
     hits = 0
     for pose in ((2.0, 2.0, 0.4), (5.6, 4.0, -2.0), (4.0, 4.4, 0.0)):
         for angle, found in zip(*lidar(scenario, *pose, count), strict=True):
             ray = [
-                pose[0] + np.linspace(0, found, 200) * np.cos(angle),
-                pose[1] + np.linspace(0, found, 200) * np.sin(angle),
+                pose[0] + np.linspace(0, found, 100) * np.cos(angle),
+                pose[1] + np.linspace(0, found, 100) * np.sin(angle),
             ]
             distances = [distance_to(shape, x, y) for x, y in zip(*ray, strict=True)]
             x, y = ray[0][-1], ray[1][-1]
             assert min(distances) > -1e-9
             assert found == 5.0 or min(abs(distances[-1]), abs(min(x, 8 - x, y, 6 - y))) < 1e-9
             hits += abs(distances[-1]) < 1e-9
-    assert hits > 20
+    assert hits > 5
 
 
 @each_shape

@@ -220,7 +220,8 @@ def test_gains_of_the_barrier_problem_are_finite():
 
 
 @pytest.mark.parametrize(("horizon", "robot"), [("fixed", "car"), ("free", "unicycle")])
-def test_demonstrations_succeed_and_are_replayed(tmp_path, horizon, robot):
+def test_demonstrations_succeed_and_are_replayed(tmp_path, horizon, robot, monkeypatch):
+    monkeypatch.setattr("leapnav.experts.data.rollouts.SHARD_SIZE", 1)
     arguments = {"horizon": horizon, "obstacles": "hard", "robot": robot}
     summary = rollout("clutter", 2, tmp_path, **arguments, recoveries=1, progress=False)
     assert summary.failed_replays == 0 and summary.demonstrations > 2

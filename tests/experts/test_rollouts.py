@@ -48,15 +48,15 @@ def contents(folder):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("rollouts") / "whole"
-    summary = rollout("open", 60, out, seed=3, recoveries=1, workers=2, progress=False)
-    assert summary.demonstrations > 100
+    summary = rollout("open", 40, out, seed=3, recoveries=1, workers=2, progress=False)
+    assert summary.demonstrations > 70
     assert {path.name for path in out.iterdir()} == {"leapnav", RECORD}
     return out
 
 
 def test_a_killed_and_resumed_rollout_gives_the_same_dataset(whole, tmp_path):
     out = tmp_path / "out"
-    arguments = ["rollout", "--family", "open", "--count", "60", "--seed", "3", "--recoveries", "1", "--workers", "2"]
+    arguments = ["rollout", "--family", "open", "--count", "40", "--seed", "3", "--recoveries", "1", "--workers", "2"]
     command = [sys.executable, "-m", "leapnav", *arguments, "--out", str(out)]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
     while len(list(out.glob(f"{WORK}/shard-*.npz"))) < 2 and process.poll() is None:
@@ -76,11 +76,11 @@ def test_stopped_while_the_dataset_is_written_it_writes_it_again(whole, tmp_path
     with monkeypatch.context() as patched:
         patched.setattr(rollouts, "write_dataset", stop)
         with pytest.raises(KeyboardInterrupt):
-            rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+            rollout("open", 40, tmp_path / "out", seed=3, recoveries=1, progress=False)
     (tmp_path / "out" / WORK / "root" / "leapnav").mkdir(parents=True)  # half of a dataset
     with monkeypatch.context() as patched:
         patched.setattr(rollouts, "_shard", stop)  # nothing is solved again
-        rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+        rollout("open", 40, tmp_path / "out", seed=3, recoveries=1, progress=False)
     assert contents(tmp_path / "out") == contents(whole)
 
 
@@ -89,14 +89,14 @@ def test_a_rollout_interrupted_after_its_last_step_is_completed(whole, tmp_path,
     with monkeypatch.context() as patched:
         patched.setattr(rollouts, "RolloutSummary", lambda *totals: 1 / 0)  # made when the dataset is in its place
         with pytest.raises(ZeroDivisionError):
-            rollout("open", 60, out, seed=3, recoveries=1, progress=False)
+            rollout("open", 40, out, seed=3, recoveries=1, progress=False)
     assert {path.name for path in out.iterdir()} == {WORK, "leapnav"}
-    rollout("open", 60, out, seed=3, recoveries=1, progress=False)
+    rollout("open", 40, out, seed=3, recoveries=1, progress=False)
     assert contents(out) == contents(whole)
     (out / DONE).mkdir()  # left by a run that was interrupted during its cleanup
     before = (out / RECORD).stat().st_mtime_ns
-    again = rollout("open", 60, out, seed=3, recoveries=1, progress=False)
-    assert again.demonstrations == 120
+    again = rollout("open", 40, out, seed=3, recoveries=1, progress=False)
+    assert again.demonstrations == 80
     assert (out / RECORD).stat().st_mtime_ns == before
     assert {path.name for path in out.iterdir()} == {"leapnav", RECORD}
 
@@ -113,10 +113,10 @@ def test_a_full_disk_keeps_what_is_finished(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(ResumableStore, "write", fill)
         with pytest.raises(OSError, match="No space left"):
-            rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+            rollout("open", 40, tmp_path / "out", seed=3, recoveries=1, progress=False)
     assert len(list((tmp_path / "out" / WORK).glob("shard-*.npz"))) == 2
     assert not list((tmp_path / "out" / WORK).glob(".*.partial"))
-    rollout("open", 60, tmp_path / "out", seed=3, recoveries=1, progress=False)
+    rollout("open", 40, tmp_path / "out", seed=3, recoveries=1, progress=False)
     assert contents(tmp_path / "out") == contents(whole)
 
 
@@ -217,8 +217,8 @@ def test_what_a_killed_process_left_of_a_file_is_removed(tmp_path):
 def test_a_dask_cluster_that_loses_a_worker_makes_the_same_dataset(whole, tmp_path):
     out = tmp_path / "out"
     with cluster_that_loses_a_worker(out, f"{WORK}/shard-*.npz") as address:
-        summary = rollout("open", 60, out, seed=3, recoveries=1, dask=address, progress=False)
-    assert summary.demonstrations > 100
+        summary = rollout("open", 40, out, seed=3, recoveries=1, dask=address, progress=False)
+    assert summary.demonstrations > 70
     assert contents(out) == contents(whole)
 
 
@@ -233,7 +233,7 @@ def test_without_dask_or_a_scheduler_a_cluster_is_refused(tmp_path, monkeypatch)
 
 def test_a_dataset_is_replayed(whole, tmp_path, capsys):
     replay = check_dataset(whole, progress=False)
-    assert replay.episodes > 100
+    assert replay.episodes > 70
     assert (replay.observation, replay.reward, replay.state) == (0.0, 0.0, 0.0)
     assert main(["dataset", "check", str(whole)]) == 0
     assert f"{replay.episodes} episodes replayed" in capsys.readouterr().out

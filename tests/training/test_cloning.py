@@ -148,7 +148,7 @@ def test_cloning_by_the_hamiltonian_learns(dataset, env):
 
 
 def test_ppo_can_go_on_from_a_clone(clone, env):
-    model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, policy_kwargs=network())
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, policy_kwargs=network((128, 128)))
     copy_actor(clone[0], model.policy)
     observation, _ = env.reset(seed=0)
     assert model.predict(observation, deterministic=True)[0] == pytest.approx(

@@ -156,13 +156,14 @@ def test_the_displacements_are_those_of_the_robot():
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_learners_with_a_history_are_warm_started_trained_saved_and_exported(algorithm, dataset, tmp_path):
     venv = make_vec_env(n_envs=2, family="open", split="fresh", **HISTORY)
-    model = algorithm("MlpPolicy", venv, policy_kwargs=network(SMALL), device="cpu", batch_size=64, seed=0)
+    steps = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 150}
+    model = algorithm("MlpPolicy", venv, policy_kwargs=network(SMALL), batch_size=64, seed=0, device="cpu", **steps)
     observed = dataset.observed(venv.get_attr("settings")[0])
     config = WarmStartConfig(critic_epochs=1, slopes=200)
     result = warm_start(model, observed, config, cloning=replace(QUICK, epochs=6), progress=False)
     assert result.cloning[-1].training < 0.8 * result.cloning[0].training
     assert np.isfinite([result.value_error, result.slope_error]).all()
-    model.learn(300 if algorithm is SAC else 4096)
+    model.learn(250 if algorithm is SAC else 128)
     save_policy(model, tmp_path / "policy", HISTORY)
     loaded = load_policy(tmp_path / "policy", NavigateEnv("open", **HISTORY))
     observations = observed.observations[:50]
@@ -180,7 +181,8 @@ def test_the_policy_that_is_trained_is_the_one_that_is_evaluated(kind):
     env = NavigateEnv("open", split="fresh", **MOMENTUM)
     policy_class = NavigationPolicy if kind is PPO else MomentumSACPolicy
     options = {**network(SMALL), "effort_weights": (4.0, 4.5)}
-    model = kind(policy_class, env, policy_kwargs=options, device="cpu", seed=1)
+    steps = {"n_steps": 64, "batch_size": 64} if kind is PPO else {"learning_starts": 100}
+    model = kind(policy_class, env, policy_kwargs=options, device="cpu", seed=1, **steps)
     observations = np.stack([env.reset(seed=seed)[0] for seed in range(4)])
     observations[1:, 4:6] = [[0.5, 0.1], [-0.3, 0.2], [0.1, -0.6]]  # the last actions
     actions = model.predict(observations, deterministic=True)[0]
@@ -195,7 +197,7 @@ def test_the_policy_that_is_trained_is_the_one_that_is_evaluated(kind):
         else:
             means = th.tanh(model.policy.actor.get_action_dist_params(batch)[0])
     np.testing.assert_allclose(np.clip(means, -1, 1), actions, atol=1e-5)
-    model.learn(1200 if kind is SAC else 2048)
+    model.learn(150 if kind is SAC else 128)
     assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
 
 

@@ -7,10 +7,24 @@ from leapnav.training import evaluate, load_policy, policy_environment, shipped_
 from leapnav.training.policies.files import SHIPPED, read_description
 from leapnav.training.scoring.policy_specs import load_policy_spec
 
+# SOC in the first 40 scenarios of the test split, and for "all" in the first 12 of each family; `docs/results.md` has
+# that of whole test splits. One failure changes it by 0.025.
+SOC = {
+    "all": 0.986,
+    "car-clutter": 0.967,
+    "clutter": 0.992,
+    "dynamic_unicycle-clutter": 0.938,
+    "free-clutter": 0.901,
+    "open": 0.997,
+    "polygons": 0.969,
+    "rooms": 0.993,
+    "slalom": 0.991,
+}
+
 
 def test_the_policies_that_ship_are_small():
     assert sum(file.stat().st_size for file in SHIPPED.glob("*/*")) < 4_000_000
-    assert {folder.name for folder in SHIPPED.iterdir()} == set(shipped_policies())
+    assert {folder.name for folder in SHIPPED.iterdir()} == set(shipped_policies()) == set(SOC)
 
 
 @pytest.mark.parametrize("name", shipped_policies())
@@ -21,9 +35,9 @@ def test_a_policy_that_ships_is_loaded_by_its_name_and_drives(name):
     assert env.action_space.contains(policy.predict(observation, deterministic=True)[0])
     family = name.rpartition("-")[2]  # after the robot, if it is not the unicycle
     families = ALL_FAMILIES if family == "all" else (family,)
-    found = [evaluate(policy, family, count=60, environment=sensors, progress=False) for family in families]
-    min_success = 0.95 if name in (*ALL_FAMILIES, "all") else 0.85
-    assert np.mean([evaluation.success for evaluation in found]) >= min_success
+    options = {"count": 40 if len(families) == 1 else 12, "environment": sensors, "timed": False, "progress": False}
+    found = [evaluate(policy, family, **options) for family in families]
+    assert np.mean([evaluation.soc for evaluation in found]) > SOC[name] - 0.03
     assert read_description(name)["training"]["family"] == family
 
 

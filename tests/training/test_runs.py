@@ -71,7 +71,8 @@ def lines(folder):
     return [json.loads(line) for line in (folder / "evaluations.jsonl").read_text().splitlines()]
 
 
-def test_a_run_leaves_its_configuration_policy_and_evaluations(demos, tmp_path):
+def test_a_run_leaves_its_configuration_policy_and_evaluations(demos, tmp_path, monkeypatch):
+    monkeypatch.setattr("leapnav.training.runs.run.FINAL_SCENARIOS", None)  # all
     config = bc(tmp_path / "run", demos)
     evaluations = train_bc(config, progress=False)
     assert [len(e) for e in evaluations] == [200]

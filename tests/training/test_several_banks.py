@@ -32,6 +32,7 @@ def test_an_episode_is_drawn_with_the_optimum_of_its_own_bank(comparison):
             np.testing.assert_array_equal(np.column_stack(optimum.get_data()), expected)
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_the_decisions_of_an_episode_are_those_in_its_own_scenario(comparison, tmp_path):
     found = costliest_decisions(comparison.runs["random"][0], BANKS, 6, progress=False)
     assert len(found) == 6
@@ -47,6 +48,7 @@ def test_an_episode_of_none_of_the_banks_is_an_error(comparison, tmp_path):
         bank_of(comparison.runs["random"][0].episodes[0], [])
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_tables_and_pages_have_a_column_for_each_bank(comparison, tmp_path, capsys):
     assert comparison.families == ("open",)
     assert comparison.bank_names == ("open (open-train.bank)", "open (open-test.bank)")

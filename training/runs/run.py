@@ -29,6 +29,7 @@ from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.results import Evaluation
 
+FINAL_SCENARIOS: int | None = None  # in the final evaluation; None: all of the bank
 TEST_COUNT, TEST_SEED = 100, 1  # of the bank for the evaluations of a family that is not built in
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
@@ -116,13 +117,13 @@ class Run:
         Args:
             policy: the policy.
             step: number of samples or environment steps from which the policy has learned.
-            final: play all scenarios instead of the first `evaluation_scenarios`.
+            final: play all scenarios (`FINAL_SCENARIOS`) instead of the first `evaluation_scenarios`.
 
         Returns:
             One evaluation for each family.
 
         """
-        count = None if final else self.config.evaluation_scenarios
+        count = FINAL_SCENARIOS if final else self.config.evaluation_scenarios
         options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
         evaluations = [evaluate(policy, self._bank(family), count=count, **options) for family in self.families]
         line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
