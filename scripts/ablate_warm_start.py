@@ -76,7 +76,8 @@ def main() -> None:
     runs: Path = arguments.runs
     demos, clone = runs / "demonstrations", runs / "clone"
     rollout("clutter", DEMONSTRATIONS, demos, seed=DEMONSTRATION_SEED, workers=arguments.workers)
-    config = BCConfig.tuned("clutter", out=clone, demos=(demos,), resume=(clone / "config.json").exists())
+    settings: dict[str, Any] = {"observation": "lidar", "resume": (clone / "config.json").exists()}
+    config = BCConfig.tuned("clutter", out=clone, demos=(demos,), **settings)
     train_bc(config)
     print("| run | initial success (%) / SOC | minimum | final | collision (%) | regret (%) |")
     print("|---|---|---|---|---|---|")

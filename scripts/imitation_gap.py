@@ -20,7 +20,7 @@ from leapnav.envs.simulation.observations import GOAL_ENTRIES
 from leapnav.experts import rollout
 from leapnav.experts.data.banks import build_bank
 from leapnav.training import CloningConfig, Dataset, NavigationFeatures, evaluate, make_policy, score
-from leapnav.training.learning.cloning import Cloning
+from leapnav.training.learning.cloning import _Fit
 from leapnav.training.learning.samples import Batch
 from leapnav.training.scoring.reports import markdown_cells
 from leapnav.training.threads import limit_threads
@@ -61,7 +61,7 @@ class MixtureHead(nn.Module):
         return logits, means, nn.functional.softplus(stds - 1.0) + MIN_STD
 
 
-class MixtureCloning(Cloning):
+class MixtureCloning(_Fit):
     """Behaviour cloning by the likelihood of the expert's actions under a mixture density."""
 
     def _loss(self, batch: Batch) -> th.Tensor:
@@ -139,7 +139,7 @@ def main() -> None:
         policy, dataset = make_learner(name, env), demonstrations.observed(env.settings)
         # A map can be mirrored, too, but the symmetries of the samples are those of a lidar.
         config = CloningConfig(epochs=MAX_EPOCHS, augment=name != "map")
-        fit = (MixtureCloning if name == "mixture" else Cloning)(policy, dataset, config)
+        fit = (MixtureCloning if name == "mixture" else _Fit)(policy, dataset, config, 0)
         while not fit.finished:
             loss = fit.run_epoch()
             print(f"{name}: epoch {loss.epoch}, losses {loss.training:.4f} {loss.validation:.4f}", flush=True)

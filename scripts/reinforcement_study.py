@@ -45,7 +45,7 @@ from leapnav.training.policies.actors import copy_actor
 from leapnav.training.scoring.reports import markdown_cells
 
 SEEDS, SCENARIOS, BANK_SEED = 3, 4000, 781
-N_DRIVEN, HARD_SEED = 20_000, 783  # episodes of the start, from whose failures the hard starts are taken
+N_DRIVEN, N_ROBOTS, HARD_SEED = 20_000, 256, 783  # episodes of the start, from whose failures the hard starts are taken
 HARD_TIMES, HARD_STARTS = (0.5, 4.0), 4  # s before a failure; number per failure
 HARD_PROBABILITY, HARD_DURATION = 0.5, 4.0  # fraction of the episodes that have a hard start, and their length (s)
 
@@ -123,21 +123,20 @@ def find_hard_starts(policy: BasePolicy, settings: EnvironmentSettings, family: 
         ScenarioSource(family, split="fresh"),
         settings,
         (HARD_SEED,),
-        robots=256,
-        per_task=1000,
+        robots=N_ROBOTS,
         workers=workers,
     )
     rng, starts, failures = np.random.default_rng(HARD_SEED), [], 0
     for episode in islice(episodes, N_DRIVEN):
-        if not episode.collision:
+        if not episode.played.collision:
             continue
         failures += 1
         for before in rng.uniform(*HARD_TIMES, size=HARD_STARTS):
-            step = len(episode.states) - 1 - round(before / settings.control_period)
+            step = len(episode.played.actions) - round(before / settings.control_period)
             if step > 0:
                 time = step * settings.control_period
                 try:
-                    starts.append(episode.scenario.from_state(episode.states[step], time))
+                    starts.append(episode.scenario.from_state(episode.played.states[step], time))
                 except ScenarioError:  # in contact already
                     continue
     episodes.close()
@@ -145,19 +144,19 @@ def find_hard_starts(policy: BasePolicy, settings: EnvironmentSettings, family: 
     return starts
 
 
-def prepare_start(case: Case, folder: Path) -> Path:
+def prepare_start(case: Case, folder: Path, workers: int) -> Path:
     """Return the policy to start from; those with lidar alone are trained first."""
     if not case.start.startswith("lidar-"):
         return Path(case.start)
     run = folder / case.start
     if not (run / "policy.json").exists():
-        train_dagger(DAggerRunConfig.tuned(case.family, observation="lidar", out=run), workers=2)
+        train_dagger(DAggerRunConfig.tuned(case.family, observation="lidar", out=run), workers=workers)
     return run
 
 
 def train(name: str, case: Case, folder: Path, seeds: list[int], workers: int) -> None:
     """Train the seeds that are not finished."""
-    start, hard = prepare_start(case, folder), None
+    start, hard = prepare_start(case, folder, workers), None
     for seed in seeds:
         run = folder / f"{name}-{seed}"
         if (run / "finished").exists():
@@ -184,12 +183,12 @@ def adapt(start: Path, environment: dict[str, Any], family: str) -> BasePolicy:
     return adapted
 
 
-def print_scores(name: str, case: Case, folder: Path) -> None:
+def print_scores(name: str, case: Case, folder: Path, workers: int) -> None:
     """Print the scores of the start and of the finished runs, and the paired differences of the success rates."""
-    start = prepare_start(case, folder)
+    start = prepare_start(case, folder, workers)
     path = folder / f"{case.family}-{case.horizon}.bank"
     if not path.exists():
-        build_bank(case.family, SCENARIOS, path, horizon=case.horizon, seed=BANK_SEED, workers=2)
+        build_bank(case.family, SCENARIOS, path, horizon=case.horizon, seed=BANK_SEED, workers=workers)
     bank = ScenarioBank(path)
     actuation = {"actuation": "motor"} if "actuation" in case.settings else {}
     for disturbance in case.disturbances:
@@ -214,13 +213,13 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/reinforcement"))
     parser.add_argument("--only", nargs="+", default=list(CASES), choices=CASES)
     parser.add_argument("--seeds", nargs="+", type=int, default=range(SEEDS))
-    parser.add_argument("--workers", type=int, default=2, help="number of processes that look for failures")
+    parser.add_argument("--workers", type=int, default=2, help="number of processes")
     parser.add_argument("--scores", action="store_true", help="train nothing")
     arguments = parser.parse_args()
     for name in arguments.only:
         if not arguments.scores:
             train(name, CASES[name], arguments.runs, list(arguments.seeds), arguments.workers)
-        print_scores(name, CASES[name], arguments.runs)
+        print_scores(name, CASES[name], arguments.runs, arguments.workers)
 
 
 if __name__ == "__main__":

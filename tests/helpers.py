@@ -16,10 +16,16 @@ from scipy.integrate import solve_ivp
 
 from leapnav.cli import main
 from leapnav.envs import Scenario
+from leapnav.envs.robots.base import MODELS
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, Trajectory
+from leapnav.experts.solve import METHODS
 from leapnav.training import CloningConfig, make_policy
 
 DATA = Path(__file__).parent / "data"
+ROOT = Path(__file__).parents[1]
+# All built-in robots and solvers.
+ROBOTS = tuple(name for name, kind in MODELS.items() if kind.__module__.startswith("leapnav."))
+SOLVERS = tuple(METHODS)
 QUICK = CloningConfig(epochs=3, batch_size=256, validation_share=0.2)  # a quick fit of low quality
 SMALL = (32, 32)  # hidden layers of a small network
 DISC_AND_TRIANGLE = Scenario(

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from helpers import best_known, failing, scenario_fields
+from helpers import SOLVERS, best_known, failing, scenario_fields
 
 from leapnav.cli import main
 
@@ -16,7 +16,7 @@ def scenario_file(tmp_path):
     return path, cost
 
 
-METHODS = {"single_shooting", "multiple_shooting", "leapfrog", "collocation"}
+METHODS = set(SOLVERS)
 
 
 @pytest.mark.parametrize("method", ["optimum", "leapfrog", "multiple_shooting", "collocation"])

@@ -13,18 +13,18 @@ from leapnav.envs import ScenarioBank
 def test_watch_films_the_policy(tmp_path, capsys, monkeypatch):
     import imageio.v3 as iio
 
-    video = tmp_path / "rooms.mp4"
-    arguments = ["watch", "--family", "rooms", "--index", "11", "--episodes", "2", "--video", str(video)]
+    video = tmp_path / "open.mp4"
+    arguments = ["watch", "--family", "open", "--index", "11", "--episodes", "2", "--video", str(video)]
     assert main(arguments) == 0
     first, second, last = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"rooms-1-11: success after [\d.]+ s, cost [\d.]+, optimum for the state reached [\d.]+", first)
-    assert second.startswith("rooms-1-12: success")
+    assert re.fullmatch(r"open-1-11: success after [\d.]+ s, cost [\d.]+, optimum for the state reached [\d.]+", first)
+    assert second.startswith("open-1-12: success")
     assert last == f"wrote {video}"
     frames = iio.imread(video)
-    bank = ScenarioBank.shipped("rooms", "test")
+    bank = ScenarioBank.shipped("open", "test")
     assert len(frames) == pytest.approx(20 * (bank[11].horizon + bank[12].horizon), abs=5)
     assert frames.shape[1:] == (640, 600, 3)
-    assert [path.name for path in tmp_path.iterdir()] == ["rooms.mp4"]
+    assert [path.name for path in tmp_path.iterdir()] == ["open.mp4"]
 
 
 def test_watch_opens_a_window(capsys, monkeypatch):

@@ -4,7 +4,6 @@ import json
 import math
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +32,6 @@ from leapnav.experts.problem.system import switching_functions, system_of
 
 ROBOTS = {model.name(): model for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer)}
 BOX = [{"offset": offset, "radius": 0.16} for offset in (-0.2, 0.0, 0.2)]
-ROOT = Path(__file__).parents[2]
 each_robot = pytest.mark.parametrize("name", ROBOTS)
 
 

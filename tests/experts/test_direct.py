@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers import best_known, scenario_fields
+from helpers import ROBOTS, best_known, scenario_fields
 
 from leapnav.envs import Scenario
 from leapnav.experts import OptimalControlProblem, Trajectory, find_optimum
@@ -49,7 +49,7 @@ def test_it_converges_to_the_extremal_with_order_two(scenario):
     assert np.abs(direct.costates - costates).max() < 0.02 * np.abs(costates).max()
 
 
-@pytest.mark.parametrize("robot", ["unicycle", "differential_drive", "dynamic_unicycle", "car"])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_every_step_of_the_path_is_one_of_the_midpoint_rule_and_ends_at_the_goal(robot):
     optimum = find_optimum(Scenario.from_dict({**BEST_KNOWN[0][0].to_dict(), "robot": {"model": robot}}))
     problem, times = optimum.problem, np.linspace(0.0, optimum.horizon, 65)

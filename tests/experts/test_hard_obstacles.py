@@ -5,6 +5,7 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers import ROBOTS
 
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv, Scenario, ScenarioBank, ScenarioError, sample_scenario
@@ -28,7 +29,6 @@ from leapnav.training.runs.reinforcement import make_training_env
 
 ID = "leapnav/Navigate-v0"
 FAMILIES = ("clutter", "polygons", "rooms", "slalom")  # with included test banks
-ROBOTS = ("unicycle", "differential_drive", "car", "dynamic_unicycle")
 
 
 def stored_path(bank, index):

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import best_known, scenario_fields
+from helpers import ROBOTS, best_known, scenario_fields
 from scipy.integrate import solve_ivp
 
 from leapnav.envs import FAMILIES, Scenario, ScenarioBank, Unicycle, sample_scenario
@@ -406,7 +406,7 @@ def test_the_hard_optimum_around_a_disc_is_the_shortest_path():
     assert optimum.cost == pytest.approx(0.5 * length**2 / 10.0, rel=5e-3)
 
 
-@pytest.mark.parametrize("robot", ["unicycle", "differential_drive", "car", "dynamic_unicycle"])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_a_large_time_weight_leads_to_no_collision(robot):
     scenario = sample_scenario("clutter", 21, robot=robot, horizon="free")
     cost = scenario.cost.model_copy(update={"time_weight": 16.0})

@@ -56,7 +56,7 @@ def whole(tmp_path_factory):
 
 def test_a_killed_and_resumed_rollout_gives_the_same_dataset(whole, tmp_path):
     out = tmp_path / "out"
-    arguments = ["rollout", "--family", "open", "--count", "40", "--seed", "3", "--recoveries", "1", "--workers", "2"]
+    arguments = ["rollout", "--family", "open", "--count", "40", "--seed", "3", "--recoveries", "1", "--workers", "1"]
     command = [sys.executable, "-m", "leapnav", *arguments, "--out", str(out)]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
     while len(list(out.glob(f"{WORK}/shard-*.npz"))) < 2 and process.poll() is None:

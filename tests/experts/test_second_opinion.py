@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import scenario_fields
+from helpers import ROBOTS, scenario_fields
 
 from leapnav.envs import Scenario, ScenarioBank, sample_scenario
 from leapnav.envs.shapes.proximity import disc_proximity
@@ -80,8 +80,7 @@ def test_ipopt_finds_the_same_optimum_by_other_means(scenario):
     pytest.importorskip("casadi")
     from leapnav.experts.search.ipopt import Transcription
 
-    robots = ("unicycle", "car", "dynamic_unicycle", "differential_drive")
-    others = (sample_scenario("polygons", 3, robot) for robot in robots)
+    others = (sample_scenario("polygons", 3, robot) for robot in ROBOTS)
     for other in (scenario, *others):
         optimum = find_optimum(other)
         times = np.linspace(0.0, other.horizon, 101)

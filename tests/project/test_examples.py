@@ -5,11 +5,10 @@ import re
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
-ROOT = Path(__file__).parents[2]
 D3RLPY = ROOT / ".venv" / "examples"  # `make test` installs it there
 SCORE = r"success \d+\.\d %, collision \d+\.\d %, SOC \d\.\d+"
 # Arguments, and the last lines of the output.

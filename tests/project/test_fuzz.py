@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import sympy
-from helpers import scenario_fields
+from helpers import SOLVERS, scenario_fields
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
@@ -188,7 +188,7 @@ POSES = st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-7, 7))
     horizon=spread(0.1, 30.0),
     weight=st.tuples(spread(0.01, 100.0), spread(0.01, 100.0)),
     bound=st.none() | spread(0.1, 10.0),
-    method=st.sampled_from(["leapfrog", "multiple_shooting", "single_shooting", "collocation"]),
+    method=st.sampled_from(SOLVERS),
 )
 def test_a_solution_that_is_called_one_is_one(start, goal, free, horizon, weight, bound, method):
     goal = (*goal[:2], None) if free else goal

@@ -3,11 +3,10 @@
 import ast
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
-ROOT = Path(__file__).parents[2]
 PACKAGES = ("envs", "experts", "training", "leapnav")
 FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MAX_LINES, MAX_POSITIONAL, MAX_MODULES = 450, 8, 12

@@ -99,8 +99,8 @@ def test_dagger_is_the_same_with_any_number_of_workers(env, monkeypatch):
     found = []
     for workers in (1, 2):
         policy = fresh(env)
-        config = DAggerConfig(rounds=1, max_episodes=4, lead=0.5, seed=4)
-        dagger = DAgger(policy, "open", config, cloning=QUICK, robots=2, effort="medium", workers=workers)
+        config = DAggerConfig(rounds=1, max_episodes=2, max_failures=1, lead=0.5, seed=4)
+        dagger = DAgger(policy, "open", config, cloning=QUICK, robots=1, workers=workers)
         dagger.run(progress=False)
         found.append((policy.parameters_to_vector().tobytes(), dagger.dataset.observations.tobytes()))
     assert found[0] == found[1]
@@ -135,9 +135,9 @@ def test_dagger_improves_a_clone(env, dataset):
     policy = fresh(env)
     few = dataset[dataset.episodes < 4]
     behaviour_clone(policy, few, QUICK, progress=False)
-    options = {"environment": {"lidar_beams": 32}, "timed": False, "progress": False, "count": 60}
+    options = {"environment": {"lidar_beams": 32}, "timed": False, "progress": False, "count": 40}
     before = evaluate(policy, "open", **options)
-    config = DAggerConfig(rounds=2, max_failures=25, max_episodes=100, last_epochs=12, epochs=6)
+    config = DAggerConfig(rounds=1, max_failures=25, max_episodes=100, last_epochs=12)
     dagger = DAgger(policy, "open", config, cloning=CloningConfig(batch_size=128), dataset=few)
     dagger.run(progress=False)
     after = evaluate(policy, "open", **options)

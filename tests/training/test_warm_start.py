@@ -54,7 +54,7 @@ def test_an_observer_sees_what_the_environment_shows():
 
 def test_the_critic_of_ppo_is_the_cost_to_go(dataset):
     model = ppo(gamma=1.0)
-    config = WarmStartConfig(critic_epochs=90, critic_batch_size=512, slopes=5000)
+    config = WarmStartConfig(critic_epochs=75, critic_batch_size=512, slopes=5000)
     found = warm_start(model, dataset, config, cloning=CLONING, reward_scale=0.1, progress=False)
     assert len(found.cloning) == 4
     assert found.value_error < 0.02
@@ -70,7 +70,7 @@ def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
     errors = []
     for gradient in (True, False):
         model = ppo(gamma=1.0)
-        config = WarmStartConfig(actor=False, critic_epochs=60, critic_batch_size=512, slopes=3000, gradient=gradient)
+        config = WarmStartConfig(actor=False, critic_epochs=30, critic_batch_size=512, slopes=3000, gradient=gradient)
         warm_start(model, dataset, config, progress=False)
         squares = []
         for scenario in test:
@@ -90,7 +90,7 @@ def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
 def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
     """Q is the value at the expert's action, and lower at other actions by the cost according to the Hamiltonian."""
     model = SAC("MlpPolicy", make_vec_env(n_envs=1, family="open"), policy_kwargs=small(), gamma=1.0, seed=0)
-    config = WarmStartConfig(actor=False, critic_epochs=60, critic_batch_size=512, slopes=3000)
+    config = WarmStartConfig(actor=False, critic_epochs=45, critic_batch_size=512, slopes=3000)
     found = warm_start(model, dataset, config, progress=False)
     assert found.value_error < 0.05
     # The excess cost of other actions, as the difference of the Q values.
