@@ -23,8 +23,8 @@ from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.scenarios.scenario import Circle, Obstacle, Polygon
 from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import OptimalControlProblem, Trajectory, build_bank, find_optimum
+from leapnav.experts.ipopt import Transcription
 from leapnav.experts.search.candidates import CandidateSearch
-from leapnav.experts.search.ipopt import Transcription
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.transcription.direct import discretise, optimise
 

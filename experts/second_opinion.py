@@ -176,7 +176,7 @@ def _steered(track: Trajectory, rng: np.random.Generator) -> Trajectory:
 def _add_ipopt(search: LocalOptima, scenario: Scenario, paths: list[Trajectory]) -> int:
     """Add IPOPT's solutions from several guesses; return the number of guesses."""
     # CasADi is an optional dependency.
-    from leapnav.experts.search.ipopt import Transcription
+    from leapnav.experts.ipopt import Transcription
 
     transcription = Transcription(scenario, search.problem, IPOPT_INTERVALS)
     lift = Lifting(scenario, search.problem, search.problem.proximity_weight)

@@ -127,7 +127,7 @@ def test_a_killed_build_resumes(tmp_path):
     code = (
         "from leapnav.experts import build_bank\n"
         "if __name__ == '__main__':\n"
-        f"    build_bank('clutter', 10, {str(tmp_path / 'killed.bank')!r}, seed=3, workers=2, progress=False)\n"
+        f"    build_bank('clutter', 10, {str(tmp_path / 'killed.bank')!r}, seed=3, workers=1, progress=False)\n"
     )
     script, directory = tmp_path / "build.py", tmp_path / "killed.bank.build"
     script.write_text(code)

@@ -325,7 +325,10 @@ def test_the_minimum_time_of_a_unicycle(goal, shortest, pieces):
     assert len(found.levels) == pieces == len(found.switching_times) + 1
 
 
-@pytest.mark.parametrize("scenario", [sample_scenario("open", 5), sample_scenario("open", 3, robot="car")])
+@pytest.mark.parametrize(
+    "scenario",
+    [sample_scenario("open", 5), pytest.param(sample_scenario("open", 3, robot="car"), marks=pytest.mark.slow)],
+)
 def test_the_minimum_time_of_a_scenario(scenario):
     found = minimum_time(scenario)
     assert found.extremal.success

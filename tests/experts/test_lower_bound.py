@@ -68,7 +68,7 @@ def test_the_time_may_be_unlimited(optimum: Optimum):
     assert lower_bound(SCENARIO, optimum, gap=0.2, time_limit=math.inf).gap == pytest.approx(0.2, abs=1e-12)
 
 
-@pytest.mark.parametrize("time_limit", [1e-3, 0.5, 2.0])
+@pytest.mark.parametrize("time_limit", [1e-3, 0.5])
 def test_an_early_answer_is_proved(optimum: Optimum, time_limit: float):
     early = lower_bound(SCENARIO, optimum, gap=0.001, time_limit=time_limit)
     assert 0.001 < early.gap < 0.5
@@ -79,7 +79,7 @@ def test_an_early_answer_is_proved(optimum: Optimum, time_limit: float):
 def test_a_bound_that_starts_from_a_local_optimum_is_below_the_optimum(optimum: Optimum):
     """The gap to a more expensive local optimum is at least its difference from the optimum."""
     local = optimum.alternatives[-1]
-    found = lower_bound(SCENARIO, local, gap=1e-3, time_limit=4.0)
+    found = lower_bound(SCENARIO, local, gap=1e-3, time_limit=1.5)
     assert found.value <= optimum.cost
     assert found.gap >= 1.0 - optimum.cost / local.cost
 
@@ -360,7 +360,7 @@ def test_the_functions_bound_the_cost_of_random_paths(bound: LowerBound, rng: np
 def test_every_local_optimum_costs_more_than_the_bound(seed: int):
     scenario = sample_scenario("clutter", seed)
     optimum = find_optimum(scenario)
-    found = lower_bound(scenario, optimum, gap=0.15, time_limit=30.0)
+    found = lower_bound(scenario, optimum, gap=0.25, time_limit=30.0)
     assert all(found.value <= local.cost for local in (optimum, *optimum.alternatives, *optimum.doubts))
 
 

@@ -25,7 +25,7 @@ def test_the_best_known_cost_is_reached(scenario, cost):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_fresh_scenarios_are_solved_and_certified(family):
-    for seed in range(20):
+    for seed in range(10):
         extremal = find_optimum(sample_scenario(family, 9000 + seed))
         assert extremal.success, (seed, extremal.status, extremal.certificate)
         certificate = extremal.certificate

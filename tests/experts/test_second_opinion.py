@@ -54,7 +54,7 @@ def test_a_whole_bank_gets_opinions_in_order_whatever_the_number_of_workers(tmp_
 
 def test_the_proximity_cost_of_the_transcription_is_that_of_the_kernels():
     casadi = pytest.importorskip("casadi")
-    from leapnav.experts.search.ipopt import _proximity
+    from leapnav.experts.ipopt import _proximity
 
     obstacles = [
         {"circle": {"center": [3, 3], "radius": 0.5}},
@@ -78,7 +78,7 @@ def test_the_proximity_cost_of_the_transcription_is_that_of_the_kernels():
 
 def test_ipopt_finds_the_same_optimum_by_other_means(scenario):
     pytest.importorskip("casadi")
-    from leapnav.experts.search.ipopt import Transcription
+    from leapnav.experts.ipopt import Transcription
 
     others = (sample_scenario("polygons", 3, robot) for robot in ROBOTS)
     for other in (scenario, *others):
