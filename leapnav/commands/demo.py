@@ -38,8 +38,8 @@ class DemoSettings:
     family: str = "clutter"
     training_scenarios: int = 1000
     training_seed: int = 1000
-    recoveries: int = 4
-    lidar_beams: int = 128
+    recoveries: int = 2
+    lidar_beams: int = 64
     test_scenarios: int = 100
     workers: int = 2
     # Half of the default number: the fit is the longest step of the demo.
