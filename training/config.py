@@ -64,7 +64,7 @@ class CloningConfig:
     """Loss of an action: "action": Huber loss of the error, each component in units of its spread; "hamiltonian": cost
     of the error per second, H(q, lambda, u) - H(q, lambda, u*) with the expert's costate lambda."""
     augment: bool = True
-    """Augmentation with mirrored and time-reversed samples."""
+    """Augmentation with mirrored and time-reversed samples, if the robot and the observation have these symmetries."""
     seed: int = 0
     """Random seed of the validation split, the order of the samples and the augmentation."""
 

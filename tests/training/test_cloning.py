@@ -8,7 +8,7 @@ import torch as th
 from helpers import QUICK, SMALL, fresh
 from stable_baselines3 import A2C, PPO, SAC, TD3
 
-from leapnav.envs import sample_scenario
+from leapnav.envs import NavigateEnv, sample_scenario
 from leapnav.training import CloningConfig, Dataset, behaviour_clone, evaluate, network
 from leapnav.training.learning.cloning import _Fit
 from leapnav.training.policies.actors import copy_actor, mean_action
@@ -205,3 +205,10 @@ def test_a_diverging_fit_raises_an_error(dataset, env):
 def test_bad_settings_are_named(settings, message, dataset, env):
     with pytest.raises(ValueError, match=message):
         behaviour_clone(fresh(env), dataset, CloningConfig(**settings), progress=False)
+
+
+def test_observations_of_a_map_are_not_augmented(dataset):
+    env = NavigateEnv("open", observation="map", map_obstacles=2)
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, device="cpu")
+    losses = behaviour_clone(model, dataset.observed(env.settings), QUICK, progress=False)
+    assert losses[-1].training < losses[0].training

@@ -123,9 +123,10 @@ class _Fit:
         check_cloning(config)
         check_observations(policy, dataset)
         settings = dataset.settings
-        can_reverse = settings.model.reversal is not None and dataset.is_reversible
+        is_map = settings.observation == "map"  # whose rows have no such symmetry
+        can_reverse = settings.model.reversal is not None and dataset.is_reversible and not is_map
         self._symmetries = [
-            *([partial(mirror, settings=settings)] if settings.model.mirror is not None else []),
+            *([partial(mirror, settings=settings)] if settings.model.mirror is not None and not is_map else []),
             *([partial(time_reverse, settings=settings)] if can_reverse else []),
         ]
         beams = settings.lidar_beams if settings.has_lidar else 0

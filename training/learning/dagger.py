@@ -125,6 +125,12 @@ class DAgger:
         self._source, self._settings = env.source, env.settings
         _check_environment(self._settings)
         self._policy, self._robots, self._workers = policy_of(model), robots, workers
+        if self._policy.observation_space != env.single_observation_space:
+            has, expected = env.single_observation_space.shape, self._policy.observation_space.shape
+            raise ValueError(
+                f"environment: has observations {has}, the policy's are {expected} or have other bounds; pass the "
+                "arguments of gym.make that it was trained with"
+            )
         self._effort: Effort = effort
         self._parts: list[Dataset] = [] if dataset is None else [Dataset.of(dataset)]
         if self._parts:
