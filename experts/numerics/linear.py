@@ -55,23 +55,6 @@ def substitute(A, x):
         x[k] /= A[k, k]
 
 
-@kernel(boolean(MATRIX, VECTOR))
-def solve_dense(A, b):
-    """Replace b by the solution of A x = b; False, with b unchanged, if A is singular."""
-    n = len(b)
-    extended = np.empty((n, n + 1))
-    largest = 0.0
-    for i in range(n):
-        extended[i, n] = b[i]
-        for j in range(n):
-            extended[i, j] = A[i, j]
-            largest = max(largest, abs(A[i, j]))
-    if eliminate(extended, True, MIN_PIVOT * largest) == 0.0:
-        return False
-    substitute(extended, b)
-    return True
-
-
 @kernel(boolean(MATRIX, VECTOR, int64))
 def solve_banded(rows, b, half):
     """Replace b by the solution of a banded system, by Gaussian elimination with partial pivoting; False if singular.

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 from leapnav.envs import sample_scenario
 from leapnav.experts import OptimalControlProblem, find_optimum
 from leapnav.experts.numerics.integrator import propagate
-from leapnav.experts.numerics.linear import solve_banded, solve_dense
+from leapnav.experts.numerics.linear import eliminate, solve_banded, substitute
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
@@ -121,10 +121,12 @@ def test_the_linear_solvers_agree_with_numpy():
                 rows[i, j - i + half] = A[i, j]
         banded, dense = b.copy(), b.copy()
         assert solve_banded(rows, banded, half)
-        assert solve_dense(A.copy(), dense)
+        extended = np.column_stack([A, b])
+        assert eliminate(extended, True, 0.0) != 0.0
+        substitute(extended, dense)
         assert banded == pytest.approx(expected, rel=1e-8, abs=1e-10)
         assert dense == pytest.approx(expected, rel=1e-8, abs=1e-10)
-    assert not solve_dense(np.zeros((2, 2)), np.ones(2))
+    assert eliminate(np.zeros((2, 3)), True, 0.0) == 0.0
     assert not solve_banded(np.zeros((4, 4)), np.ones(4), 1)
 
 
