@@ -23,10 +23,10 @@ class Status(Enum):
     ZERO_HORIZON = (
         "the start is the goal, so with a free horizon the optimum takes no time. Move the start or the goal."
     )
-    STALLED = "Newton's method stopped making progress. Try method='leapfrog', a better guess, or find_optimum."
-    DIVERGED = "the extremal flow diverged from the guess. Try a guess closer to the solution, or method='leapfrog'."
+    STALLED = "Newton's method stopped making progress. Try another method, a better guess, or find_optimum."
+    DIVERGED = "the extremal flow diverged from the guess. Try a guess closer to the solution, or another method."
     SINGULAR = "the Newton matrix is singular: the solution is not isolated. Move the start or the goal slightly."
-    MAX_ITERATIONS = "the iteration limit was reached. Try increasing max_iterations, or method='leapfrog'."
+    MAX_ITERATIONS = "the iteration limit was reached. Try increasing max_iterations, or another method."
     NOT_CERTIFIED = "the solver converged but re-integration did not confirm it. Try a smaller tol."
     COLLISION = "the extremal passes through an obstacle. Try find_optimum, or another guess."
     BEYOND_LIMITS = "a state of the extremal is beyond its bounds. Try wider state_bounds, or another guess or horizon."
