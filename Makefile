@@ -18,12 +18,12 @@ demo: $(if $(wildcard .venv/installed),.venv/installed,.venv/package)
 compile: .venv/installed
 	$(BIN)/leapnav compile
 
-test: lint .venv/examples
+test: lint
 	$(MAKE) --jobs=2 --output-sync types compile
 	$(PYTEST)
 
 # Long checks, see CONTRIBUTING.md.
-test-all: test
+test-all: test .venv/examples
 	$(PYTEST) -m "slow"
 	HYPOTHESIS_PROFILE=long $(PYTEST) tests/project/test_fuzz.py
 	NUMBA_BOUNDSCHECK=1 LEAPNAV_CACHE_DIR=$(CURDIR)/build/bounds-checked $(PYTEST)
@@ -55,7 +55,7 @@ bench: .venv/installed
 	$(BIN)/python benchmarks/lower_bounds.py
 	$(BIN)/python benchmarks/labels.py
 
-coverage: compile .venv/examples
+coverage: compile
 	$(PYTEST) --cov=envs --cov=experts --cov=training --cov=leapnav --cov-report=term
 
 clean:

@@ -53,7 +53,7 @@ def run(code, *arguments, **variables):
     ("imports", "prefix"),
     [
         ("from leapnav.package.called import SCALE, called", ""),
-        ("from .called import SCALE, called", ""),
+        pytest.param("from .called import SCALE, called", "", marks=pytest.mark.slow),
         ("from leapnav.package.nested.again import SCALE, called", ""),
     ],
     ids=["absolute", "relative", "through another module"],

@@ -122,7 +122,7 @@ def test_a_run_trains_and_is_evaluated(module, tmp_path):
 def test_the_command_line_finds_modules_in_the_current_directory(module, tmp_path):
     out, script = tmp_path / "own.bank", Path(sys.executable).with_name("leapnav")
     command = ["bank", "build", "--family", module, "--count", "3", "--out", str(out)]
-    words = [str(script), *command, "--workers", "2"]
+    words = [str(script), *command, "--workers", "1"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert ScenarioBank(out)[0].name == "warehouse_pillar-0-0"

@@ -145,7 +145,8 @@ def test_files_that_cannot_be_a_bank_are_named(files, error, message, tmp_path, 
     assert not (tmp_path / "x.bank").exists() and not (tmp_path / "x.bank.build").exists()
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [30, 2000])
 def test_a_dask_cluster_that_loses_a_worker_builds_the_same_bank(count, tmp_path):
     given, out = [sample_scenario("open", seed) for seed in range(5, 5 + count)], tmp_path / "dask/given.bank"
     out.parent.mkdir()

@@ -44,10 +44,11 @@ def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
     assert re.search(rf"(^|\n){EXAMPLES[name][1]}$", printed), printed
 
 
+@pytest.mark.slow
 def test_the_example_with_d3rlpy_runs(tmp_path):
     """In a process of its own: d3rlpy brings other versions of packages that the tests use."""
     if not D3RLPY.exists():
-        pytest.skip("d3rlpy is not installed; `make test` installs it")
+        pytest.skip("d3rlpy is not installed; `make test-all` installs it")
     path = os.pathsep.join(filter(None, [str(D3RLPY), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
         [sys.executable, str(ROOT / "examples" / "offline_rl.py"), *words("offline_rl", tmp_path)],

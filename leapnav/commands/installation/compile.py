@@ -38,7 +38,7 @@ class Compile:
 
 
 def compile_missing(jobs: int | None = None) -> dict[str, Any]:
-    """Compile the kernels that are not in the cache, with the generated ones of the unicycle.
+    """Compile the kernels that are not in the cache, with the generated ones of the robots.
 
     Args:
         jobs: number of processes; None for one per core.
@@ -58,16 +58,20 @@ def compile_missing(jobs: int | None = None) -> dict[str, Any]:
             except ModuleNotFoundError as error:  # a package of an extra that is not installed
                 if (error.name or "").startswith("leapnav"):
                     raise
-    _load_unicycle()
+    _load_robots()
     count = prepare(*kernels_of("leapnav", GENERATED), jobs=jobs)
     return {"compiled": count, "cache": kernel_cache(), "seconds": perf_counter() - start}
 
 
-def _load_unicycle() -> None:
-    """Generate the functions of the unicycle's problem, which most scenarios use."""
+def _load_robots() -> None:
+    """Generate the functions of the problems of all robots, with fixed and with free horizon."""
+    from leapnav.envs.robots.base import MODELS
     from leapnav.envs.scenarios.scenario import Scenario
     from leapnav.experts.problem.problem import OptimalControlProblem
     from leapnav.experts.transcription.direct import generated_functions
 
-    scenario = Scenario(arena=(0, 0, 2, 2), start=(0.5, 1, 0), goal=(1.5, 1, 0), horizon=2)
-    generated_functions(OptimalControlProblem.from_scenario(scenario))
+    fields = {"arena": (0, 0, 4, 4), "start": (1, 2, 0), "goal": (3, 2, 0), "cost": {"time_weight": 1.0}}
+    for robot in MODELS:
+        for horizon in (2.0, None):
+            scenario = Scenario.from_dict({**fields, "robot": {"model": robot}, "horizon": horizon})
+            generated_functions(OptimalControlProblem.from_scenario(scenario))
