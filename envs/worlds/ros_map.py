@@ -31,7 +31,7 @@ OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # defaults of the map server
 UNKNOWN = ("occupied", "free")  # what unknown cells count as
 UNKNOWN_GRAY = 205  # of 255: the value that map savers write for an unknown cell in the mode trinary
 MAX_SHALLOW, MAX_DEEP = 255, 65535  # white, with 8 and 16 bits per channel
-MAX_YAW = 1e-4  # rad: a rotation that moves a corner by 1 cm at 100 m, less than a cell; yaws are rounded in files
+MIN_YAW = 1e-4  # rad: smaller rotations are rounding errors, which move a corner by 1 cm at 100 m, less than a cell
 
 
 class _MapFile(YamlRecord):
@@ -55,6 +55,7 @@ class GridMap:
         blocked (height, width): whether a cell is an obstacle; the first line is the top of the map.
         resolution: side length of a cell (m).
         origin: position of the lower left corner (m).
+        yaw: rotation of the map around this corner, counter-clockwise (rad).
 
     """
 
@@ -62,18 +63,49 @@ class GridMap:
     blocked: np.ndarray
     resolution: float
     origin: tuple[float, float]
+    yaw: float = 0.0
 
     @property
     def arena(self) -> tuple[float, float, float, float]:
         """x_min, y_min, x_max, y_max of the map (m)."""
-        height, width = self.blocked.shape
-        x, y = self.origin
-        return x, y, x + width * self.resolution, y + height * self.resolution
+        corners = np.array(self._corners())
+        x_min, y_min, x_max, y_max = (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
+        return x_min, y_min, x_max, y_max
 
     def obstacles(self) -> list[Obstacle]:
-        """Return the blocked cells that have a free neighbour, merged into few rectangles; others cannot be reached."""
-        parts = rectangle_vertices(self.blocked, self.resolution, self.origin)
+        """Return the blocked cells that have a free neighbour, merged into few rectangles; others cannot be reached.
+
+        The parts of the arena outside of a rotated map are obstacles, too.
+        """
+        if self.yaw == 0.0:
+            parts = rectangle_vertices(self.blocked, self.resolution, self.origin)
+        else:
+            rectangles = rectangle_vertices(self.blocked, self.resolution)
+            parts = [tuple(self._placed(*vertex) for vertex in part) for part in rectangles]
+            parts += self._triangles()
         return [Obstacle(polygon=Polygon(vertices=part)) for part in parts]
+
+    def _placed(self, x: float, y: float) -> tuple[float, float]:
+        """Return the position of a point of the map that is not rotated and has its corner at (0, 0)."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return self.origin[0] + cos * x - sin * y, self.origin[1] + sin * x + cos * y
+
+    def _corners(self) -> list[tuple[float, float]]:
+        """Return the corners of the map, counter-clockwise from its origin."""
+        height, width = self.blocked.shape
+        right, top = width * self.resolution, height * self.resolution
+        return [self._placed(x, y) for x, y in ((0.0, 0.0), (right, 0.0), (right, top), (0.0, top))]
+
+    def _triangles(self) -> list[tuple[tuple[float, float], ...]]:
+        """Return the triangles between the edges of the rotated map and the corners of the arena."""
+        corners, found = self._corners(), []
+        for (x, y), (other_x, other_y) in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if min(abs(other_x - x), abs(other_y - y)) < MIN_YAW * self.resolution:  # the edge is one of the arena
+                continue
+            # The corner of the arena to the right of the edge.
+            outside = (other_x, y) if (other_x - x) * (other_y - y) > 0.0 else (x, other_y)
+            found.append(((x, y), outside, (other_x, other_y)))
+        return found
 
 
 def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> GridMap:
@@ -90,8 +122,8 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: a field is missing or invalid, the map is rotated, its mode is "raw", or the image cannot be read;
-            the message names the file and the field.
+        ValueError: a field is missing or invalid, the mode is "raw", or the image cannot be read; the message names the
+            file and the field.
         ModuleNotFoundError: PyYAML is not installed.
 
     Warns:
@@ -104,7 +136,7 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     fields = as_record(_MapFile, read_yaml(path), path)
-    origin = _origin(path, fields)
+    origin, yaw = _origin(path, fields)
     gray, is_opaque = _read_image(path, fields.image, fields.mode)
     occupancy = gray if fields.negate else 1.0 - gray
     occupied = occupancy > fields.occupied_thresh
@@ -119,7 +151,7 @@ def read_ros_map(path: str | os.PathLike[str], *, unknown: str = "occupied") -> 
             stacklevel=2,
         )
     blocked = ~free if unknown == "occupied" else occupied
-    return GridMap(path.stem, blocked, fields.resolution, origin)
+    return GridMap(path.stem, blocked, fields.resolution, origin, yaw)
 
 
 def sample_on_map(
@@ -143,17 +175,19 @@ def sample_on_map(
     return [sample_scenario(family, seed + i, robot, horizon, obstacles) for i in range(count)]
 
 
-def _origin(path: Path, fields: _MapFile) -> tuple[float, float]:
-    """Return the position of the lower left corner (m), if the map is not rotated."""
+def _origin(path: Path, fields: _MapFile) -> tuple[tuple[float, float], float]:
+    """Return the position of the lower left corner (m) and the rotation of the map (rad)."""
     x, y, *yaws = fields.origin
     if not (math.isfinite(x) and math.isfinite(y)):
         raise ValueError(f"{path}: origin: expected finite coordinates, got {fields.origin}")
-    for yaw in yaws:
-        if math.isnan(yaw):
-            warnings.warn(f"{path}: origin: the yaw is not a number and is read as 0", stacklevel=3)
-        elif math.isinf(yaw) or abs(math.remainder(yaw, 2 * math.pi)) > MAX_YAW:
-            raise ValueError(f"{path}: origin: expected a map that is not rotated, got the yaw {yaw}")
-    return x, y
+    yaw = yaws[0] if yaws else 0.0
+    if math.isinf(yaw):
+        raise ValueError(f"{path}: origin: expected a finite yaw, got {yaw}")
+    if math.isnan(yaw):
+        warnings.warn(f"{path}: origin: the yaw is not a number and is read as 0", stacklevel=3)
+        yaw = 0.0
+    yaw = math.remainder(yaw, 2 * math.pi)
+    return (x, y), yaw if abs(yaw) > MIN_YAW else 0.0
 
 
 def _read_image(path: Path, name: str, mode: str) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,10 @@ import pytest
 from PIL import Image
 
 from leapnav.cli import main
+from leapnav.envs import Scenario
 from leapnav.envs.scenarios.files import read_scenarios
-from leapnav.envs.worlds.ros_map import read_ros_map
+from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.worlds.ros_map import read_ros_map, sample_on_map
 from leapnav.experts import find_optimum
 
 
@@ -58,7 +60,6 @@ def test_a_map_of_ros_has_scenarios_between_its_walls(tmp_path, capsys, monkeypa
     [
         ({"resolution": None}, "map.yaml: resolution: missing"),
         ({"resolution": -1}, "map.yaml: resolution: expected a number > 0, got -1"),
-        ({"origin": [0, 0, 0.5]}, "map.yaml: origin: expected a map that is not rotated, got the yaw 0.5"),
         ({"origin": "here"}, "map.yaml: origin: expected a list, got 'here'"),
         ({"mode": "raw"}, "map.yaml: mode: expected 'trinary' or 'scale', got 'raw'"),
         ({"image": "map.yaml"}, "map.yaml: not an image"),
@@ -66,7 +67,7 @@ def test_a_map_of_ros_has_scenarios_between_its_walls(tmp_path, capsys, monkeypa
         ({"free_thresh": "low"}, "map.yaml: free_thresh: expected a number, got 'low'"),
         ({"image": "[1"}, "map.yaml: not valid YAML"),
         ({"origin": "[.nan, 0, 0]"}, "map.yaml: origin: expected finite coordinates"),
-        ({"origin": "[0, 0, .inf]"}, "map.yaml: origin: expected a map that is not rotated, got the yaw inf"),
+        ({"origin": "[0, 0, .inf]"}, "map.yaml: origin: expected a finite yaw, got inf"),
         ({"negate": "maybe"}, "map.yaml: negate: expected True or False, got 'maybe'"),
         ({"negate": "2"}, "map.yaml: negate: expected True or False, got 2"),
         ({"occupied_thresh": 65}, "map.yaml: occupied_thresh: expected a number <= 1, got 65"),
@@ -154,3 +155,43 @@ def test_a_yaw_that_is_not_a_number_is_read_as_zero_with_a_warning(yaw, tmp_path
     path = write_ros_map(tmp_path, rooms_in_gray(), origin=f"[-2.0, -1.0, {yaw}]")
     with pytest.warns(UserWarning, match="origin: the yaw is not a number and is read as 0"):
         assert read_ros_map(path).arena == (-2.0, -1.0, 8.0, 6.5)
+
+
+@pytest.mark.parametrize("yaw", [0.5, -2.0, 3.0, np.pi / 2, -0.001])
+def test_a_rotated_map_is_the_map_in_another_frame(yaw, tmp_path):
+    """Its walls are where the rotation puts them, and nothing outside of it can be reached."""
+    plain = read_ros_map(write_ros_map(tmp_path, rooms_in_gray()))
+    turned = read_ros_map(write_ros_map(tmp_path, rooms_in_gray(), origin=[-2.0, -1.0, yaw]))
+    fields = [
+        Scenario.from_dict(
+            {"arena": grid.arena, "start": start, "goal": start, "horizon": 1.0, "obstacles": walls}
+        ).field
+        for grid, start in ((plain, (0.0, 2.0, 0.0)), (turned, (*placed(2.0, 3.0, yaw), 0.0)))
+        for walls in ([{"polygon": {"vertices": one.polygon.vertices}} for one in grid.obstacles()],)
+    ]
+    rng = np.random.default_rng(0)
+    for x, y in rng.uniform((0, 0), (10, 7.5), (200, 2)):
+        expected, found = (
+            clearance(*at, field)[0] for at, field in zip(((x - 2, y - 1), placed(x, y, yaw)), fields, strict=True)
+        )
+        if expected > 0.0:
+            assert found == pytest.approx(expected, abs=1e-9)
+        else:
+            assert found <= 1e-9
+    x_min, y_min, x_max, y_max = turned.arena
+    for x, y in rng.uniform((x_min, y_min), (x_max, y_max), (300, 2)):
+        dx, dy = x + 2, y + 1
+        inside = np.array([np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx])
+        if (inside < 0).any() or (inside > (10, 7.5)).any():
+            assert clearance(x, y, fields[1])[0] <= 1e-9
+
+
+def placed(x, y, yaw):
+    """The position in the world of a point of the map."""
+    return -2.0 + np.cos(yaw) * x - np.sin(yaw) * y, -1.0 + np.sin(yaw) * x + np.cos(yaw) * y
+
+
+def test_scenarios_on_a_rotated_map_have_optima(tmp_path):
+    grid = read_ros_map(write_ros_map(tmp_path, rooms_in_gray(), origin=[-2.0, -1.0, 0.7]))
+    for scenario in sample_on_map(grid, 2, seed=5):
+        assert find_optimum(scenario, "medium").success
