@@ -162,28 +162,24 @@ def test_a_rotated_map_is_the_map_in_another_frame(yaw, tmp_path):
     """Its walls are where the rotation puts them, and nothing outside of it can be reached."""
     plain = read_ros_map(write_ros_map(tmp_path, rooms_in_gray()))
     turned = read_ros_map(write_ros_map(tmp_path, rooms_in_gray(), origin=[-2.0, -1.0, yaw]))
-    fields = [
-        Scenario.from_dict(
-            {"arena": grid.arena, "start": start, "goal": start, "horizon": 1.0, "obstacles": walls}
-        ).field
-        for grid, start in ((plain, (0.0, 2.0, 0.0)), (turned, (*placed(2.0, 3.0, yaw), 0.0)))
-        for walls in ([{"polygon": {"vertices": one.polygon.vertices}} for one in grid.obstacles()],)
-    ]
+    plain_field, field = field_of(plain, (0.0, 2.0, 0.0)), field_of(turned, (*placed(2.0, 3.0, yaw), 0.0))
     rng = np.random.default_rng(0)
     for x, y in rng.uniform((0, 0), (10, 7.5), (200, 2)):
-        expected, found = (
-            clearance(*at, field)[0] for at, field in zip(((x - 2, y - 1), placed(x, y, yaw)), fields, strict=True)
-        )
-        if expected > 0.0:
-            assert found == pytest.approx(expected, abs=1e-9)
-        else:
-            assert found <= 1e-9
+        expected, found = clearance(x - 2, y - 1, plain_field)[0], clearance(*placed(x, y, yaw), field)[0]
+        assert found == pytest.approx(expected, abs=1e-9) if expected > 0.0 else found <= 1e-9
     x_min, y_min, x_max, y_max = turned.arena
     for x, y in rng.uniform((x_min, y_min), (x_max, y_max), (300, 2)):
         dx, dy = x + 2, y + 1
         inside = np.array([np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx])
         if (inside < 0).any() or (inside > (10, 7.5)).any():
-            assert clearance(x, y, fields[1])[0] <= 1e-9
+            assert clearance(x, y, field)[0] <= 1e-9
+
+
+def field_of(grid, start):
+    """The obstacle field of a map."""
+    walls = [{"polygon": {"vertices": one.polygon.vertices}} for one in grid.obstacles()]
+    fields = {"arena": grid.arena, "start": start, "goal": start, "horizon": 1.0, "obstacles": walls}
+    return Scenario.from_dict(fields).field
 
 
 def placed(x, y, yaw):
