@@ -91,13 +91,17 @@ def test_a_person_drives_by_touch_and_sees_the_regret(page):
     load(page, SHORT)
     page.tap("#drive")
     assert page.is_visible("#pad") and page.evaluate("play.driving.hasBegun") is False
-    box = page.locator("#pad").bounding_box()
     session = page.context.new_cdp_session(page)
-    middle, top = box["x"] + box["width"] / 2, box["y"]
-    # Half of the maximum speed, straight ahead.
-    point = {"x": middle, "y": top + box["height"] / 4}
     scrolled = page.evaluate("scrollY")
-    session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+    # Half of the maximum speed, straight ahead. The first touch may miss the pad while the layout still changes.
+    while True:
+        box = page.locator("#pad").bounding_box()
+        point = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 4}
+        session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+        page.wait_for_timeout(200)
+        if page.evaluate("play.driving === null || play.driving.hasBegun"):
+            break
+        session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
     until(page, "play.episode !== null")
     session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
     episode = page.evaluate("play.episode")
