@@ -178,15 +178,14 @@ class EnvironmentSettings:
         ages = tuple(map(float, given))
         if not all(before < age <= longest for before, age in zip((0.0, *ages), ages, strict=False)):
             raise ValueError(f"history: expected increasing ages in (0, {longest:g}] s, got {given!r}")
-        if ages and ages[0] < self.control_period / 2:
+        if ages and round(ages[0] / self.control_period) < 1:
             raise ValueError(f"history: expected ages of at least one control period, got {ages[0]:g}")
-        for name, conflicting in (("dict_observation", self.dict_observation), ("goal", self.goal_conditioned)):
-            if conflicting and (ages or self.previous_action):
-                option = "history" if ages else "previous_action"
-                kind = "dictionaries" if name == "dict_observation" else "those of a goal-conditioned environment"
-                raise ValueError(
-                    f"{option}: expected the default, because observations are {kind}, got {getattr(self, option)!r}"
-                )
+        option = "history" if ages else "previous_action"
+        if (self.dict_observation or self.goal_conditioned) and (ages or self.previous_action):
+            kind = "dictionaries" if self.dict_observation else "those of a goal-conditioned environment"
+            raise ValueError(
+                f"{option}: expected the default, because observations are {kind}, got {getattr(self, option)!r}"
+            )
         return ages
 
     @property

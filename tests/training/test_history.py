@@ -16,6 +16,7 @@ from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.observations import frame_size, observation_entries, parts_of
 from leapnav.envs.simulation.observer import Observer
+from leapnav.experts import find_optimum
 from leapnav.training import (
     DAgger,
     DAggerConfig,
@@ -97,6 +98,7 @@ def test_the_robots_of_a_vector_environment_remember_their_own_episodes():
         ({"history": (0.4, 0.4)}, r"history: expected increasing ages"),
         ({"history": (-1.0,)}, r"history: expected increasing ages in \(0, 500\] s, got \(-1\.0,\)"),
         ({"history": (0.01,)}, r"history: expected ages of at least one control period, got 0\.01"),
+        ({"history": (0.025,)}, r"history: expected ages of at least one control period, got 0\.025"),
         ({"history": AGES, "dict_observation": True}, r"history: expected the default, because .* dictionaries"),
         ({"previous_action": 1}, "previous_action: expected True or False, got 1"),
     ],
@@ -253,3 +255,13 @@ def test_runs_with_a_history(tmp_path, capsys):
     assert json.loads((tmp_path / "ppo" / "policy.json").read_text())["environment"]["history"] == [0.4, 1.2]
     assert main([*started, "--history", "0.4", "--out", str(tmp_path / "other")]) == 2
     assert "history" in capsys.readouterr().err
+
+
+def test_samples_with_another_control_period_keep_their_history():
+    scenario = sample_scenario("open", 4)
+    settings = EnvironmentSettings(history=(0.4,), control_period=0.2)
+    samples = Labeller(settings, 3.0, "low").samples(scenario, find_optimum(scenario, "low"))
+    fewer = samples.observed(replace(settings, lidar_beams=16)).observations
+    size = fewer.shape[1] // 2
+    np.testing.assert_array_equal(fewer[2:, size:], fewer[:-2, :size])  # 0.4 s are two control periods
+    assert np.abs(fewer[2:, size:] - fewer[2:, :size]).max() > 0.1

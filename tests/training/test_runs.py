@@ -13,8 +13,8 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from leapnav.experts.data.rollouts import rollout
+from leapnav.training import Dataset, load_policy, make_policy, shipped_policies
 from leapnav.training import config as configuration
-from leapnav.training import load_policy, make_policy, shipped_policies
 from leapnav.training.config import (
     ALGORITHMS,
     BCConfig,
@@ -262,7 +262,8 @@ def test_an_interrupted_clone_keeps_its_demonstrations(tmp_path, monkeypatch):
     made = {path: path.stat().st_mtime_ns for path in (config.out / "demonstrations").rglob("*") if path.is_file()}
     train_bc(replace(config, resume=True), progress=False)
     assert made == {path: path.stat().st_mtime_ns for path in made}
-    assert [line["step"] for line in lines(config.out)] == [1, 2, 3, 3]
+    samples = len(Dataset.of(config.out / "demonstrations"))
+    assert [line["step"] for line in lines(config.out)] == [samples, 2 * samples, 3 * samples, 3 * samples]
 
 
 def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):

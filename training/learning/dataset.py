@@ -102,7 +102,7 @@ class Dataset:
             return self
         parsed = [Scenario.from_json(text) for text in self.scenarios]
         scenarios = [parsed[episode] for episode in self.episodes.tolist()]
-        starts = np.append(True, (np.diff(self.episodes) != 0) | (np.diff(self.times) > 1.5 * CONTROL_PERIOD))
+        starts = np.append(True, (np.diff(self.episodes) != 0) | (np.diff(self.times) > 1.5 * settings.control_period))
         previous = np.where(starts[:, None], 0.0, np.nan_to_num(np.roll(self.executed, 1, axis=0)))
         first = np.maximum.accumulate(np.where(starts, np.arange(len(self)), 0))
         observations = Observer(settings).observe(scenarios, self.states, self.times, previous, first)

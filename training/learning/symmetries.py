@@ -9,6 +9,7 @@ optimal in the scenario with the start and goal headings rotated by 180 degrees,
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import torch as th
 
@@ -75,6 +76,12 @@ def time_reverse(
     return _transformed(observations, actions, settings, _TIME_REVERSE_SIGNS, symmetry, rotated)
 
 
+@cache
+def _layout(settings: EnvironmentSettings) -> ObservationLayout:
+    """Return the layout of observations; it is needed for each batch of samples."""
+    return ObservationLayout(settings)
+
+
 def _require(settings: EnvironmentSettings, name: str, symmetry: Symmetry | None) -> Symmetry:
     if symmetry is None:
         raise ValueError(f"{name}: the robot {settings.robot!r} does not have this symmetry")
@@ -99,7 +106,7 @@ def _transformed(
         "detours": moved,
         "distance": lambda values: values,
     }
-    layout = ObservationLayout(settings)
+    layout = _layout(settings)
     frames = observations.reshape(-1, layout.frame)  # those of the history are transformed like the current one
     changed = th.cat([changes[name](frames[:, part]) for name, part in layout.parts.items()], dim=1)
     return changed.reshape(observations.shape), actions @ matrix.T

@@ -150,13 +150,13 @@ class NavigationFeatures(BaseFeaturesExtractor):
 
 
 def _displacements(frames: th.Tensor) -> th.Tensor:
-    """Return the earlier poses relative to the current one, from the goal as it was seen: (B, 4 (k - 1)).
+    """Return the earlier poses (B, 4 (k - 1)) of the robot in the frame of its current pose.
 
-    The goal pose is the same in all frames, so the poses of the robot follow from it. For each earlier frame: position
-    (x and y in units of 2 m), and the sine and the cosine (minus 1) of its heading.
+    They are computed from the goal pose relative to the robot, which each observation contains: the goal is the same in
+    all of them. A pose is given by x and y in units of 2 m, the sine of the heading, and its cosine minus 1.
 
     Args:
-        frames: (B, k, d), newest first.
+        frames: (B, k, d), the current observation and the earlier ones, newest first.
 
     """
     goals, headings = frames[:, :, 0:2], frames[:, :, 2:4]  # the headings of the goal minus those of the robot

@@ -56,30 +56,31 @@ def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> li
     checkpoint = run.load_checkpoint() if config.resume else None
     if checkpoint is not None:
         policy.load_state_dict(th.load(checkpoint[0] / "policy.pt", weights_only=True))
-        epochs = checkpoint[1]["epochs"]
+        samples = checkpoint[1]["samples"]
     else:
         dataset = given or _demonstrations(run, config.scenarios, workers, progress)
-        epochs = _clone(run, policy, dataset.observed(observed_settings(config)), config, progress)
-        run.save_checkpoint(lambda folder: th.save(policy.state_dict(), folder / "policy.pt"), {"epochs": epochs})
-    evaluations = run.evaluate(policy, epochs, final=True)
+        samples = _clone(run, policy, dataset.observed(observed_settings(config)), config, progress)
+        run.save_checkpoint(lambda folder: th.save(policy.state_dict(), folder / "policy.pt"), {"samples": samples})
+    evaluations = run.evaluate(policy, samples, final=True)
     run.save_policy(policy)
     return evaluations
 
 
 def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConfig, progress: bool) -> int:
-    """Fit a policy, with an evaluation after each epoch; return the number of epochs."""
+    """Fit a policy, with an evaluation after each epoch; return the number of samples of all epochs."""
 
     def record(loss: EpochLoss) -> None:
         run.logger.record("loss/training", loss.training)
         run.logger.record("loss/validation", loss.validation)
-        evaluations = run.evaluate(policy, loss.epoch)
+        evaluations = run.evaluate(policy, loss.epoch * len(dataset))
         if progress:
             tqdm.write(f"epoch {loss.epoch}: {_scores(evaluations)}, loss {loss.validation:.4f}")
         run.save_policy(policy)
 
     settings = replace(config.cloning, seed=config.seed)
     label = f"Cloning {config.family}"
-    return len(behaviour_clone(policy, dataset, settings, progress=progress, label=label, on_epoch=record))
+    losses = behaviour_clone(policy, dataset, settings, progress=progress, label=label, on_epoch=record)
+    return len(losses) * len(dataset)
 
 
 @limit_threads

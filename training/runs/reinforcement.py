@@ -54,7 +54,7 @@ def train_ppo(
 ) -> list[Evaluation]:
     """Train a policy by proximal policy optimisation.
 
-    With `config.resume` the run resumes from its last checkpoint, with new episodes.
+    With `config.resume` the run resumes from its last checkpoint, with new episodes and without scores of levels.
 
     Args:
         config: settings.
