@@ -33,6 +33,7 @@ SINGLE_SEED = {
     "warm": ("clutter", "polygons", "rooms", "slalom"),
     **dict.fromkeys(("sac", "sacwarm"), tuple(ALL_FAMILIES)),
 }
+OPEN = {"lidar_beams": 32, "hidden": (128, 128)}  # a smaller network suffices
 N_EVALUATIONS = 8  # during a run of PPO or SAC
 ROWS = {
     "bc": "clone of {demos:,}",
@@ -50,9 +51,10 @@ def train(method: str, family: str, runs: Path, seeds: int, workers: int) -> Non
         rollout(family, DEMONSTRATIONS[family], demos, seed=DEMONSTRATION_SEED, workers=workers)
     for seed in range(1 if family in SINGLE_SEED[method] else seeds):
         out = runs / family / f"{method}-{seed}"
-        run = {"out": out, "seed": seed, "resume": (out / "config.json").exists()}
+        run = {"out": out, "seed": seed, "resume": (out / "config.json").exists(), **(OPEN if family == "open" else {})}
         if method == "bc":
-            train_bc(BCConfig.tuned(family, demos=(demos,), **run))
+            observation = "lidar" if family == "open" else "geodesic"
+            train_bc(BCConfig.tuned(family, demos=(demos,), observation=observation, **run))
             continue
         if method in SAC_STEPS:
             steps = SAC_STEPS[method]

@@ -9,16 +9,23 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from leapnav.envs.scenarios.bank import collection_name
 from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES
 from leapnav.training import DAggerRunConfig, evaluate, load_policy, policy_environment, save_policy, train_dagger
-from leapnav.training.config import RobotName
+from leapnav.training.config import DAggerConfig, RobotName
 from leapnav.training.policies.files import SHIPPED, read_description
 
 ROBOTS = ("car", "dynamic_unicycle")
 FREE = collection_name("clutter", horizon="free")
+OPEN = {"observation": "lidar", "lidar_beams": 32, "hidden": (128, 128), "scenarios": 2000}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "open": {**OPEN, "dagger": DAggerConfig(rounds=2)},
+    "polygons": {"scenarios": 8000},
+    "rooms": {"scenarios": 8000},
+    "slalom": {"scenarios": 4000, "dagger": DAggerConfig(max_episodes=6000)},
+}
 NAMES = (*ALL_FAMILIES, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
 
 
@@ -27,7 +34,8 @@ def ship(name: str, runs: Path) -> None:
     run = runs / name
     prefix, _, family = name.rpartition("-")
     robot = cast(RobotName, prefix if prefix in ROBOTS else "unicycle")
-    config = DAggerRunConfig.tuned(family, out=run, robot=robot, horizon="free" if name == FREE else "fixed")
+    settings: dict[str, Any] = {**SETTINGS.get(family, {}), "horizon": "free" if name == FREE else "fixed"}
+    config = DAggerRunConfig.tuned(family, out=run, robot=robot, **settings)
     train_dagger(replace(config, resume=(run / "config.json").exists()), workers=os.cpu_count() or 1)
     shipped = SHIPPED / name
     shutil.rmtree(shipped, ignore_errors=True)

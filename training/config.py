@@ -10,13 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self, cast
 
-# Tuned settings, by the name of the run's class. The suffix "-warm" marks the changes for a warm start, "-warm-motor"
-# those for a warm start of a robot with motors, "-free" those for a free horizon, "-lidar" those for lidar alone; a
-# sub-table with the name of a family contains the changes for this family.
-_DEFAULTS: dict[str, Any] = tomllib.loads(
-    files("leapnav.training").joinpath("defaults.toml").read_text(encoding="utf-8")
-)
-
+_FOLDER = files("leapnav.training")
+# The settings of an algorithm for another start than that of its defaults, by the name of the profile.
+PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
 
 # Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
 # robots of the user are text as well.
@@ -26,20 +22,7 @@ HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
-TEST_BANK = "test.bank"  # file in the directory of a run of a family without an included bank
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
-
-
-def own_bank(folder: Path, trained: str, family: str) -> Path:
-    """Return the file of the test bank that a run builds for a family of which no bank is included.
-
-    Args:
-        folder: directory of the run.
-        trained: family of the run, which may be "all".
-        family: the family of the bank.
-
-    """
-    return folder / (TEST_BANK if family == trained else f"test-{family}.bank")
 
 
 @dataclass(frozen=True)
@@ -73,11 +56,11 @@ class CloningConfig:
 class DAggerConfig:
     """Settings of dataset aggregation (DAgger)."""
 
-    rounds: int = 8
+    rounds: int = 3
     """Number of rounds: rollouts of the learner, takeovers by the expert, fit to all samples."""
-    max_failures: int = 300
+    max_failures: int = 200
     """Failed episodes per round before relabelling; the expert takes over at most 12 times in each."""
-    max_episodes: int = 15_000
+    max_episodes: int = 8_000
     """Maximum number of episodes per round."""
     successes: float = 1.0
     """Successful episodes with one takeover each, per failed episode."""
@@ -85,7 +68,7 @@ class DAggerConfig:
     """Time that the expert drives after a takeover (s)."""
     epochs: int = 2
     """Passes over all samples after each round except the last."""
-    last_epochs: int = 8
+    last_epochs: int = 6
     """Passes over all samples after the last round."""
     learning_rate: float = 1e-3
     """Peak learning rate of each round (cosine decay to zero)."""
@@ -140,9 +123,10 @@ class RunConfig:
     """Widths of the hidden layers of the actor and the critic."""
     observation: ObservationName = "lidar"
     """Lidar alone, or with the geodesic distance to the goal and the detour along each beam, from the complete map."""
-    lidar_beams: int = 128
-    """Number of lidar beams, an even number. Demonstrations are observed again with these beams; a policy to start from
-    must have the same number. With 32 beams, narrow passages cannot be distinguished from wide ones."""
+    lidar_beams: int | None = None
+    """Number of lidar beams, an even number; by default 64 with the geodesic observation and 128 with lidar alone. With
+    32 beams, narrow passages cannot be distinguished from wide ones. Demonstrations are observed again with these
+    beams; a policy to start from must have the same number."""
     history: tuple[float, ...] = ()
     """Ages of earlier observations that are part of the observation, such as 0.4, 1.2 and 2.8 (s)."""
     previous_action: bool | None = None
@@ -164,7 +148,8 @@ class RunConfig:
         observation = {} if self.observation == "lidar" else {"observation": self.observation}
         history = {"history": self.history} if self.history else {}
         previous = {} if self.effort_weights is None else {"previous_action": True}
-        return {**observation, "lidar_beams": self.lidar_beams, **robot, **horizon, **history, **previous}
+        beams = (64 if self.observation == "geodesic" else 128) if self.lidar_beams is None else self.lidar_beams
+        return {**observation, "lidar_beams": beams, **robot, **horizon, **history, **previous}
 
     @property
     def effort_weights(self) -> tuple[float, ...] | None:
@@ -186,15 +171,21 @@ class RunConfig:
             raise ValueError("previous_action: expected a free horizon and a robot without drift, got True")
         return found
 
+    def own_bank(self, folder: Path, family: str) -> Path:
+        """Return the file of the test bank that the run in a directory builds for a family without an included one."""
+        return folder / ("test.bank" if family == self.family else f"test-{family}.bank")
+
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, start: Sequence[Path] = (), **changes: Any) -> Self:
-        """Return the settings tuned for a family and a horizon (file `defaults.toml`), with changes.
+        """Return the settings for a family, tuned for the start of the run: the profile of the algorithm, with changes.
 
-        A run that starts from a policy has the observation of that policy.
+        The defaults of the class are the profile of a run from scratch; DAgger has another one for lidar alone, and PPO
+        and SAC for a warm start (file `profiles.toml`). A run that starts from a policy has the observation of that
+        policy.
 
         Args:
             family: one of the families, or "all".
-            warm: whether to use the settings of a warm start; None: if `changes` contains a `warm_start`.
+            warm: whether to use the profile of a warm start; None: if `changes` contains a `warm_start`.
             start: the policy to start from, among other paths; by default in `warm_start` and `policy`.
             changes: values of any settings.
 
@@ -206,55 +197,50 @@ class RunConfig:
             from leapnav.envs.scenarios.families import check_family
 
             check_family(family)
-        if warm is None:
-            warm = bool(changes.get("warm_start"))
         own = {setting.name for setting in fields(cls)}
         given = _as_paths(start) or _as_paths(changes.get("warm_start")) or _as_paths(changes.get("policy"))
         inherited = {name: value for name, value in _inherited(given).items() if name in own}
         changes = {**inherited, **changes}
+        profile = next(name for name, kind in ALGORITHMS.items() if issubclass(cls, kind))
+        if bool(changes.get("warm_start")) if warm is None else warm:
+            profile += "-warm"
+            if f"{profile}-{changes.get('actuation')}" in PROFILES:
+                profile += f"-{changes['actuation']}"
+        elif changes.get("observation") == "lidar":
+            profile += "-lidar"
         config = cls(out=Path(), family=cast(FamilyName, family))
-        sections = ["RunConfig", cls.__name__, *([f"{cls.__name__}-warm"] if warm else [])]
-        if changes.get("horizon") == "free":
-            sections.append(f"{cls.__name__}-free")
-        if changes.get("observation") == "lidar":
-            sections.append(f"{cls.__name__}-lidar")
-        if warm and changes.get("actuation") == "motor":
-            sections.append(f"{cls.__name__}-warm-motor")
-        for section in sections:
-            table = _DEFAULTS.get(section, {})
-            names = {setting.name for setting in fields(config)}
-            common = {name: value for name, value in table.items() if name in names}  # the other keys are families
-            config = _replace_nested(_replace_nested(config, common), table.get(family, {}))
-        return replace(config, **changes)
+        return replace(_replace_nested(config, PROFILES.get(profile, {})), **changes)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BCConfig(RunConfig):
-    """Behaviour cloning: fit a policy to demonstrations of the expert."""
+class _ImitationConfig(RunConfig):
+    """Settings shared by the runs of imitation learning."""
 
+    observation: ObservationName = "geodesic"
+    """With the geodesic distance to the goal and the detour along each beam, from the complete map, or lidar alone,
+    which does not contain what is behind an obstacle."""
     demos: tuple[Path, ...] = ()
     """Directories written by `leapnav rollout`; if none is given, demonstrations are generated in the run directory."""
     scenarios: int = 10_000
     """Number of scenarios to demonstrate if no demonstrations are given."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
-    """Settings of the fit; the seed is that of the run."""
+    """Settings of the clone, in DAgger the first learner; its loss and batch size are those of all fits. The seed is
+    that of the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DAggerRunConfig(RunConfig):
+class BCConfig(_ImitationConfig):
+    """Behaviour cloning: fit a policy to demonstrations of the expert."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DAggerRunConfig(_ImitationConfig):
     """Dataset aggregation (DAgger): the learner drives, the expert takes over and provides the labels."""
 
-    demos: tuple[Path, ...] = ()
-    """Directories written by `leapnav rollout`, for the clone that is the first learner and for the dataset; if none is
-    given, demonstrations are generated in the run directory."""
-    scenarios: int = 10_000
-    """Number of scenarios to demonstrate if no demonstrations are given."""
     policy: Path | None = None
     """Policy to use as the first learner instead of a new clone."""
     n_envs: int = 256
     """Number of parallel robots."""
-    cloning: CloningConfig = field(default_factory=CloningConfig)
-    """Settings of the first clone, and loss and batch size of all fits; the seed is that of the run."""
     dagger: DAggerConfig = field(default_factory=DAggerConfig)
     """Settings of the aggregation; the seed is that of the run."""
 
@@ -299,6 +285,8 @@ class _LearnerConfig(RunConfig):
 class PPOConfig(_LearnerConfig):
     """Proximal policy optimisation. The defaults are for training from scratch; `tuned` has those of a warm start."""
 
+    lidar_beams: int | None = 32
+    """Number of lidar beams, an even number; with 128, learning takes twice as long."""
     total_timesteps: int = 5_000_000
     """Environment steps of all robots together."""
     levels: LevelsName = "fresh"
@@ -310,9 +298,9 @@ class PPOConfig(_LearnerConfig):
     """Number of parallel robots."""
     learning_rate: float = 1e-3
     """Initial learning rate (linear decay to zero)."""
-    gamma: float = 1.0
-    """Discount factor. 1 is possible because the horizon is finite and observed; the critic's values are then the
-    negative cost-to-go."""
+    gamma: float | None = None
+    """Discount factor. By default 1 with a fixed horizon, which is observed, so that the critic's values are the
+    negative cost-to-go, and 0.995 with a free horizon, where the time left is not observed: a time constant of 40 s."""
     control_period: float = 0.2
     """Time between actions during training (s); evaluations use the environment's default. With fewer decisions per
     episode, each has a larger effect."""
@@ -342,6 +330,11 @@ class PPOConfig(_LearnerConfig):
     critic_first: float = 0.0
     """Fraction of the run, from its start, in which only the critic learns."""
 
+    @property
+    def discount(self) -> float:
+        """Discount factor."""
+        return (1.0 if self.horizon == "fixed" else 0.995) if self.gamma is None else self.gamma
+
 
 @dataclass(frozen=True, kw_only=True)
 class SACConfig(_LearnerConfig):
@@ -355,8 +348,8 @@ class SACConfig(_LearnerConfig):
     """Number of parallel robots."""
     learning_rate: float = 3e-4
     """Initial learning rate (linear decay to zero)."""
-    gamma: float = 0.99
-    """Discount factor."""
+    gamma: float | None = None
+    """Discount factor; by default 0.99, and 0.999 with a free horizon, where the time left is not observed."""
     reward: Literal["cost", "shaped"] = "shaped"
     """Reward of the environment; "shaped" adds potential-based shaping towards the goal."""
     batch_size: int = 512
@@ -380,6 +373,11 @@ class SACConfig(_LearnerConfig):
     checkpoint_every: int = 50_000
     """Environment steps between checkpoints."""
 
+    @property
+    def discount(self) -> float:
+        """Discount factor."""
+        return (0.99 if self.horizon == "fixed" else 0.999) if self.gamma is None else self.gamma
+
 
 def _as_paths(value: Any) -> list[Path]:
     """Return one path, several or none as a list."""
@@ -390,7 +388,7 @@ def _as_paths(value: Any) -> list[Path]:
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
     """Return the settings of the observation of the policy among some paths; empty without one."""
-    included = files("leapnav.training").joinpath("policies", "pretrained")
+    included = _FOLDER.joinpath("policies", "pretrained")
     for path in paths:
         for folder in (Path(path), included.joinpath(str(path))):
             try:

@@ -15,7 +15,7 @@ from leapnav.training.config import ALGORITHMS, BCConfig, DAggerRunConfig, PPOCo
 if TYPE_CHECKING:
     from leapnav.training.scoring.results import Evaluation
 
-OWN_DEFAULTS = ("free", "lidar", "motor")  # horizon, observation and actuation that other settings depend on
+OWN_PROFILES = ("lidar", "motor")  # observation and actuation that have their own profile
 NOT_GIVEN = (Path("."),)
 
 
@@ -23,7 +23,7 @@ NOT_GIVEN = (Path("."),)
 class TrainCommand:
     """Train a policy: behaviour cloning of the expert, DAgger, or PPO or SAC, from scratch or from a warm start.
 
-    The defaults shown are those tuned for --family (and for --warm-start); with --resume, those of the run.
+    The defaults shown are tuned for a run from scratch, or from --warm-start; with --resume, they are those of the run.
     """
 
     config: RunConfig
@@ -79,7 +79,7 @@ def train_command(defaults: Mapping[str, RunConfig], *, needs_out: bool = True) 
 
 
 def default_configurations() -> dict[str, RunConfig]:
-    """Return the default configurations, without --family and other settings that change them."""
+    """Return the default configurations, those of runs from scratch."""
     return {name: kind.tuned(RunConfig.family) for name, kind in ALGORITHMS.items()}
 
 
@@ -96,7 +96,7 @@ def probes() -> dict[str, RunConfig]:
 
 
 def tuned_configurations(given: RunConfig) -> dict[str, RunConfig]:
-    """Return the default configurations for a command line: those of the run to resume, or those tuned for its words.
+    """Return the default configurations for a command line: those of the run to resume, or those of its profile.
 
     Args:
         given: the command line, parsed with `probes` as defaults.
@@ -116,7 +116,7 @@ def tuned_configurations(given: RunConfig) -> dict[str, RunConfig]:
         raise ValueError("warm_start: expected demonstrations or a policy, got none")
     is_warm = warm_start != NOT_GIVEN
     start = [*(warm_start if is_warm else ()), *filter(None, [getattr(given, "policy", None)])]
-    names = ("horizon", "observation", "actuation")
-    changes = {name: value for name in names if (value := getattr(given, name, None)) in OWN_DEFAULTS}
+    names = ("observation", "actuation")
+    changes = {name: value for name in names if (value := getattr(given, name, None)) in OWN_PROFILES}
     algorithm = next(name for name, kind in ALGORITHMS.items() if isinstance(given, kind))
     return {**defaults, algorithm: type(given).tuned(given.family, warm=is_warm, start=start, **changes)}

@@ -301,7 +301,7 @@ def test_reinforcement_learning_runs(kind, train, tmp_path):
     if kind is SACConfig:
         changes |= {"learning_starts": 50, "buffer_size": 1000, "batch_size": 32}
     config = kind.tuned("open", horizon="free", out=tmp_path / "run", **changes)
-    assert 0.99 < config.gamma < 1.0
+    assert 0.99 < config.discount < 1.0
     (evaluation,) = train(config, progress=False)
     assert len(evaluation.episodes) == 5
 

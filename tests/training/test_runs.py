@@ -37,7 +37,7 @@ from leapnav.training.scoring.html_report import write_report
 from leapnav.training.scoring.policy_specs import load_policy_spec
 
 QUICK = CloningConfig(epochs=3, batch_size=256)
-COMMON = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 4}
+COMMON = {"family": "open", "hidden": (16, 16), "observation": "lidar", "lidar_beams": 16, "evaluation_scenarios": 4}
 
 
 @pytest.fixture(scope="module")
@@ -401,28 +401,47 @@ def test_no_training_run_meets_the_scenarios_of_the_banks():
     assert len({environment_seed(seed, stream) for seed in range(50) for stream in range(50)}) == 2500
 
 
-def test_tuned_settings_depend_on_the_family_and_the_warm_start():
+def test_a_profile_contains_all_settings_of_its_algorithm():
+    for name, profile in configuration.PROFILES.items():
+        algorithm = ALGORITHMS[name.partition("-")[0]]
+        assert isinstance(algorithm.tuned("open"), algorithm)
+        if algorithm is DAggerRunConfig:
+            assert set(profile["dagger"]) == {field.name for field in fields(DAggerConfig)} - {"seed"}
+            continue
+        own = set(algorithm.__annotations__) - set(BCConfig.__annotations__)
+        unset = {"gamma", "levels", "level_bank", "algorithm", "evaluate_every", "checkpoint_every"}
+        assert own - unset <= set(profile) <= {field.name for field in fields(algorithm)}
+
+
+def test_the_start_of_a_run_determines_its_profile():
     for kind in ALGORITHMS.values():
-        for family in ("open", "clutter", "polygons", "rooms", "slalom", "all"):
-            assert kind.tuned(family).family == family
-    assert PPOConfig.tuned("clutter", warm=True).reward == "cost"
-    assert PPOConfig.tuned("clutter", seed=7).seed == 7
-    assert PPOConfig.tuned("clutter").gamma == 1.0
-    free = PPOConfig.tuned("clutter", horizon="free", warm=True)
-    assert 0.99 < free.gamma < 1.0 and free.reward == "cost" and free.environment["horizon"] == "free"
-    for kind, tables in configuration._DEFAULTS.items():
-        settings = {field.name for field in fields(getattr(configuration, kind.partition("-")[0]))}
-        assert set(tables) <= settings | {"open", "clutter", "polygons", "rooms", "slalom", "all"}
-    # Settings of a family, in the run and in a nested configuration.
-    assert DAggerRunConfig.tuned("open").hidden == (128, 128)
-    assert DAggerRunConfig.tuned("open").dagger.rounds == 2
-    assert DAggerRunConfig.tuned("clutter").dagger.max_failures < DAggerConfig().max_failures
-    assert DAggerRunConfig.tuned("clutter", observation="lidar").dagger == DAggerConfig()
-    for family, observation, beams in (("clutter", "geodesic", 64), ("open", "lidar", 32)):
-        for kind in (BCConfig, DAggerRunConfig):
-            config = kind.tuned(family)
-            assert (config.observation, config.lidar_beams) == (observation, beams)
-    assert BCConfig.tuned("clutter", observation="lidar").lidar_beams == 128
+        assert kind.tuned("slalom") == kind(out=Path(), family="slalom")
+    warm, motors = PPOConfig.tuned("clutter", warm=True), PPOConfig.tuned("clutter", warm=True, actuation="motor")
+    assert (warm.reward, warm.std, motors.std, motors.total_timesteps) == ("cost", 0.1, 0.15, 2_500_000)
+    assert PPOConfig.tuned("clutter", warm=True, seed=7).seed == 7
+    assert PPOConfig.tuned("clutter", actuation="motor").std == PPOConfig.std
+    sac = SACConfig.tuned("clutter", warm=True, actuation="motor")
+    assert sac == replace(SACConfig.tuned("clutter", warm=True), actuation="motor")
+    assert sac.imitation == 50.0
+    assert DAggerRunConfig.tuned("clutter", observation="lidar").dagger.rounds > DAggerConfig.rounds
+    with pytest.raises(ValueError, match="town"):
+        PPOConfig.tuned("town")
+
+
+@pytest.mark.parametrize(("kind", "fixed", "free"), [(PPOConfig, 1.0, 0.995), (SACConfig, 0.99, 0.999)])
+def test_the_discount_depends_on_whether_the_time_left_is_observed(kind, fixed, free):
+    assert kind(out=Path()).discount == fixed
+    config = kind.tuned("clutter", horizon="free", warm=True)
+    assert config.discount == free and config.environment["horizon"] == "free"
+    assert replace(config, gamma=0.9).discount == 0.9
+
+
+def test_the_number_of_beams_depends_on_the_observation():
+    for kind in (BCConfig, DAggerRunConfig, SACConfig):
+        for observation, beams in (("geodesic", 64), ("lidar", 128)):
+            assert kind(out=Path(), observation=observation).environment["lidar_beams"] == beams
+    assert BCConfig(out=Path(), lidar_beams=32).environment["lidar_beams"] == 32
+    assert PPOConfig(out=Path()).environment["lidar_beams"] == 32
 
 
 @pytest.mark.usefixtures("coarse_decisions")

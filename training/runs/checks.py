@@ -43,8 +43,9 @@ def check_config(config: RunConfig) -> None:
     if not config.hidden or min(config.hidden) < 1:
         raise ValueError(f"hidden: expected widths of at least 1, got {config.hidden!r}")
     check_integer("seed", config.seed, 0, 2**32 - 1)
-    if not (config.lidar_beams > 0 and config.lidar_beams % 2 == 0):
-        raise ValueError(f"lidar_beams: expected an even number >= 2, got {config.lidar_beams!r}")
+    beams = config.environment["lidar_beams"]
+    if not (beams > 0 and beams % 2 == 0):
+        raise ValueError(f"lidar_beams: expected an even number >= 2, got {beams!r}")
     EnvironmentSettings(**config.environment)
     if isinstance(config, SACConfig) and config.algorithm == "tqc" and config.effort_weights is not None:
         raise ValueError(f"previous_action: expected False for algorithm='tqc', got {config.previous_action!r}")
@@ -58,7 +59,7 @@ def check_config(config: RunConfig) -> None:
         value = getattr(config, field.name)
         if is_dataclass(value):
             _check_nested(field.name, value)
-        elif field.name in _CHECKS:
+        elif field.name in _CHECKS and value is not None:  # None: determined by other settings
             _CHECKS[field.name](field.name, value)
 
 

@@ -23,7 +23,7 @@ from leapnav.envs.scenarios.families import families_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
-from leapnav.training.config import RunConfig, own_bank
+from leapnav.training.config import RunConfig
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
@@ -143,7 +143,7 @@ class Run:
         task: dict[str, Any] = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
         if family in ScenarioBank.shipped_families(**task):
             return ScenarioBank.shipped(family, "test", **task)
-        path = own_bank(self.folder, config.family, family)
+        path = config.own_bank(self.folder, family)
         return build_bank(family, TEST_COUNT, path, **task, seed=TEST_SEED, progress=False)
 
     def _write_evaluations(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of
-from leapnav.training.config import own_bank, read_config
+from leapnav.training.config import read_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.results import Evaluation, bank_identity
@@ -226,7 +226,7 @@ def default_banks(
                 for folder, config in configs.items()
                 if config.obstacles == kind and split == "test"
                 if name not in ScenarioBank.shipped_families(config.robot, config.horizon, kind)
-                if (path := own_bank(folder, config.family, name)).exists()
+                if (path := config.own_bank(folder, name)).exists()
             ]
             own |= {bank_identity(bank): bank for bank in found}
             if not found:
