@@ -305,8 +305,7 @@ class PPOConfig(_LearnerConfig):
     """Time between actions during training (s); evaluations use the environment's default. With fewer decisions per
     episode, each has a larger effect."""
     penalty: float = 50.0
-    """Penalty of a collision or of a missed goal during training. Most warm starts use less than the environment's
-    default: most of their episodes succeed, and a high penalty would add noise to the returns."""
+    """Penalty of a collision or of a missed goal during training."""
     reward: Literal["cost", "shaped"] = "shaped"
     """Reward of the environment; "shaped" adds potential-based shaping towards the goal."""
     n_steps: int = 64
