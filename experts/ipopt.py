@@ -75,9 +75,11 @@ class Transcription:
         }
         self._solver: Any = casadi.nlpsol("solver", "ipopt", program, options)
         self._count = constraints.shape[0]
-        limits = scenario.robot.limits()
-        upper = np.concatenate([np.full(n * (intervals + 1), np.inf), np.tile(limits, intervals + 1)])
-        self._bounds = np.append(-upper, 0.0 if unknown else []), np.append(upper, np.inf if unknown else [])
+        low, high = scenario.robot.control_bounds().T
+        free = np.full(n * (intervals + 1), np.inf)
+        lower = np.append(-free, np.tile(low, intervals + 1))
+        upper = np.append(free, np.tile(high, intervals + 1))
+        self._bounds = np.append(lower, 0.0 if unknown else []), np.append(upper, np.inf if unknown else [])
 
     def solve(self, problem: OptimalControlProblem, path: Trajectory) -> Trajectory | None:
         """Solve from an initial guess.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from leapnav.envs.utils.validation import (
     check_positive,
 )
 from leapnav.experts.hard_limits import BARRIER_TOLERANCE, fitted_weight, follow_limit, softened
+from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
@@ -46,6 +48,9 @@ OPTIONS = {
 }
 # Without a guess, at most this number of initial paths is solved, until one costs more than the best by this fraction.
 MAX_INITIAL_PATHS, SIMILAR_COST = 4, 0.05
+# If these fail, the horizon is halved at most this often, and then followed back with at least this fraction of the
+# logarithm of the change per step.
+MAX_HALVINGS, MIN_STEP = 12, 1 / 64
 
 
 def solve(
@@ -152,7 +157,30 @@ def _without_guess(
     problem: OptimalControlProblem,
     options: SolverOptions,
 ) -> Extremal:
-    """The cheapest success from the best initial paths, or from the straight line if all others fail."""
+    """The cheapest success from the best initial paths, or from the straight line or shorter horizons if all fail."""
+    best, failed = _from_initial_paths(solver, problem, options)
+    if best is not None:
+        return best
+    line = problem.straight_line()
+    failed.append(solver(problem.with_winding_of(line.states), line, options))
+    if failed[-1].success:
+        return failed[-1]
+    if problem.horizon is not None:
+        lengthened = _from_shorter_horizons(solver, problem, options)
+        if lengthened is not None:
+            return lengthened
+    # A failure that converged is more informative.
+    statuses = Status.CONJUGATE_POINT, Status.TIME_NOT_MINIMAL, Status.COLLISION
+    converged = [extremal for extremal in failed if extremal.status in statuses]
+    return (converged or failed)[0]
+
+
+def _from_initial_paths(
+    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    problem: OptimalControlProblem,
+    options: SolverOptions,
+) -> tuple[Extremal | None, list[Extremal]]:
+    """The cheapest success from the best initial paths, and the failures."""
     best: Extremal | None = None
     failed: list[Extremal] = []
     for wound, path in islice(initial_paths(problem), MAX_INITIAL_PATHS):
@@ -163,16 +191,36 @@ def _without_guess(
             best = extremal
         elif extremal.cost > best.cost + SIMILAR_COST * abs(best.cost):
             break
-    if best is not None:
-        return best
-    line = problem.straight_line()
-    failed.append(solver(problem.with_winding_of(line.states), line, options))
-    if failed[-1].success:
-        return failed[-1]
-    # A failure that converged is more informative.
-    statuses = Status.CONJUGATE_POINT, Status.TIME_NOT_MINIMAL, Status.COLLISION
-    converged = [extremal for extremal in failed if extremal.status in statuses]
-    return (converged or failed)[0]
+    return best, failed
+
+
+def _from_shorter_horizons(
+    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    problem: OptimalControlProblem,
+    options: SolverOptions,
+) -> Extremal | None:
+    """The extremal that is followed from a shorter horizon, for which there is an initial path.
+
+    Over a horizon that is much longer than the time scales of the system, the steps of an initial path are too long,
+    and the flow is too sensitive for the nodes of a guess to be far from the solution.
+    """
+    horizon = problem.fixed_horizon
+    for halvings in range(1, MAX_HALVINGS + 1):
+        factor = 2.0**halvings
+        first, _ = _from_initial_paths(solver, problem.with_horizon(horizon / factor), options)
+        if first is not None:
+            break
+    else:
+        return None
+
+    def lengthen(fraction: float, guess: Extremal) -> Extremal | None:
+        longer = guess.problem.with_horizon(horizon * factor ** (fraction - 1.0))
+        times = guess.times * (longer.fixed_horizon / guess.horizon)
+        path = Trajectory(times, guess.states, guess.costates)
+        extremal = solver(longer, path, replace(options, segments=len(times) - 1))
+        return extremal if extremal.success else None
+
+    return step_halving(lengthen, first, min_step=MIN_STEP)
 
 
 def _from_guess(

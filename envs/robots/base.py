@@ -84,10 +84,16 @@ class Disc(Frozen):
     radius: Positive
 
 
+def magnitude(interval: tuple[float, float]) -> float:
+    """Return the largest absolute value in an interval."""
+    return max(-interval[0], interval[1])
+
+
 class RobotModel(Frozen):
     """A wheeled robot: the base class of all models.
 
-    The state is q = (x, y, heading, further states), the action the control u divided by its largest absolute value.
+    The state is q = (x, y, heading, further states). Actions are in [-1, 1], from the lowest to the highest value of
+    each control.
 
     Args:
         model: name of the model.
@@ -99,6 +105,8 @@ class RobotModel(Frozen):
         control_names: names of the m controls.
         state_units, control_units: their units.
         goal_motion: goal values of the further states; None leaves a state free.
+        limited: names of the limited quantities, by default those of `limits`. Each has two fields: its interval
+            (lowest, highest), and its largest absolute value `max_...`, which counts if the interval is None.
         cost_fields: names of the weights of `leapnav.envs.Cost` that the model uses, besides the proximity cost.
         advance: kernel of ADVANCE_SIGNATURE, exact or to 1e-9.
         state_cost: kernel of STATE_COST_SIGNATURE, or None without a state cost.
@@ -121,6 +129,7 @@ class RobotModel(Frozen):
     state_units: ClassVar[tuple[str, ...]] = ("m", "m", "rad")
     control_units: ClassVar[tuple[str, ...]]
     goal_motion: ClassVar[tuple[float | None, ...]] = ()
+    limited: ClassVar[tuple[str, ...]] = ()
     cost_fields: ClassVar[tuple[str, ...]] = ("speed_weight", "turn_weight")
     advance: ClassVar[Any]
     state_cost: ClassVar[Any] = None
@@ -136,9 +145,12 @@ class RobotModel(Frozen):
     footprint: Annotated[tuple[Disc, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def _check_footprint(self) -> Self:
+    def _check_alternatives(self) -> Self:
         if self.footprint is not None and "radius" in self.model_fields_set:
             raise ValueError("radius: cannot be combined with footprint, whose discs have radii of their own")
+        for name in self._intervals:
+            if f"max_{name}" in self.model_fields_set:
+                raise ValueError(f"max_{name}: cannot be combined with {name}, which has both limits")
         return self
 
     @model_serializer(mode="wrap")
@@ -146,20 +158,61 @@ class RobotModel(Frozen):
         fields = handler(self)
         if self.footprint is not None:
             del fields["radius"]
+        for name in self.limited:
+            fields.pop(f"max_{name}" if name in self._intervals else name, None)
         return fields
+
+    @property
+    def _intervals(self) -> list[str]:
+        """Names of the limits that are given as intervals."""
+        return [name for name in self.limited if getattr(self, name) is not None]
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest value of one of `limited`."""
+        interval: tuple[float, float] | None = getattr(self, name)
+        if interval is None:
+            largest = float(getattr(self, f"max_{name}"))
+            return -largest, largest
+        return interval
 
     @classmethod
     @abstractmethod
     def dynamics(cls) -> Dynamics:
         """Return the dynamics. SymPy is imported here, not with the module."""
 
-    @abstractmethod
-    def limits(self) -> tuple[float, ...]:
-        """Return the largest absolute values (m,) of the controls."""
+    def limits(self) -> Sequence[float | tuple[float, float]]:
+        """Return the limits of each control: (lowest, highest), or the largest absolute value."""
+        return [self.interval(name) for name in self.limited]
 
     @abstractmethod
     def control_weight(self, cost: CostWeights) -> tuple[float, ...]:
         """Return the weights (m,) of the squared controls in the running cost."""
+
+    def control_bounds(self) -> np.ndarray:
+        """Return the lowest and the highest value of each control, (m, 2)."""
+        pairs = [limit if isinstance(limit, tuple) else (-limit, limit) for limit in self.limits()]
+        return np.array(pairs, dtype=float)
+
+    def action_scale(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return `middle` and `half` (m,): the control is middle + half * action, with actions in [-1, 1]."""
+        bounds = self.control_bounds()
+        return bounds.mean(axis=1), (bounds[:, 1] - bounds[:, 0]) / 2
+
+    def actions(self, controls: np.ndarray) -> np.ndarray:
+        """Return the actions (..., m) of controls (..., m)."""
+        middle, half = self.action_scale()
+        return (controls - middle) / half
+
+    def controls(self, actions: np.ndarray) -> np.ndarray:
+        """Return the controls (..., m) of actions (..., m)."""
+        middle, half = self.action_scale()
+        return middle + half * actions
+
+    def has_symmetric_limits(self, symmetry: Symmetry) -> bool:
+        """Return whether a symmetry of the motion maps controls within their limits to such controls."""
+        bounds, matrix = self.control_bounds(), np.array(symmetry.controls, dtype=float)
+        ends = np.sort(matrix[:, :, None] * bounds, axis=2)
+        return bool(np.array_equal(ends.sum(axis=1), bounds))
 
     def parameters(self, cost: CostWeights) -> tuple[float, ...]:
         """Return the values of the parameters of `dynamics`."""
@@ -181,6 +234,13 @@ class RobotModel(Frozen):
     def speed_limits(self) -> tuple[float, float]:
         """Return bounds of the speed (m/s) and of the turn rate (rad/s); infinite if there are none."""
         return math.inf, math.inf
+
+    def slowest_speed(self) -> float:
+        """Return the smallest possible magnitude of the speed (m/s); it is positive if the robot cannot stop."""
+        if "speed" not in self.limited:
+            return 0.0
+        low, high = self.interval("speed")
+        return max(low, -high, 0.0)
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:
         """Return the motion primitives on a lattice with cells of the given side (m), in the given metric."""

@@ -12,10 +12,19 @@ from pydantic import Field
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, rotation
-from leapnav.envs.robots.base import ADVANCE_SIGNATURE, POSE, CostWeights, Dynamics, RobotModel, Symmetry, register
-from leapnav.envs.robots.moves import Moves, curved_moves
+from leapnav.envs.robots.base import (
+    ADVANCE_SIGNATURE,
+    POSE,
+    CostWeights,
+    Dynamics,
+    RobotModel,
+    Symmetry,
+    magnitude,
+    register,
+)
+from leapnav.envs.robots.moves import Moves, curved_moves, driving_modes
 from leapnav.envs.robots.unicycle import POSE_LABELS
-from leapnav.envs.utils.records import Positive
+from leapnav.envs.utils.records import Interval, Positive
 
 MAX_LATTICE_CELL = 0.25  # minimum turning radii: larger cells would make the lattice's turns much too wide
 
@@ -67,8 +76,9 @@ class Car(RobotModel):
         radius, footprint: see `RobotModel`.
         wheelbase: distance between the axles (m).
         max_steering: largest steering angle (rad), below pi / 2.
-        max_speed: largest speed (m/s), forwards and backwards.
-        max_steering_rate: largest rate of the steering state (rad/s).
+        max_speed, speed: largest speed (m/s), forwards and backwards, or instead (lowest, highest) speed; a positive
+            lowest speed means that the car can neither stop nor reverse.
+        max_steering_rate, steering_rate: largest rate of the steering state (rad/s), or (lowest, highest).
         steering_weight: cost weight of the squared rate of the steering state.
 
     """
@@ -85,11 +95,15 @@ class Car(RobotModel):
     reversal: ClassVar[Symmetry | None] = Symmetry((-1,), ((-1, 0), (0, -1)))
     is_kinematic: ClassVar[bool] = True
 
+    limited: ClassVar[tuple[str, ...]] = ("speed", "steering_rate")
+
     model: Literal["car"] = "car"
     wheelbase: Positive = 0.5
     max_steering: Annotated[float, Field(gt=0, lt=math.pi / 2)] = 0.6
     max_speed: Positive = 2.0
+    speed: Interval | None = None
     max_steering_rate: Positive = 4.0
+    steering_rate: Interval | None = None
     steering_weight: Positive = 0.2
 
     @classmethod
@@ -110,9 +124,6 @@ class Car(RobotModel):
         """Largest curvature of the path (1/m)."""
         return math.tan(self.max_steering) / self.wheelbase
 
-    def limits(self) -> tuple[float, ...]:  # noqa: D102
-        return self.max_speed, self.max_steering_rate
-
     def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
         return cost.speed_weight, self.steering_weight
 
@@ -124,10 +135,12 @@ class Car(RobotModel):
         return cost.speed_weight, 0.25 * cost.speed_weight / self.max_curvature**2
 
     def speed_limits(self) -> tuple[float, float]:  # noqa: D102
-        return self.max_speed, self.max_speed * self.max_curvature
+        speed = magnitude(self.interval("speed"))
+        return speed, speed * self.max_curvature
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
-        return curved_moves(cell, speed_weight, 1.0 / self.max_curvature, 0.0)
+        radius = 1.0 / self.max_curvature
+        return curved_moves(cell, speed_weight, (radius, radius), modes=driving_modes(self.interval("speed")))
 
     def max_lattice_cell(self) -> float:  # noqa: D102
         return MAX_LATTICE_CELL / self.max_curvature

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.robots.arcs import advance_arc
-from leapnav.envs.robots.base import ADVANCE_SIGNATURE, CostWeights, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.robots.base import (
+    ADVANCE_SIGNATURE,
+    CostWeights,
+    Dynamics,
+    RobotModel,
+    Symmetry,
+    magnitude,
+    register,
+)
+from leapnav.envs.robots.moves import Moves, curved_moves, driving_modes, rotating_moves
 from leapnav.envs.robots.unicycle import POSE_LABELS
-from leapnav.envs.utils.records import Positive
+from leapnav.envs.utils.records import Interval, Positive
 
 
 @kernel(ADVANCE_SIGNATURE)
@@ -29,7 +39,8 @@ class DifferentialDrive(RobotModel):
     Args:
         model: "differential_drive".
         radius, footprint: see `RobotModel`.
-        max_wheel_speed: largest speed of each wheel (m/s), forwards and backwards.
+        max_wheel_speed, wheel_speed: largest speed of each wheel (m/s), forwards and backwards, or instead (lowest,
+            highest).
         track: distance between the wheels (m).
 
     """
@@ -42,9 +53,11 @@ class DifferentialDrive(RobotModel):
     reversal: ClassVar[Symmetry | None] = Symmetry((), ((0, -1), (-1, 0)))
     key_controls: ClassVar[tuple[tuple[float, ...], tuple[float, ...]] | None] = ((1, 1), (-1, 1))
     is_kinematic: ClassVar[bool] = True
+    limited: ClassVar[tuple[str, ...]] = ("wheel_speed",)
 
     model: Literal["differential_drive"] = "differential_drive"
     max_wheel_speed: Positive = 2.0
+    wheel_speed: Interval | None = None
     track: Positive = 0.4
 
     @classmethod
@@ -63,8 +76,8 @@ class DifferentialDrive(RobotModel):
             labels=(*POSE_LABELS, "left wheel (m/s)", "right wheel (m/s)"),
         )
 
-    def limits(self) -> tuple[float, ...]:  # noqa: D102
-        return self.max_wheel_speed, self.max_wheel_speed
+    def limits(self) -> Sequence[tuple[float, float]]:  # noqa: D102
+        return [self.interval("wheel_speed")] * 2
 
     def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
         return cost.speed_weight / 2, cost.speed_weight / 2
@@ -76,4 +89,16 @@ class DifferentialDrive(RobotModel):
         return cost.speed_weight, cost.speed_weight * self.track**2 / 4
 
     def speed_limits(self) -> tuple[float, float]:  # noqa: D102
-        return self.max_wheel_speed, 2 * self.max_wheel_speed / self.track
+        low, high = self.interval("wheel_speed")
+        return magnitude((low, high)), (high - low) / self.track
+
+    def slowest_speed(self) -> float:  # noqa: D102
+        low, high = self.interval("wheel_speed")
+        return max(low, -high, 0.0)
+
+    def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
+        low, high = self.interval("wheel_speed")
+        if low < 0.0 < high:
+            return rotating_moves(cell, speed_weight, turn_weight)
+        radius = abs(high + low) / (high - low) * self.track / 2  # with one wheel at each limit
+        return curved_moves(cell, speed_weight, (radius, radius), modes=driving_modes((low, high)))

@@ -21,7 +21,7 @@ from leapnav.envs.robots.base import (
     register,
 )
 from leapnav.envs.robots.unicycle import POSE_LABELS
-from leapnav.envs.utils.records import Positive
+from leapnav.envs.utils.records import Interval, Positive
 
 
 @kernel(ADVANCE_SIGNATURE)
@@ -60,8 +60,8 @@ class DynamicUnicycle(RobotModel):
     Args:
         model: "dynamic_unicycle".
         radius, footprint: see `RobotModel`.
-        max_acceleration: largest acceleration (m/s^2) along the heading.
-        max_angular_acceleration: largest angular acceleration (rad/s^2).
+        max_acceleration, acceleration: largest acceleration (m/s^2) along the heading, or instead (lowest, highest).
+        max_angular_acceleration, angular_acceleration: largest angular acceleration (rad/s^2), or (lowest, highest).
         acceleration_weight: cost weight of the squared acceleration.
         angular_acceleration_weight: cost weight of the squared angular acceleration.
 
@@ -77,10 +77,13 @@ class DynamicUnicycle(RobotModel):
     state_cost: ClassVar = state_cost
     mirror: ClassVar[Symmetry | None] = Symmetry((1, -1), ((1, 0), (0, -1)))
     reversal: ClassVar[Symmetry | None] = Symmetry((-1, 1), ((-1, 0), (0, 1)))
+    limited: ClassVar[tuple[str, ...]] = ("acceleration", "angular_acceleration")
 
     model: Literal["dynamic_unicycle"] = "dynamic_unicycle"
     max_acceleration: Positive = 3.0
+    acceleration: Interval | None = None
     max_angular_acceleration: Positive = 12.0
+    angular_acceleration: Interval | None = None
     acceleration_weight: Positive = 0.1
     angular_acceleration_weight: Positive = 0.02
 
@@ -99,9 +102,6 @@ class DynamicUnicycle(RobotModel):
             state_cost=(speed_weight * v**2 + turn_weight * omega**2) / 2,
             labels=(*POSE_LABELS, *labels),
         )
-
-    def limits(self) -> tuple[float, ...]:  # noqa: D102
-        return self.max_acceleration, self.max_angular_acceleration
 
     def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
         return self.acceleration_weight, self.angular_acceleration_weight

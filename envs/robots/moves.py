@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
@@ -15,17 +17,19 @@ DIRECTIONS = np.concatenate([_QUADRANT @ np.linalg.matrix_power(_QUARTER_TURN, k
 ANGLES = np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]) % (2 * np.pi)
 HEADINGS = len(ANGLES)
 SIMPSON = np.array([1.0, 4.0, 1.0])
+N_MOVES_PER_MODE = 5  # of `rotating_moves`: those ahead, those backwards, and then the rotations
 
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """Motion primitives of a robot, the same number `count` from each heading. The reverse of a move is a move, too.
+    """Motion primitives of a robot, the same number `count` from each heading.
 
     Attributes:
         targets: (HEADINGS, count, 3), int64: cells in x, cells in y, heading steps.
         points: (HEADINGS, count, P, 2), int64: offsets (half cells) of the points at which the speed of the metric is
             evaluated, from the start of the move to its end.
-        rotating: whether these are the moves of `rotating_moves`.
+        rotating: whether these are all moves of `rotating_moves`.
+        reversible: whether the reverse of each move is also one.
         weights: (HEADINGS, count, P), weights of these speeds: the length of the move, in the units of sqrt(cost * s),
             times the weights of Simpson's rule on each of its straight parts.
 
@@ -35,11 +39,31 @@ class Moves:
     points: np.ndarray
     weights: np.ndarray
     rotating: bool = False
+    reversible: bool = True
+
+    def reverse(self) -> Moves:
+        """Return the reverses of all moves, which lead from their ends to their starts."""
+        if self.reversible:
+            return self
+        targets, points, weights = (np.empty_like(array) for array in (self.targets, self.points, self.weights))
+        for heading in range(HEADINGS):
+            for move, (dx, dy, change) in enumerate(self.targets[heading].tolist()):
+                other = (heading + change) % HEADINGS
+                targets[other, move] = -dx, -dy, -change
+                points[other, move] = (self.points[heading, move] - (2 * dx, 2 * dy))[::-1]
+                weights[other, move] = self.weights[heading, move, ::-1]
+        targets.flags.writeable = False
+        return Moves(targets, np.ascontiguousarray(points), weights, reversible=False)
 
     @property
     def border(self) -> int:
         """Largest number of cells that a move covers in x or y."""
         return int(np.abs(self.points).max() + 1) // 2
+
+
+def driving_modes(speed: tuple[float, float]) -> tuple[Literal[1, -1], ...]:
+    """Return the modes, 1 ahead and -1 backwards, that an interval of speeds contains."""
+    return (*((1,) if speed[1] > 0 else ()), *((-1,) if speed[0] < 0 else ()))
 
 
 def turn_angle(heading: int, change: int) -> float:
@@ -48,7 +72,9 @@ def turn_angle(heading: int, change: int) -> float:
     return min(turn, 2.0 * math.pi - turn)
 
 
-def rotating_moves(cell: float, speed_weight: float, turn_weight: float) -> Moves:
+def rotating_moves(
+    cell: float, speed_weight: float, turn_weight: float, modes: Sequence[Literal[1, -1]] = (1, -1)
+) -> Moves:
     """Return the moves of a robot that can rotate in place.
 
     Forward and backward: straight, or with one heading step to either side, along the old or the new heading. Each of
@@ -58,12 +84,21 @@ def rotating_moves(cell: float, speed_weight: float, turn_weight: float) -> Move
         cell: side of a cell (m).
         speed_weight: weight of the squared speed.
         turn_weight: weight of the squared turn rate.
+        modes: 1 for moves ahead, -1 for moves backwards.
 
     """
-    targets, points, squares, turns = _rotating_table()
+    table = _rotating_table()
+    chosen = [k for k in range(table[0].shape[1]) if len(modes) == 2 or not _is_in_mode(k, -modes[0])]
+    targets, points, squares, turns = (np.ascontiguousarray(array[:, chosen]) for array in table)
     lengths = np.sqrt(speed_weight * squares * cell * cell + turn_weight * turns * turns)
     targets.flags.writeable = False
-    return Moves(targets, points, (lengths / 6.0)[:, :, None] * SIMPSON, rotating=True)
+    weights = (lengths / 6.0)[:, :, None] * SIMPSON
+    return Moves(targets, points, weights, rotating=len(modes) == 2, reversible=len(modes) == 2)
+
+
+def _is_in_mode(move: int, mode: int) -> bool:
+    """Return whether a row of `_rotating_table` is a move ahead (1) or backwards (-1)."""
+    return move < 2 * N_MOVES_PER_MODE and (move < N_MOVES_PER_MODE) == (mode == 1)
 
 
 @cache
@@ -88,7 +123,13 @@ ROTATING_MOVES = _rotating_table()[0]
 ROTATING_MOVES.flags.writeable = False
 
 
-def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: float) -> Moves:
+def curved_moves(
+    cell: float,
+    speed_weight: float,
+    radii: tuple[float, float],
+    turn_length: float = 0.0,
+    modes: Sequence[Literal[1, -1]] = (1, -1),
+) -> Moves:
     """Return the moves of a robot with a minimum turning radius.
 
     Forward and backward: straight, or along the old and then along the new heading, both so far that an arc of the
@@ -97,19 +138,20 @@ def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: f
     Args:
         cell: side of a cell (m).
         speed_weight: weight of the squared speed.
-        radius: minimum turning radius (m).
+        radii: minimum turning radii (m) of anticlockwise and clockwise rotations.
         turn_length: length in the metric that a heading step adds (steering).
+        modes: 1 for moves ahead, -1 for moves backwards.
 
     """
     steps: list[list[list[tuple[int, int]]]] = []
-    changes = [0, 0, 1, 1, -1, -1]
+    changes = [change for change in (0, 1, -1) for _ in modes]
     for heading in range(HEADINGS):
         rows = []
         for change in (0, 1, -1):
-            for mode in (1, -1):
+            for mode in modes:
                 path = [tuple((mode * DIRECTIONS[heading]).tolist())]
                 if change:
-                    leg = radius * math.tan(turn_angle(heading, change) / 2.0)
+                    leg = radii[0 if change > 0 else 1] * math.tan(turn_angle(heading, change) / 2.0)
                     path = []
                     for k in (heading, (heading + change) % HEADINGS):
                         count = max(1, math.ceil(leg / (cell * math.hypot(*DIRECTIONS[k])) - 1e-9))
@@ -133,4 +175,4 @@ def curved_moves(cell: float, speed_weight: float, radius: float, turn_length: f
             for k, length in enumerate(lengths.tolist()):
                 weights[heading, move, 2 * k : 2 * k + 3] += length / 6.0 * SIMPSON
     targets.flags.writeable = False
-    return Moves(targets, points, weights)
+    return Moves(targets, points, weights, reversible=len(modes) == 2 and radii[0] == radii[1])

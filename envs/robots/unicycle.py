@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
+
+from pydantic import model_validator
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.robots.arcs import advance_arc
-from leapnav.envs.robots.base import ADVANCE_SIGNATURE, CostWeights, Dynamics, RobotModel, Symmetry, register
-from leapnav.envs.utils.records import Positive
+from leapnav.envs.robots.base import (
+    ADVANCE_SIGNATURE,
+    CostWeights,
+    Dynamics,
+    RobotModel,
+    Symmetry,
+    magnitude,
+    register,
+)
+from leapnav.envs.robots.moves import Moves, curved_moves, driving_modes, rotating_moves
+from leapnav.envs.utils.records import Interval, Positive
 
 POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
 
@@ -27,8 +38,9 @@ class Unicycle(RobotModel):
     Args:
         model: "unicycle".
         radius, footprint: see `RobotModel`.
-        max_speed: largest speed (m/s), forwards and backwards.
-        max_turn_rate: largest turn rate (rad/s), to either side.
+        max_speed, speed: largest speed (m/s), forwards and backwards, or instead (lowest, highest) speed. With a
+            positive lowest speed the robot can neither stop nor reverse nor rotate in place.
+        max_turn_rate, turn_rate: largest turn rate (rad/s), to either side, or instead (lowest, highest).
 
     """
 
@@ -38,10 +50,13 @@ class Unicycle(RobotModel):
     mirror: ClassVar[Symmetry | None] = Symmetry((), ((1, 0), (0, -1)))
     reversal: ClassVar[Symmetry | None] = Symmetry((), ((-1, 0), (0, 1)))
     is_kinematic: ClassVar[bool] = True
+    limited: ClassVar[tuple[str, ...]] = ("speed", "turn_rate")
 
     model: Literal["unicycle"] = "unicycle"
     max_speed: Positive = 2.0
+    speed: Interval | None = None
     max_turn_rate: Positive = 3.0
+    turn_rate: Interval | None = None
 
     @classmethod
     def dynamics(cls) -> Dynamics:  # noqa: D102 (the interface is documented in the base class)
@@ -55,11 +70,22 @@ class Unicycle(RobotModel):
             labels=(*POSE_LABELS, "$v$ (m/s)", r"$\omega$ (rad/s)"),
         )
 
-    def limits(self) -> tuple[float, ...]:  # noqa: D102
-        return self.max_speed, self.max_turn_rate
+    @model_validator(mode="after")
+    def _check_turn_rate(self) -> Self:
+        low, high = self.interval("turn_rate")
+        if not low < 0.0 < high:
+            raise ValueError(f"turn_rate: expected an interval that contains 0 inside, got {[low, high]}")
+        return self
 
     def control_weight(self, cost: CostWeights) -> tuple[float, ...]:  # noqa: D102
         return cost.speed_weight, cost.turn_weight
 
     def speed_limits(self) -> tuple[float, float]:  # noqa: D102
-        return self.max_speed, self.max_turn_rate
+        return magnitude(self.interval("speed")), magnitude(self.interval("turn_rate"))
+
+    def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
+        speed, (right, left) = self.interval("speed"), self.interval("turn_rate")
+        slowest = self.slowest_speed()
+        if slowest == 0.0:
+            return rotating_moves(cell, speed_weight, turn_weight, driving_modes(speed))
+        return curved_moves(cell, speed_weight, (slowest / left, -slowest / right), modes=driving_modes(speed))

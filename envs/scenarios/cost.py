@@ -28,8 +28,9 @@ class Cost(Frozen):
 
 
 def cruise_speed(robot: RobotModel, cost: Cost) -> float:
-    """Return the speed (m/s) at which c = 1/2 speed_weight v^2, at most the limit of the robot.
+    """Return the speed (m/s) at which c = 1/2 speed_weight v^2, within the limits of the robot.
 
     An optimum with a free horizon has H = 0, hence this speed on a straight line without obstacles.
     """
-    return min(math.sqrt(2.0 * cost.time_weight / robot.metric(cost)[0]), robot.speed_limits()[0])
+    optimal = math.sqrt(2.0 * cost.time_weight / robot.metric(cost)[0])
+    return min(max(optimal, robot.slowest_speed()), robot.speed_limits()[0])

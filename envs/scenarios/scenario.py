@@ -38,14 +38,16 @@ class Task(NamedTuple):
 
     Attributes:
         start, goal (n,): states at time 0 and at the end; NaN for a state that is free at the goal.
-        limits, weights (m,): limits of the controls, and weights of their squares in the running cost.
+        middles, halves (m,): middles and half widths of the intervals of the controls.
+        weights (m,): weights of the squared controls in the running cost.
         parameters (p,): parameters of the robot's model.
 
     """
 
     start: np.ndarray
     goal: np.ndarray
-    limits: np.ndarray
+    middles: np.ndarray
+    halves: np.ndarray
     weights: np.ndarray
     parameters: np.ndarray
 
@@ -202,7 +204,8 @@ class Scenario(Frozen):
             message = f"cost.time_weight: environments and banks with a fixed horizon need 0, got {cost.time_weight:g}"
             raise ScenarioError(one_line(self.name, [message]))
         goal = [math.nan if value is None else value for value in self.goal_state]
-        vectors = self.start_state, goal, robot.limits(), robot.control_weight(cost), robot.parameters(cost)
+        weights, parameters = robot.control_weight(cost), robot.parameters(cost)
+        vectors = self.start_state, goal, *robot.action_scale(), weights, parameters
         for array in (task := Task(*(np.array(vector, dtype=float) for vector in vectors))):
             array.flags.writeable = False
         return task

@@ -69,7 +69,8 @@ class BatchSimulator:
             states=self.states,
             controls=np.zeros((count, m)),
             goals=np.zeros((count, n)),
-            limits=np.zeros((count, m)),
+            middles=np.zeros((count, m)),
+            halves=np.zeros((count, m)),
             weights=np.zeros((count, m)),
             parameters=np.zeros((count, 0)),
             discs=np.zeros((count, 1, 2)),
@@ -137,7 +138,7 @@ class BatchSimulator:
         self.layout.actions[indices] = 0.0
         for i, scenario, reference in zip(indices.tolist(), scenarios, references, strict=True):
             self.fields[i], task, discs = scenario.field, scenario.task, scenario.discs
-            self.states[i], sim.goals[i], sim.limits[i], sim.weights[i], sim.parameters[i] = task
+            self.states[i], sim.goals[i], sim.middles[i], sim.halves[i], sim.weights[i], sim.parameters[i] = task
             sim.discs[i], sim.discs[i, : len(discs)] = 0.0, discs
             self.episodes["horizon"][i] = scenario.episode_limit
             self.episodes["time_weight"][i] = scenario.cost.time_weight

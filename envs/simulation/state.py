@@ -138,7 +138,8 @@ class Simulation(NamedTuple):
         states (count, n): x, y (m), heading (rad, unwrapped) and further states of the robots.
         controls (count, m): of the period, with actuation noise.
         goals (count, n): NaN for a state that is free at the goal.
-        limits, weights (count, m): limits of the controls, and weights of their squares.
+        middles, halves (count, m): middles and half widths of the intervals of the controls.
+        weights (count, m): weights of the squared controls.
         parameters (count, p): parameters of the robots' model.
         discs (count, D, 2): footprints of at most D discs, each with its offset along the heading and its radius (m),
             which is 0 if the disc is unused.
@@ -155,7 +156,8 @@ class Simulation(NamedTuple):
     states: np.ndarray
     controls: np.ndarray
     goals: np.ndarray
-    limits: np.ndarray
+    middles: np.ndarray
+    halves: np.ndarray
     weights: np.ndarray
     parameters: np.ndarray
     discs: np.ndarray
@@ -172,7 +174,8 @@ SIMULATION = record_type(
     states=MATRIX,
     controls=MATRIX,
     goals=MATRIX,
-    limits=MATRIX,
+    middles=MATRIX,
+    halves=MATRIX,
     weights=MATRIX,
     parameters=MATRIX,
     discs=CUBE,

@@ -127,7 +127,7 @@ def _begin_periods(actions, active, sim):
             continue
         episode.duration = max(min(settings.control_period, episode.horizon - episode.time), 0.0)
         for j in range(len(controls)):
-            controls[j] = min(max(actions[i, j], -1.0), 1.0) * sim.limits[i, j]
+            controls[j] = sim.middles[i, j] + min(max(actions[i, j], -1.0), 1.0) * sim.halves[i, j]
         if settings.disturbance.actuation != 0.0 or settings.disturbance.slip != 0.0:
             _disturb(sim, i, controls)
     return -1
@@ -172,7 +172,7 @@ def drive(actions, active, packed, addresses):
     """Drive robots without motors for a period, up to the first contact, and add the running cost.
 
     Args:
-        actions (count, m): the controls divided by their limits.
+        actions (count, m): from -1 to 1, the lowest to the highest controls.
         active (count,): the robots that drive.
         packed: the episodes.
         addresses: see `motion_at`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 # Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
 MAX_MAGNITUDE = 1e6
@@ -12,6 +12,15 @@ Finite = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE, allow_inf_n
 Positive = Annotated[float, Field(gt=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=MAX_MAGNITUDE, allow_inf_nan=False)]
 Point = tuple[Finite, Finite]
+
+
+def _check_interval(interval: tuple[float, float]) -> tuple[float, float]:
+    if not interval[0] < interval[1]:
+        raise ValueError("expected (lowest, highest) with lowest < highest")
+    return interval
+
+
+Interval = Annotated[tuple[Finite, Finite], AfterValidator(_check_interval)]
 
 
 class Frozen(BaseModel):

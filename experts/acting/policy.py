@@ -58,7 +58,7 @@ def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) 
     controls = extremal.evaluate(middles)[1]
     if scenario.robot.sizes()[0] > 3:  # Simpson's rule
         controls = (extremal.evaluate(starts)[1] + 4.0 * controls + extremal.evaluate(ends)[1]) / 6.0
-    return (controls / scenario.robot.limits()).astype(np.float32)
+    return scenario.robot.actions(controls).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ class _Robot:
 
     scenario: Scenario
     time: float
-    limits: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
     feedback: Feedback
     gains: Gains | None
     solved: bool = False
@@ -251,7 +252,7 @@ class ExpertPolicy:
             if self._feedback == "resolve":
                 robot.solved = robot.feedback.update(situation.state, situation.time)
             control = robot.feedback.control(situation.time + ahead)
-        return control / robot.limits
+        return (control - robot.middle) / robot.half
 
     def _robot(self, i: int, situation: _Situation) -> _Robot:
         """The solution of a robot's episode; a new episode is looked up or solved."""
@@ -275,8 +276,7 @@ class ExpertPolicy:
             gains = feedback.gains() if self._feedback == "gains" else None
         except (ValueError, FloatingPointError) as error:
             raise NoOptimumError(str(error), scenario) from None
-        limits = np.array(scenario.robot.limits())
-        robot = _Robot(scenario, situation.time, limits, feedback, gains)
+        robot = _Robot(scenario, situation.time, *scenario.robot.action_scale(), feedback, gains)
         self._robots[i] = robot
         return robot
 

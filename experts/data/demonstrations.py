@@ -130,7 +130,7 @@ def demonstrate_disturbed(
     inner = env.unwrapped
     assert isinstance(inner, NavigateEnv)
     feedback = Feedback(scenario, extremal)
-    limits = scenario.robot.limits()
+    robot = scenario.robot
     costates, costs = [], []
 
     def label() -> None:
@@ -145,8 +145,8 @@ def demonstrate_disturbed(
     def decide(step: int) -> tuple[np.ndarray, np.ndarray]:
         label()
         ahead = min(inner.control_period, scenario.episode_limit - inner.time) / 2
-        action = np.clip(feedback.control(inner.time + ahead) / limits, -1.0, 1.0).astype(np.float32)
-        executed = np.clip(action + noise * rng.standard_normal(len(limits)), -1.0, 1.0).astype(np.float32)
+        action = np.clip(robot.actions(feedback.control(inner.time + ahead)), -1.0, 1.0).astype(np.float32)
+        executed = np.clip(action + noise * rng.standard_normal(len(action)), -1.0, 1.0).astype(np.float32)
         return action, executed
 
     driven = _drive(env, scenario, decide)
@@ -304,7 +304,7 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
     steps = len(demonstration.actions)
     terminations = np.zeros(steps, dtype=bool)
     terminations[-1] = True
-    controls = demonstration.actions * np.array(demonstration.scenario.robot.limits())
+    controls = demonstration.scenario.robot.controls(demonstration.actions)
     return EpisodeBuffer(
         id=number,
         seed=demonstration.seed,

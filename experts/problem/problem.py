@@ -186,7 +186,7 @@ class OptimalControlProblem:
             horizon=scenario.horizon,
             control_weight=robot.control_weight(cost),
             state_cost=state_cost_of(type(robot)),
-            control_bounds=tuple((-limit, limit) for limit in robot.limits()),
+            control_bounds=[(low, high) for low, high in robot.control_bounds().tolist()],
             field=scenario.field,
             parameters=robot.parameters(cost),
             footprint=None if robot.footprint is None else tuple(map(tuple, scenario.discs.tolist())),

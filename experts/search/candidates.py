@@ -233,7 +233,9 @@ class CandidateSearch:
         bound = cell_costs(metric, seeds)
         fraction = self._fraction
         limits = Limits(1.0 + fraction * (self._reach - 1.0), fraction * self.slack, math.inf)
-        cost_behind, behind, limit = tree(metric, ends, seeds, bound, False, limits)
+        moves = self.lattice.moves.reverse()
+        back = metric._replace(targets=moves.targets, points=moves.points, weights=moves.weights)
+        cost_behind, behind, limit = tree(back, ends, seeds, bound, False, limits)
         cost_ahead, ahead, _ = tree(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
         self._meetings, self.limit = self._meet(limit), limit
@@ -263,6 +265,10 @@ class CandidateSearch:
         durations = lengths / np.sqrt(2 * (energy + phi))
         if horizon is None:
             durations = np.maximum(durations, LIMIT_MARGIN * shortest_durations(poses, self.lattice.scenario))
+            slowest = self.lattice.scenario.robot.slowest_speed()
+            if slowest > 0.0:
+                steps = np.diff(poses[:, :2], axis=0)
+                durations = np.minimum(durations, np.hypot(steps[:, 0], steps[:, 1]) / (LIMIT_MARGIN * slowest) + 1e-9)
         times = np.concatenate([[0.0], np.cumsum(durations)])
         cost = float(self._from_start.cost[node] + self._to_goal.cost[node])
         return Candidate(times if horizon is None else times * (horizon / times[-1]), poses, cost, nodes)
@@ -299,10 +305,12 @@ def _plane_distance(lattice: Lattice, energy: float) -> float:
 def metric_of(lattice: Lattice, energy: float) -> Metric:
     """Return the metric of a lattice for a given E."""
     speed, moves = np.sqrt(2.0 * (energy + lattice.phi)), lattice.moves
-    fastest = math.sqrt(lattice.weights[0]) * lattice.scenario.robot.speed_limits()[0]
-    if lattice.scenario.horizon is None and fastest < math.inf:
-        # At the speed limit, which is below the optimal speed there, a path costs (c + Phi) / v + r_v v / 2 per m.
-        speed = np.where(speed > fastest, 0.5 * (speed**2 / fastest + fastest), speed)
+    robot, unit = lattice.scenario.robot, math.sqrt(lattice.weights[0])
+    slowest, fastest = unit * robot.slowest_speed(), unit * robot.speed_limits()[0]
+    if lattice.scenario.horizon is None and (slowest > 0.0 or fastest < math.inf):
+        # At a speed limit v beyond which the optimal speed would be, a path costs (c + Phi) / v + r_v v / 2 per m.
+        limited = np.clip(speed, slowest, fastest)
+        speed = np.where(speed != limited, 0.5 * (speed**2 / limited + limited), speed)
     plane = speed[0] if len(speed) == 1 else speed.min(axis=0)
     return Metric(speed, plane, lattice.cell, *lattice.weights, moves.targets, moves.points, moves.weights)
 

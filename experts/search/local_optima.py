@@ -124,7 +124,7 @@ class LocalOptima:
         self._relaxed_weight, self._budget = RELAXED_WEIGHT * energy, budget
         self._radius = float(scenario.discs[:, 1].min())
         self._lift = Lifting(scenario, self.problem, self._relaxed_weight)
-        self._limits = np.array(scenario.robot.limits())
+        self._bounds = scenario.robot.control_bounds()
         self._duplicate_distance = DUPLICATE_DISTANCE * min(
             1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE
         )
@@ -231,7 +231,8 @@ class LocalOptima:
 
     def _is_limited(self, path: DirectPath) -> bool:
         """Return whether controls are at their limits somewhere on a path."""
-        return bool((np.abs(path.controls) > (1.0 - LIMIT_TOLERANCE) * self._limits).any())
+        slack = LIMIT_TOLERANCE * np.abs(self._bounds).max(axis=1)
+        return bool(((path.controls < self._bounds[:, 0] + slack) | (path.controls > self._bounds[:, 1] - slack)).any())
 
     def _judge(self, problem: OptimalControlProblem, direct: DirectPath) -> Verdict:
         """Compute the extremal of a direct path, unless the path is a duplicate or unlikely to lead to a useful one."""

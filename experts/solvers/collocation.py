@@ -31,7 +31,6 @@ MAX_NODES = 5_000
 # Entries of the Jacobian beyond which the iteration has diverged. SuperLU, which solve_bvp uses, overflows for matrices
 # with larger entries, and the BLAS then prints messages about illegal arguments.
 MAX_ENTRY = 1e30
-MAX_POLISHED_SEGMENTS = 128
 # Exit codes of solve_bvp.
 STATUS = {0: Status.SUCCESS, 1: Status.MAX_ITERATIONS, 2: Status.SINGULAR, 3: Status.STALLED}
 
@@ -104,12 +103,8 @@ def collocation(problem: OptimalControlProblem, path: Trajectory, options: Solve
     history = (Iteration("collocation", len(mesh) - 1, _cost(problem, mesh, nodes), residual),)
     if status is not Status.SUCCESS or not options.polish:
         return certify(problem, mesh, nodes, status, history, evaluations)
-    # Every k-th node of the mesh, which solve_bvp refined where the path needs it.
-    every = -(-(len(mesh) - 1) // MAX_POLISHED_SEGMENTS)
-    chosen = np.unique(np.append(np.arange(0, len(mesh), every), len(mesh) - 1))
-    times, nodes = mesh[chosen], nodes[chosen]
-    status, rows, count = polish(problem, times, nodes, options.tol, options.max_iterations)
-    return confirm(problem, times, nodes, status, (*history, *rows), evaluations + count, options)
+    status, rows, count = polish(problem, mesh, nodes, options.tol, options.max_iterations)
+    return confirm(problem, mesh, nodes, status, (*history, *rows), evaluations + count, options)
 
 
 def _cost(problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray) -> float:

@@ -44,7 +44,8 @@ def start_nodes(
     Args:
         problem: the problem.
         path: the path; its costates are estimated if it has none. Its duration is the guess of a free horizon.
-        segments: number of segments of equal duration, or the times (segments + 1,) of the nodes.
+        segments: number of segments, each with the same number of points of the path, or the times (segments + 1,) of
+            the nodes.
 
     Returns:
         Times (segments + 1,) and nodes (segments + 1, 2n).
@@ -53,7 +54,8 @@ def start_nodes(
         ValueError: the path has another number of states.
 
     """
-    times = np.linspace(0.0, problem.horizon_of(path), segments + 1) if isinstance(segments, int) else segments
+    times = _spread(path.times, segments + 1) if isinstance(segments, int) else segments
+    times[0], times[-1] = 0.0, problem.horizon_of(path)
     resampled = path.resample(times)
     if resampled.states.shape[1] != problem.system.n:
         raise ValueError(f"states: expected {problem.system.n} columns, got {resampled.states.shape[1]}")
@@ -66,6 +68,11 @@ def start_nodes(
     return times, nodes
 
 
+def _spread(times: np.ndarray, count: int) -> np.ndarray:
+    """Return times between which there are equal numbers of the given ones."""
+    return np.interp(np.linspace(0.0, len(times) - 1.0, count), np.arange(len(times)), times)
+
+
 def default_segments(path: Trajectory) -> int:
     """Return the larger of one segment per 0.5 s and one per two points of a lattice path (0.4 to 0.7 m)."""
     return int(np.clip(max(len(path.times) / 2, path.times[-1] / 0.5), MIN_SEGMENTS, MAX_SEGMENTS))
@@ -75,6 +82,8 @@ def path_of(
     problem: OptimalControlProblem, extremal: Extremal, options: SolverOptions
 ) -> tuple[Trajectory, SolverOptions]:
     """Return an extremal as the initial path of a problem, and options with its number of segments.
+
+    The points of the path are as dense as the steps of the integrator.
 
     Raises:
         ValueError: the extremal has no path, or another number of states.
@@ -87,8 +96,8 @@ def path_of(
         raise ValueError(f"guess: the extremal has {n} states, the problem {expected}")
     if options.segments is None and extremal.n_nodes > 2:
         options = replace(options, segments=extremal.n_nodes - 1)
-    points = POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1
-    values = extremal.interpolate(np.linspace(0.0, extremal.times[-1], points))
+    times = _spread(extremal.times, POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1)
+    values = extremal.interpolate(times)
     # If the horizons differ, time is scaled.
-    duration = float(extremal.times[-1]) if problem.horizon is None else problem.horizon
-    return Trajectory(np.linspace(0.0, duration, points), values[:, :n], values[:, n:]), options
+    factor = 1.0 if problem.horizon is None else problem.horizon / float(extremal.times[-1])
+    return Trajectory(factor * times, values[:, :n], values[:, n:]), options

@@ -14,6 +14,8 @@ from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.solvers.newton import CONVERGED, solve_arc
 
+# Largest distance of the end of an arc that was not found from its target, relative to the distance of the two nodes.
+MAX_MISS = 0.1
 MIN_FRACTION = 0.05  # smallest distance in time of a node from its neighbours, relative to the sub-problem's duration
 MIN_HALF_COST_STEPS = 16  # smallest number of integration steps of the search for half of the cost
 
@@ -83,28 +85,39 @@ def measure_defects(flow, path, end, accuracy):
     return states, costates, evaluations
 
 
+@kernel(boolean(VECTOR, VECTOR, VECTOR, int64))
+def _is_close(end, target, start, n):
+    """Return whether an arc from `start` ends close to its target, compared with the distance of the two."""
+    error, length = 0.0, 0.0
+    for i in range(n):
+        error += (end[i] - target[i]) ** 2
+        length += (target[i] - start[i]) ** 2
+    return error <= MAX_MISS**2 * length
+
+
 @kernel(tuple_of(int64, int64)(FLOW, ARC_PATH, END_CONDITION, NEWTON_OPTIONS))
 def connect(flow, path, end, options):
     """Make a path feasible: solve for each arc separately, with the costates at the nodes as initial guess.
 
-    If that fails, the final costate of the arc before is tried. Fills the costs of the arcs. Returns (number of arcs
-    that were not found, evaluations of the flow).
+    If that fails, the final costate of the arc before is tried. If that fails too, an inner node moves to the end of
+    the arc, if that is close: a node that is computed only approximately is beyond reach where the controls are at
+    their bounds. Fills the costs of the arcs. Returns (number of arcs that were not found, evaluations of the flow).
     """
     times, Z, costs = path.times, path.nodes, path.costs
     n = len(end.goal)
     p = len(times) - 1
     arrival, before, z = Z[0].copy(), np.empty(n), np.empty(2 * n)
+    none = np.empty((2 * n, 0))
     failed, evaluations = 0, 0
     for k in range(p):
         costs[k] = np.inf
-        condition = _condition(end, k == p - 1)
+        condition, duration = _condition(end, k == p - 1), times[k + 1] - times[k]
         for i in range(n):
             before[i] = arrival[n + i]
         for attempt in range(2):
             for i in range(n):
                 z[i] = Z[k, i]
                 z[n + i] = before[i] if attempt == 1 else Z[k, n + i]
-            duration = times[k + 1] - times[k]
             status, cost, count = _solve_arc(flow, z, Z[k + 1], condition, duration, options, arrival)
             evaluations += count
             if status == CONVERGED:
@@ -115,6 +128,15 @@ def connect(flow, path, end, options):
                         Z[p, i] = arrival[i]
                 break
         else:
+            for i in range(2 * n):
+                arrival[i] = Z[k, i]
+            success, cost, _, _, count = propagate(flow, arrival, none, duration, options.accuracy, 0.0, False)
+            evaluations += count
+            if success and k < p - 1 and _is_close(arrival, Z[k + 1], Z[k], n):
+                costs[k] = cost
+                for i in range(n):
+                    Z[k + 1, i] = arrival[i]
+                continue
             failed += 1
             for i in range(2 * n):
                 arrival[i] = Z[k + 1, i]

@@ -182,7 +182,7 @@ def check_accepted(bank, arrays, original):
     for i, (scenario, text) in enumerate(zip(bank, texts_of(arrays), strict=True)):
         assert scenario == Scenario.from_json(text)
         found, expected = bank.reference(i), original.reference(i)
-        weights, limits = scenario.robot.control_weight(scenario.cost), scenario.robot.limits()
+        weights, limits = scenario.robot.control_weight(scenario.cost), scenario.robot.action_scale()[1]
         step = np.abs(np.diff(expected.states, axis=0)).max(axis=0)
         assert (np.abs(found.states - expected.states) <= step + 1e-5).all()
         for k, ends in ((0, scenario.start_state), (-1, scenario.goal_state)):

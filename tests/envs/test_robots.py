@@ -84,7 +84,7 @@ def test_every_model_of_the_package_is_tested():
 @each_robot
 def test_the_simulated_motion_is_that_of_the_declared_dynamics(name):
     scenario, rng = task(name), np.random.default_rng(0)
-    rates, limits = rates_of(scenario), np.array(scenario.robot.limits())
+    rates, limits = rates_of(scenario), scenario.robot.action_scale()[1]
     parameters = np.array(scenario.robot.parameters(scenario.cost))
     for h in (0.05, 0.3) if name != "trailer" else (0.05,):
         for _ in range(5):
@@ -100,7 +100,7 @@ def test_the_simulated_motion_is_that_of_the_declared_dynamics(name):
 def test_an_optimum_is_certified_and_satisfies_the_minimum_principle_independently(name, optima):
     optimum, scenario = optima[name], task(name)
     assert optimum.success
-    rates, limits = rates_of(scenario), np.array(scenario.robot.limits())
+    rates, limits = rates_of(scenario), scenario.robot.action_scale()[1]
     # SciPy's integrator with the controls of the optimum arrives at the goal, at the same cost and without contact.
     weights = np.array(scenario.robot.control_weight(scenario.cost))
     times = np.linspace(0.0, scenario.horizon, 4001)

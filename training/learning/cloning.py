@@ -124,9 +124,9 @@ class _Fit:
         check_observations(policy, dataset)
         settings = dataset.settings
         is_map = settings.observation == "map"  # whose rows have no such symmetry
-        can_reverse = settings.model.reversal is not None and dataset.is_reversible and not is_map
+        can_reverse = dataset.is_reversible and not is_map
         self._symmetries = [
-            *([partial(mirror, settings=settings)] if settings.model.mirror is not None and not is_map else []),
+            *([partial(mirror, settings=settings)] if dataset.is_mirrored and not is_map else []),
             *([partial(time_reverse, settings=settings)] if can_reverse else []),
         ]
         beams = settings.lidar_beams if settings.has_lidar else 0

@@ -13,7 +13,7 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from leapnav.envs.robots import RobotModel
+from leapnav.envs.robots import RobotModel, Symmetry
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
@@ -114,9 +114,14 @@ class Dataset:
         return [json.loads(text) for text in self.scenarios]
 
     @property
-    def limits(self) -> np.ndarray:
-        """Limits (N, m) of the controls of each sample's robot, the controls of the action 1."""
-        return self._per_sample([robot.limits() for robot, _ in self._robots])
+    def halves(self) -> np.ndarray:
+        """Half widths (N, m) of the intervals of the controls of each sample's robot: the controls per unit action."""
+        return self._per_sample([robot.action_scale()[1] for robot, _ in self._robots])
+
+    @property
+    def controls(self) -> np.ndarray:
+        """Controls (N, m) of the actions."""
+        return self._per_sample([robot.action_scale()[0] for robot, _ in self._robots]) + self.halves * self.actions
 
     @property
     def weights(self) -> np.ndarray:
@@ -140,8 +145,18 @@ class Dataset:
 
     @property
     def is_reversible(self) -> bool:
-        """Whether all robots have footprints that a rotation by 180 degrees does not change."""
-        return all(bool((robot.discs()[:, 0] == 0.0).all()) for robot, _ in self._robots)
+        """Whether a rotation of all headings by 180 degrees changes neither footprints nor limits of the robots."""
+        return self._has("reversal") and all(bool((robot.discs()[:, 0] == 0.0).all()) for robot, _ in self._robots)
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether a mirror image does not change the limits of the robots."""
+        return self._has("mirror")
+
+    def _has(self, name: str) -> bool:
+        """Whether the model and the limits of all robots have a symmetry."""
+        symmetry: Symmetry | None = getattr(self.settings.model, name)
+        return symmetry is not None and all(robot.has_symmetric_limits(symmetry) for robot, _ in self._robots)
 
     @cached_property
     def _robots(self) -> list[tuple[RobotModel, Cost]]:

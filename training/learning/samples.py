@@ -58,7 +58,7 @@ class Samples:
     def __init__(self, dataset: Dataset, chosen: np.ndarray, device: th.device) -> None:
         self._rows = th.as_tensor(np.flatnonzero(chosen), device=device)
         self._observations = _tensor(dataset.observations, device)
-        columns = dataset.actions, action_slopes(dataset), dataset.weights * dataset.limits**2
+        columns = dataset.actions, action_slopes(dataset), dataset.weights * dataset.halves**2
         self._columns = [_tensor(column, device) for column in columns]
 
     def __len__(self) -> int:
@@ -99,7 +99,7 @@ def _tensor(values: Any, device: th.device) -> th.Tensor:
 def action_slopes(dataset: Dataset) -> np.ndarray:
     """dH/du (N, m) at the expert's actions, per unit of the action; zero for actions that no limit bounds."""
     p = switching_functions(dataset.settings.model, dataset.states, dataset.costates, dataset.parameters)
-    slopes = (p + dataset.weights * dataset.limits * dataset.actions) * dataset.limits
+    slopes = (p + dataset.weights * dataset.controls) * dataset.halves
     # The expert's action belongs to the middle of the control period, the costate to its beginning. Inside the limits
     # the difference of the two is not meaningful, and at a limit dH/du must point outwards.
     limited = (np.abs(dataset.actions) >= SATURATION) & (slopes * dataset.actions < 0)

@@ -194,7 +194,7 @@ class _CriticSamples:
         self._observations, self._actions = _tensor(dataset.observations, device), _tensor(dataset.actions, device)
         self._values = _tensor(factors * dataset.returns, device)
         self._variance = self._values.var().clamp(min=1e-8)
-        self._weights = _tensor(dataset.weights * dataset.limits**2, device)
+        self._weights = _tensor(dataset.weights * dataset.halves**2, device)
         self._slopes, self._factors = _tensor(action_slopes(dataset), device), _tensor(factors, device)
         self._period = period
 

@@ -206,9 +206,10 @@ def _check_states(scenario: Scenario, states: np.ndarray, certified: float) -> N
 def _check_motion(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float) -> None:
     """Check that the states are the motion of the robot under the controls, and that these are within the limits."""
     robot = scenario.robot
-    limits, parameters = np.array(robot.limits()), np.array(robot.parameters(scenario.cost), dtype=float)
-    if not (np.abs(controls) <= limits * (1 + PRECISION)).all():
-        raise ValueError(f"controls: expected at most {limits.tolist()}, the limits of the robot")
+    bounds, parameters = robot.control_bounds(), np.array(robot.parameters(scenario.cost), dtype=float)
+    slack = PRECISION * np.abs(bounds).max(axis=1)
+    if not ((controls >= bounds[:, 0] - slack) & (controls <= bounds[:, 1] + slack)).all():
+        raise ValueError(f"controls: expected values within {bounds.tolist()}, the limits of the robot")
     moved = np.empty_like(states[1:])
     for k, control in enumerate((controls[:-1] + controls[1:]) / 2):
         type(robot).advance(states[k], control, interval, parameters, moved[k])
@@ -220,15 +221,15 @@ def _check_motion(scenario: Scenario, states: np.ndarray, controls: np.ndarray, 
 def _check_costates(scenario: Scenario, states: np.ndarray, controls: np.ndarray, costates: np.ndarray) -> None:
     """Check that the controls minimise the Hamiltonian: u = -b(q)' lambda / weights, within the limits."""
     robot = scenario.robot
-    limits, weights = np.array(robot.limits()), np.array(robot.control_weight(scenario.cost))
+    (low, high), weights = robot.control_bounds().T, np.array(robot.control_weight(scenario.cost))
     parameters = np.array(robot.parameters(scenario.cost), dtype=float)
-    held = np.vstack([np.zeros(len(limits)), np.eye(len(limits))])
+    held = np.vstack([np.zeros(len(low)), np.eye(len(low))])
     moved = np.empty((len(states), len(held), states.shape[1]))
     for state, ends in zip(states, moved, strict=True):
         for action, end in zip(held, ends, strict=True):
             type(robot).advance(state, action, ACTION_TIME, parameters, end)
     slopes = np.einsum("kjn,kn->kj", moved[:, 1:] - moved[:, :1], costates) / ACTION_TIME
-    errors = np.abs(np.clip(-slopes / weights, -limits, limits) - controls) * weights
+    errors = np.abs(np.clip(-slopes / weights, low, high) - controls) * weights
     if not (errors <= ACTION_TOLERANCE * (1 + np.abs(costates).max(axis=1, keepdims=True))).all():
         raise ValueError("costates: not those of an extremal with these states and controls")
 
