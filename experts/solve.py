@@ -165,7 +165,7 @@ def _without_guess(
     failed.append(solver(problem.with_winding_of(line.states), line, options))
     if failed[-1].success:
         return failed[-1]
-    if problem.horizon is not None:
+    if problem.horizon is not None and options.segments is None:
         lengthened = _from_shorter_horizons(solver, problem, options)
         if lengthened is not None:
             return lengthened
@@ -217,7 +217,7 @@ def _from_shorter_horizons(
         longer = guess.problem.with_horizon(horizon * factor ** (fraction - 1.0))
         times = guess.times * (longer.fixed_horizon / guess.horizon)
         path = Trajectory(times, guess.states, guess.costates)
-        extremal = solver(longer, path, replace(options, segments=len(times) - 1))
+        extremal = solver(longer, path, replace(options, segments=len(times) - 1, subdivide=False))
         return extremal if extremal.success else None
 
     return step_halving(lengthen, first, min_step=MIN_STEP)
@@ -250,7 +250,7 @@ def _options(
     polish, update, order = polish is not False, update or "mean_time", order or "sequential"
     check_choice("update", update, ("mean_time", "half_cost"))
     check_choice("order", order, ("sequential", "red_black"))
-    return SolverOptions(tol, max_iterations, segments, polish, update, order)
+    return SolverOptions(tol, max_iterations, segments, segments is None, polish, update, order)
 
 
 def _check_path(guess: Trajectory, problem: OptimalControlProblem) -> Trajectory:

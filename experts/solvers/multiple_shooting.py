@@ -32,7 +32,7 @@ def multiple_shooting(problem: OptimalControlProblem, path: Trajectory, options:
     mesh = times.copy()
     status, history, evaluations = polish(problem, times, nodes, options.tol, options.max_iterations)
     for _ in range(MAX_REFINEMENTS):
-        if status is Status.SUCCESS or options.segments is not None:
+        if status is Status.SUCCESS or not options.subdivide:
             break
         mesh, count = _refine(problem, path, mesh)
         evaluations += count

@@ -22,6 +22,7 @@ class SolverOptions:
         tol: largest residual of the boundary and continuity conditions.
         max_iterations: largest number of Newton steps.
         segments: number of shooting segments; None chooses it from the guess.
+        subdivide: whether multiple shooting may divide segments.
         polish: whether Leapfrog and collocation end with multiple-shooting Newton steps.
         update: where Leapfrog moves a node on the extremal of its sub-problem, at the mean time or at half the cost.
         order: order of the nodes in a Leapfrog sweep; "red_black" moves the odd nodes before the others.
@@ -31,6 +32,7 @@ class SolverOptions:
     tol: float = 1e-9
     max_iterations: int = 60
     segments: int | None = None
+    subdivide: bool = True
     polish: bool = True
     update: Literal["mean_time", "half_cost"] = "mean_time"
     order: Literal["sequential", "red_black"] = "sequential"

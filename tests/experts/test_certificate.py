@@ -107,6 +107,7 @@ def test_the_costate_is_the_gradient_of_the_optimal_cost(name):
     scenario, _ = SCENARIOS[name]
     reference = find_optimum(scenario)
     h = 3e-5  # third derivatives are large close to an obstacle
+    rounding = 2e-10 / h  # costs close to the vertices of polygons are accurate to 1e-10
 
     def cost(**changes):
         fields = scenario.to_dict()
@@ -120,9 +121,9 @@ def test_the_costate_is_the_gradient_of_the_optimal_cost(name):
 
     for i in range(3):
         at_start = (cost(start=shift(i, h)) - cost(start=shift(i, -h))) / (2 * h)
-        assert at_start == pytest.approx(reference.costates[0, i], rel=1e-5, abs=1e-6)
+        assert at_start == pytest.approx(reference.costates[0, i], rel=1e-5, abs=rounding)
         at_goal = (cost(goal=shift(i, h)) - cost(goal=shift(i, -h))) / (2 * h)
-        assert at_goal == pytest.approx(-reference.costates[-1, i], rel=1e-5, abs=1e-6)
+        assert at_goal == pytest.approx(-reference.costates[-1, i], rel=1e-5, abs=rounding)
     by_time = (cost(horizon=lambda t: t + h) - cost(horizon=lambda t: t - h)) / (2 * h)
     assert by_time == pytest.approx(reference.hamiltonian[0], rel=1e-5)
 

@@ -222,7 +222,7 @@ def test_an_extremal_beyond_the_bounds_is_not_certified():
     # So small a weight has no effect, even beyond the limit.
     extremal = solve(bryson_denham(0.2, barrier_weight=1e-20), "multiple_shooting", guess=guess)
     assert extremal.status is Status.BEYOND_LIMITS
-    assert extremal.certificate.state_margin == pytest.approx((0.2 - 0.25) / 0.2)
+    assert extremal.certificate.state_margin == pytest.approx((0.2 - 0.25) / 0.2, rel=1e-4)  # of points along the path
 
 
 @pytest.mark.parametrize("method", METHODS)
