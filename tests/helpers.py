@@ -49,25 +49,41 @@ def best_known() -> list[tuple[Scenario, float]]:
 
 def published_problems() -> dict[str, tuple[OptimalControlProblem, float, str]]:
     """Return published problems by name, with the known cost and the source (data/published_problems.json)."""
-    problems = {}
-    for entry in json.loads((DATA / "published_problems.json").read_text()):
-        symbols = tuple(sp.Symbol(name) for name in entry["state"])
-        known = {str(s): s for s in symbols}
-        system = ControlAffineSystem(
-            state=symbols,
-            drift=[sp.sympify(e, locals=known) for e in entry["drift"]],
-            fields=[[sp.sympify(e, locals=known) for e in column] for column in entry["fields"]],
-        )
-        problem = OptimalControlProblem(
-            system,
-            start=entry["start"],
-            goal=entry["goal"],
-            horizon=entry["horizon"],
-            control_weight=entry["control_weight"],
-            state_cost=sp.sympify(entry["state_cost"], locals=known),
-        )
-        problems[entry["name"]] = problem, entry["cost"], entry["source"]
-    return problems
+    entries = json.loads((DATA / "published_problems.json").read_text())
+    return {entry["name"]: (_problem(entry), entry["cost"], entry["source"]) for entry in entries}
+
+
+def difficult_problems() -> list[tuple[str, OptimalControlProblem, float, str, bool]]:
+    """Return problems that single shooting cannot solve (data/difficult_problems.json).
+
+    Each entry is (name, problem, known cost, method, whether this takes more than 2 s).
+    """
+    found = []
+    for entry in json.loads((DATA / "difficult_problems.json").read_text()):
+        for key in ("methods", "slow"):
+            found += [
+                (entry["name"], _problem(entry), entry["cost"], method, key == "slow") for method in entry.get(key, ())
+            ]
+    return found
+
+
+def _problem(entry: dict) -> OptimalControlProblem:
+    symbols = tuple(sp.Symbol(name) for name in entry["state"])
+    known = {str(s): s for s in symbols}
+    system = ControlAffineSystem(
+        state=symbols,
+        drift=[sp.sympify(e, locals=known) for e in entry["drift"]],
+        fields=[[sp.sympify(e, locals=known) for e in column] for column in entry["fields"]],
+    )
+    return OptimalControlProblem(
+        system,
+        start=entry["start"],
+        goal=entry["goal"],
+        horizon=entry["horizon"],
+        control_weight=entry["control_weight"],
+        state_cost=sp.sympify(entry["state_cost"], locals=known),
+        control_bounds=entry.get("control_bounds"),
+    )
 
 
 def scenario_fields(**changes: object) -> dict:

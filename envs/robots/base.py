@@ -235,6 +235,12 @@ class RobotModel(Frozen):
         """Return bounds of the speed (m/s) and of the turn rate (rad/s); infinite if there are none."""
         return math.inf, math.inf
 
+    def turn_rates(self) -> tuple[float, float]:
+        """Return the lowest (clockwise) and the highest turn rate (rad/s)."""
+        if "turn_rate" in self.limited:
+            return self.interval("turn_rate")
+        return -self.speed_limits()[1], self.speed_limits()[1]
+
     def slowest_speed(self) -> float:
         """Return the smallest possible magnitude of the speed (m/s); it is positive if the robot cannot stop."""
         if "speed" not in self.limited:

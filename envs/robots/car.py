@@ -140,7 +140,7 @@ class Car(RobotModel):
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
         radius = 1.0 / self.max_curvature
-        return curved_moves(cell, speed_weight, (radius, radius), modes=driving_modes(self.interval("speed")))
+        return curved_moves(cell, speed_weight, 0.0, (radius, radius), modes=driving_modes(self.interval("speed")))
 
     def max_lattice_cell(self) -> float:  # noqa: D102
         return MAX_LATTICE_CELL / self.max_curvature

@@ -101,4 +101,4 @@ class DifferentialDrive(RobotModel):
         if low < 0.0 < high:
             return rotating_moves(cell, speed_weight, turn_weight)
         radius = abs(high + low) / (high - low) * self.track / 2  # with one wheel at each limit
-        return curved_moves(cell, speed_weight, (radius, radius), modes=driving_modes((low, high)))
+        return curved_moves(cell, speed_weight, turn_weight, (radius, radius), modes=driving_modes((low, high)))

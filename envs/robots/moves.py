@@ -123,12 +123,21 @@ ROTATING_MOVES = _rotating_table()[0]
 ROTATING_MOVES.flags.writeable = False
 
 
+def _closest_counts(steps: Sequence[float], length: float) -> tuple[int, int]:
+    """Return how often to make each of two steps (m), at least once, for a path that is about `length` (m) long."""
+    limit = 2 + int(length / min(steps))
+    pairs = ((a, b) for a in range(1, limit) for b in range(1, limit))
+    return min(pairs, key=lambda pair: abs(pair[0] * steps[0] + pair[1] * steps[1] - length))
+
+
 def curved_moves(
     cell: float,
     speed_weight: float,
+    turn_weight: float,
     radii: tuple[float, float],
-    turn_length: float = 0.0,
     modes: Sequence[Literal[1, -1]] = (1, -1),
+    *,
+    fitting: bool = True,
 ) -> Moves:
     """Return the moves of a robot with a minimum turning radius.
 
@@ -138,12 +147,14 @@ def curved_moves(
     Args:
         cell: side of a cell (m).
         speed_weight: weight of the squared speed.
+        turn_weight: weight of the squared turn rate.
         radii: minimum turning radii (m) of anticlockwise and clockwise rotations.
-        turn_length: length in the metric that a heading step adds (steering).
         modes: 1 for moves ahead, -1 for moves backwards.
+        fitting: whether an arc of the radius fits into each corner. Otherwise turns are about as long as such arcs, so
+            that the lattice has paths wherever a robot can drive that cannot reverse.
 
     """
-    steps: list[list[list[tuple[int, int]]]] = []
+    rows_of: list[list[list[tuple[int, int]]]] = []
     changes = [change for change in (0, 1, -1) for _ in modes]
     for heading in range(HEADINGS):
         rows = []
@@ -151,21 +162,28 @@ def curved_moves(
             for mode in modes:
                 path = [tuple((mode * DIRECTIONS[heading]).tolist())]
                 if change:
-                    leg = radii[0 if change > 0 else 1] * math.tan(turn_angle(heading, change) / 2.0)
+                    radius, angle = radii[0 if change > 0 else 1], turn_angle(heading, change)
+                    headings = heading, (heading + change) % HEADINGS
+                    steps = [cell * math.hypot(*DIRECTIONS[k]) for k in headings]
+                    if fitting:
+                        leg = radius * math.tan(angle / 2.0)
+                        counts = [max(1, math.ceil(leg / step - 1e-9)) for step in steps]
+                    else:
+                        counts = _closest_counts(steps, radius * angle)
                     path = []
-                    for k in (heading, (heading + change) % HEADINGS):
-                        count = max(1, math.ceil(leg / (cell * math.hypot(*DIRECTIONS[k])) - 1e-9))
+                    for k, count in zip(headings, counts, strict=True):
                         path += [tuple((mode * DIRECTIONS[k]).tolist())] * count
                 rows.append(path)
-        steps.append(rows)
-    n_steps = max(len(path) for rows in steps for path in rows)
+        rows_of.append(rows)
+    n_steps = max(len(path) for rows in rows_of for path in rows)
     shape = (HEADINGS, len(changes))
     targets = np.zeros((*shape, 3), dtype=np.int64)
     points, weights = np.zeros((*shape, 2 * n_steps + 1, 2), dtype=np.int64), np.zeros((*shape, 2 * n_steps + 1))
     for heading in range(HEADINGS):
-        for move, (path, change) in enumerate(zip(steps[heading], changes, strict=True)):
+        for move, (path, change) in enumerate(zip(rows_of[heading], changes, strict=True)):
             lengths = math.sqrt(speed_weight) * cell * np.hypot(*np.array(path).T)
-            lengths *= math.hypot(lengths.sum(), turn_length if change else 0.0) / lengths.sum()
+            turn = math.sqrt(turn_weight) * turn_angle(heading, change)
+            lengths *= math.hypot(lengths.sum(), turn) / lengths.sum()
             corners = np.concatenate([[(0, 0)], np.cumsum(path, axis=0)])
             targets[heading, move] = (*corners[-1], change)
             # The points after the end of a shorter move have no weight.

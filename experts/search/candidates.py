@@ -238,7 +238,9 @@ class CandidateSearch:
         cost_behind, behind, limit = tree(back, ends, seeds, bound, False, limits)
         cost_ahead, ahead, _ = tree(metric, seeds, ends, cost_behind, True, limits._replace(limit=limit))
         self._from_start, self._to_goal = Tree(cost_ahead, ahead), Tree(cost_behind, behind)
-        self._meetings, self.limit = self._meet(limit), limit
+        # Without a path the limit is infinite, and so are the costs.
+        self._meetings = self._meet(limit) if limit < math.inf else np.empty(0, dtype=np.int64)
+        self.limit = limit
 
     def _meet(self, limit: float) -> np.ndarray:
         """Return the nodes at which the trees meet, in order of the cost of the path through them, up to a limit."""
@@ -265,10 +267,6 @@ class CandidateSearch:
         durations = lengths / np.sqrt(2 * (energy + phi))
         if horizon is None:
             durations = np.maximum(durations, LIMIT_MARGIN * shortest_durations(poses, self.lattice.scenario))
-            slowest = self.lattice.scenario.robot.slowest_speed()
-            if slowest > 0.0:
-                steps = np.diff(poses[:, :2], axis=0)
-                durations = np.minimum(durations, np.hypot(steps[:, 0], steps[:, 1]) / (LIMIT_MARGIN * slowest) + 1e-9)
         times = np.concatenate([[0.0], np.cumsum(durations)])
         cost = float(self._from_start.cost[node] + self._to_goal.cost[node])
         return Candidate(times if horizon is None else times * (horizon / times[-1]), poses, cost, nodes)
@@ -317,9 +315,10 @@ def metric_of(lattice: Lattice, energy: float) -> Metric:
 
 def shortest_durations(poses: np.ndarray, scenario: Scenario) -> np.ndarray:
     """Return the durations (N - 1,) (s) of the steps of a path (N, 3) at the limits of the robot."""
-    step = np.abs(np.diff(poses, axis=0))
-    max_speed, max_turn_rate = scenario.robot.speed_limits()
-    return np.maximum(np.hypot(step[:, 0], step[:, 1]) / max_speed, step[:, 2] / max_turn_rate)
+    step, robot = np.diff(poses, axis=0), scenario.robot
+    low, high = robot.turn_rates()
+    turning = np.where(step[:, 2] < 0, step[:, 2] / low, step[:, 2] / high)
+    return np.maximum(np.hypot(step[:, 0], step[:, 1]) / robot.speed_limits()[0], turning)
 
 
 def cell_costs(metric: Metric, seeds: Nodes) -> np.ndarray:

@@ -260,7 +260,7 @@ def in_dataset(name, change, *rows):
         (in_dataset("costates", added([0, 0, 1]), 20), "costates: not those of an extremal"),
         (in_dataset("costs", lambda costs: 0.4 * costs), "costs: expected"),
         (in_dataset("costs", lambda costs: 1.06 * costs, 2), "costs: expected"),
-        (in_scenario("robot", "max_speed", value=0.05), "controls: expected at most"),
+        (in_scenario("robot", "max_speed", value=0.05), "controls: expected values within"),
         (in_scenario("robot", value={"model": "car"}), "robot.model: expected that of the bank, 'unicycle', got 'car'"),
         (in_scenario("cost", "time_weight", value=0.5), "cost.time_weight"),
         (in_scenario("horizon", value=3.25), "horizon: expected that of the bank, .*, got 3.25"),

@@ -24,9 +24,9 @@ from leapnav.experts.transcription.direct import discretise, optimise
 COLUMNS, LINES, CELL, SPEED_WEIGHT, TURN_WEIGHT = 18, 16, 0.3, 1.5, 0.4
 MOVES = {
     "rotating": rotating_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT),
-    "curved": curved_moves(CELL, SPEED_WEIGHT, (0.7, 0.7), 0.3),  # one cell along each heading
+    "curved": curved_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, (0.7, 0.7)),  # one cell along each heading
     "rotating backwards": rotating_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, modes=(-1,)),
-    "curved ahead": curved_moves(CELL, SPEED_WEIGHT, (0.7, 0.6), 0.3, modes=(1,)),
+    "curved ahead": curved_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, (0.7, 0.6), modes=(1,), fitting=False),
 }
 
 
@@ -64,7 +64,7 @@ def graph(speed, moves):
                         headings = [k, other] if change else [k]
                         parts = np.sqrt(SPEED_WEIGHT) * CELL * np.hypot(*DIRECTIONS[headings].T)
                         means = [speeds[2 * p : 2 * p + 3] @ [1, 4, 1] / 6 for p in range(len(parts))]
-                        cost = parts @ means * np.hypot(parts.sum(), 0.3 if change else 0.0) / parts.sum()
+                        cost = parts @ means * np.hypot(parts.sum(), np.sqrt(TURN_WEIGHT) * turn) / parts.sum()
                     heads.append(node(i, j, k))
                     tails.append(node(i + dx, j + dy, other))
                     weights.append(cost)

@@ -4,7 +4,7 @@ import pickle
 import numpy as np
 import pytest
 import sympy as sp
-from helpers import best_known, published_problems, scenario_fields, shooting_guess
+from helpers import best_known, difficult_problems, published_problems, scenario_fields, shooting_guess
 
 from leapnav.envs import Scenario
 from leapnav.experts import (
@@ -71,6 +71,19 @@ def test_published_problems_are_solved_without_a_polish(name, method):
     assert extremal.success, (extremal.status, extremal.certificate)
     assert extremal.cost == pytest.approx(cost, rel=1e-7)
     assert all(row.phase != "newton" for row in extremal.history)
+
+
+@pytest.mark.parametrize(
+    ("problem", "cost", "method"),
+    [
+        pytest.param(problem, cost, method, id=f"{name}-{method}", marks=pytest.mark.slow if slow else ())
+        for name, problem, cost, method, slow in difficult_problems()
+    ],
+)
+def test_difficult_problems_are_solved_from_nothing(problem, cost, method):
+    extremal = solve(problem, method=method)
+    assert extremal.success, (extremal.status, extremal.certificate)
+    assert extremal.cost == pytest.approx(cost, rel=1e-7)
 
 
 @pytest.mark.parametrize("method", METHODS)

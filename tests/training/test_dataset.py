@@ -21,7 +21,7 @@ def test_a_dataset_is_the_same_from_a_folder_and_from_demonstrations(demonstrate
     for name in ("observations", "actions", "returns", "costates", "states", "times", "executed", "rewards"):
         np.testing.assert_allclose(getattr(dataset, name), getattr(other, name), atol=1e-9, err_msg=name)
     assert dataset.course_texts == other.course_texts
-    assert (dataset.limits == [2.0, 3.0]).all()
+    assert (dataset.halves == [2.0, 3.0]).all()
     assert (dataset.weights == [1.0, 0.5]).all()
     first = demonstrations[0]
     np.testing.assert_allclose(dataset.returns[: len(first.actions)], -first.cost_to_go[:-1])

@@ -100,7 +100,7 @@ def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
     with th.no_grad():
         costs = [th.stack(model.critic(inputs, actions)).mean(dim=0)[:, 0] for actions in (best, other)]
     found = float((costs[0] - costs[1]).mean())
-    weights = th.as_tensor((dataset.weights * dataset.limits**2)[chosen])
+    weights = th.as_tensor((dataset.weights * dataset.halves**2)[chosen])
     assert found == pytest.approx(float(0.05 * 0.5 * (weights * (other - best) ** 2).sum(dim=1).mean()), rel=0.3)
     states = model.critic.state_dict()
     assert all(th.equal(value, states[name]) for name, value in model.critic_target.state_dict().items())
