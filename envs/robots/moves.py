@@ -123,21 +123,12 @@ ROTATING_MOVES = _rotating_table()[0]
 ROTATING_MOVES.flags.writeable = False
 
 
-def _closest_counts(steps: Sequence[float], length: float) -> tuple[int, int]:
-    """Return how often to make each of two steps (m), at least once, for a path that is about `length` (m) long."""
-    limit = 2 + int(length / min(steps))
-    pairs = ((a, b) for a in range(1, limit) for b in range(1, limit))
-    return min(pairs, key=lambda pair: abs(pair[0] * steps[0] + pair[1] * steps[1] - length))
-
-
 def curved_moves(
     cell: float,
     speed_weight: float,
     turn_weight: float,
     radii: tuple[float, float],
     modes: Sequence[Literal[1, -1]] = (1, -1),
-    *,
-    fitting: bool = True,
 ) -> Moves:
     """Return the moves of a robot with a minimum turning radius.
 
@@ -150,8 +141,6 @@ def curved_moves(
         turn_weight: weight of the squared turn rate.
         radii: minimum turning radii (m) of anticlockwise and clockwise rotations.
         modes: 1 for moves ahead, -1 for moves backwards.
-        fitting: whether an arc of the radius fits into each corner. Otherwise turns are about as long as such arcs, so
-            that the lattice has paths wherever a robot can drive that cannot reverse.
 
     """
     rows_of: list[list[list[tuple[int, int]]]] = []
@@ -162,16 +151,10 @@ def curved_moves(
             for mode in modes:
                 path = [tuple((mode * DIRECTIONS[heading]).tolist())]
                 if change:
-                    radius, angle = radii[0 if change > 0 else 1], turn_angle(heading, change)
-                    headings = heading, (heading + change) % HEADINGS
-                    steps = [cell * math.hypot(*DIRECTIONS[k]) for k in headings]
-                    if fitting:
-                        leg = radius * math.tan(angle / 2.0)
-                        counts = [max(1, math.ceil(leg / step - 1e-9)) for step in steps]
-                    else:
-                        counts = _closest_counts(steps, radius * angle)
+                    leg = radii[0 if change > 0 else 1] * math.tan(turn_angle(heading, change) / 2.0)
                     path = []
-                    for k, count in zip(headings, counts, strict=True):
+                    for k in (heading, (heading + change) % HEADINGS):
+                        count = max(1, math.ceil(leg / (cell * math.hypot(*DIRECTIONS[k])) - 1e-9))
                         path += [tuple((mode * DIRECTIONS[k]).tolist())] * count
                 rows.append(path)
         rows_of.append(rows)

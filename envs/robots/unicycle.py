@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar, Literal, Self
 
 from pydantic import model_validator
@@ -21,8 +20,6 @@ from leapnav.envs.robots.base import (
 from leapnav.envs.robots.moves import Moves, curved_moves, driving_modes, rotating_moves
 from leapnav.envs.utils.records import Interval, Positive
 
-# Minimum turning radii of a robot that cannot stop: with a radius of 0.5 m, those of the lattice are 0.53 m on average.
-MAX_LATTICE_CELL = 0.12
 POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
 
 
@@ -87,15 +84,8 @@ class Unicycle(RobotModel):
         return magnitude(self.interval("speed")), magnitude(self.interval("turn_rate"))
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
-        modes = driving_modes(self.interval("speed"))
-        if self.slowest_speed() == 0.0:
+        modes, slowest = driving_modes(self.interval("speed")), self.slowest_speed()
+        if slowest == 0.0:
             return rotating_moves(cell, speed_weight, turn_weight, modes)
-        return curved_moves(cell, speed_weight, turn_weight, self._turning_radii(), modes, fitting=False)
-
-    def max_lattice_cell(self) -> float:  # noqa: D102
-        return MAX_LATTICE_CELL * min(self._turning_radii()) if self.slowest_speed() > 0.0 else math.inf
-
-    def _turning_radii(self) -> tuple[float, float]:
-        """Return the smallest turning radii (m) of anticlockwise and clockwise rotations; 0 in place."""
-        (right, left), slowest = self.interval("turn_rate"), self.slowest_speed()
-        return slowest / left, -slowest / right
+        right, left = self.interval("turn_rate")
+        return curved_moves(cell, speed_weight, turn_weight, (slowest / left, -slowest / right), modes)

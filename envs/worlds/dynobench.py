@@ -21,7 +21,7 @@ from leapnav.envs.shapes import Polygon
 from leapnav.envs.worlds.yaml_files import Number, Pair, YamlRecord, as_record, read_yaml
 
 MODEL = "unicycle1"  # the dynamics that leapnav has: speed and turn rate
-DISCS = 9  # of the footprint that covers the robot's box; they protrude by 7 mm at its sides
+DISCS = 9  # of the footprint that covers the robot's box; they protrude by 3 mm at its sides
 # Scale (m) of the barrier. With 0.1 m, the minimum time of one of five problems was 3 % longer, another local minimum.
 PROXIMITY_SCALE = 0.02
 SOLUTION = "_solution_"  # part of the names of the files of solutions

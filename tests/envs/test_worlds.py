@@ -194,7 +194,7 @@ robots:
 
 @pytest.fixture
 def dynobench(tmp_path):
-    """A directory with the structure of dynobench: a problem, and two of robots that leapnav does not have."""
+    """A directory with the structure of dynobench: two problems, and one of a robot that leapnav does not have."""
     folder = tmp_path / "dynobench"
     (folder / "models").mkdir(parents=True)
     for model, dynamics, slowest in (
@@ -217,10 +217,11 @@ def test_problems_of_dynobench_are_scenarios_with_the_durations_of_other_planner
     problems = read_dynobench(dynobench)
     assert list(problems) == ["unicycle1_v0-wall_0", "unicycle1_v1-wall_0", "unicycle2_v0-wall_0"]
     assert all(problem.durations == {"idbastar_v0": 4.0} for problem in problems.values())  # the other is not feasible
-    assert "min_vel 0.25" in problems["unicycle1_v1-wall_0"].reason
+    robot = problems["unicycle1_v1-wall_0"].scenario.robot
+    assert robot.control_bounds().tolist() == [[0.25, 0.5], [-0.5, 0.5]]
     assert "unicycle2" in problems["unicycle2_v0-wall_0"].reason
     scenario = problems["unicycle1_v0-wall_0"].scenario
-    assert scenario.arena == (0, 0, 3, 2) and scenario.robot.max_speed == 0.5
+    assert scenario.arena == (0, 0, 3, 2) and scenario.robot.control_bounds().tolist() == [[-0.5, 0.5]] * 2
     # The discs cover the box of the robot.
     box = np.array([(x, y) for x in np.linspace(-0.25, 0.25, 41) for y in (-0.125, 0.125)])
     distances = np.hypot(box[:, :1] - scenario.discs[:, 0], box[:, 1:]) - scenario.discs[:, 1]
@@ -235,10 +236,10 @@ def test_the_table_of_dynobench(dynobench, tmp_path, capsys):
     assert main(["worlds", "benchmark", "dynobench", str(dynobench), "--tol", "0.2", "--json", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "unicycle2_v0-wall_0: left out: dynamics 'unicycle2'" in printed and "idbastar_v0" in printed
-    (row,) = json.loads(out.read_text()).values()
+    row = json.loads(out.read_text())["unicycle1_v0-wall_0"]
     assert row["idbastar_v0"] == 4.0 and 2.4 < row["leapnav"] < 4.0 and row["clearance"] > 0
     assert main(["worlds", "import", "dynobench", str(dynobench), "--out", str(tmp_path / "scenarios")]) == 0
-    assert [scenario.name for scenario in read_scenarios(tmp_path / "scenarios")] == ["unicycle1_v0-wall_0"]
+    assert [scenario.name for scenario in read_scenarios(tmp_path / "scenarios")] == list(read_dynobench(dynobench))[:2]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ MOVES = {
     "rotating": rotating_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT),
     "curved": curved_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, (0.7, 0.7)),  # one cell along each heading
     "rotating backwards": rotating_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, modes=(-1,)),
-    "curved ahead": curved_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, (0.7, 0.6), modes=(1,), fitting=False),
+    "curved ahead": curved_moves(CELL, SPEED_WEIGHT, TURN_WEIGHT, (0.7, 0.6), modes=(1,)),
 }
 
 
