@@ -165,14 +165,21 @@ def _without_guess(
     failed.append(solver(problem.with_winding_of(line.states), line, options))
     if failed[-1].success:
         return failed[-1]
-    if problem.horizon is not None and options.segments is None:
+    # A failure that converged is more informative.
+    converged = [extremal for extremal in failed if _has_converged(extremal)]
+    if not converged and problem.horizon is not None and options.segments is None:
         lengthened = _from_shorter_horizons(solver, problem, options)
         if lengthened is not None:
             return lengthened
-    # A failure that converged is more informative.
-    statuses = Status.CONJUGATE_POINT, Status.TIME_NOT_MINIMAL, Status.COLLISION
-    converged = [extremal for extremal in failed if extremal.status in statuses]
     return (converged or failed)[0]
+
+
+def _has_converged(extremal: Extremal) -> bool:
+    """Whether a failure is an extremal, but not certified."""
+    certificate = extremal.certificate
+    if extremal.status is Status.SINGULAR and certificate is not None:
+        return max(certificate.residual, certificate.defect) <= certificate.TOLERANCE
+    return extremal.status in (Status.CONJUGATE_POINT, Status.TIME_NOT_MINIMAL, Status.COLLISION)
 
 
 def _from_initial_paths(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -113,6 +114,7 @@ def certify(
         residual = max(residual, largest / max(1.0, problem.time_weight))
         curvature = _time_curvature(final, out[-1, 3 + m + 2 * n : 3 + m + 4 * n], arrays.free)
         horizon_error = largest / (curvature * extremal.horizon) if curvature > 0 else math.inf
+    at_bounds = problem.control_bounds is not None and _saturates(extremal.controls, problem.control_bounds)
     certificate = Certificate(
         residual=residual,
         defect=float(defect),
@@ -122,6 +124,7 @@ def certify(
         time_curvature=curvature,
         horizon_error=horizon_error,
         state_margin=margin,
+        controllability=None if arrays.free.any() or at_bounds else _controllability(final),
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     if clearance is not None and clearance <= 0:  # an extremal has positive clearance; the path explains the failure
@@ -134,6 +137,19 @@ def _dense_states(extremal: Extremal) -> np.ndarray:
     fractions = np.arange(POINTS_PER_STEP) / POINTS_PER_STEP
     times = extremal.times[:-1, None] + np.diff(extremal.times)[:, None] * fractions
     return extremal.interpolate(np.append(times.ravel(), extremal.times[-1]))[:, : extremal.problem.system.n]
+
+
+def _saturates(controls: np.ndarray, bounds: Sequence[tuple[float, float]]) -> bool:
+    """Return whether a control (K, m) is at one of its bounds somewhere."""
+    low, high = np.array(bounds).T
+    return bool(((controls <= low) | (controls >= high)).any())
+
+
+def _controllability(frame: np.ndarray) -> float:
+    """Return the smallest singular value of the upper half of an orthonormal basis of the columns (2n, n)."""
+    if not np.isfinite(frame).all():
+        return math.nan
+    return float(np.linalg.svd(np.linalg.qr(frame).Q[: frame.shape[1]], compute_uv=False)[-1])
 
 
 def _time_curvature(frame: np.ndarray, rates: np.ndarray, free: np.ndarray) -> float:

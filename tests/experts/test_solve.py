@@ -87,6 +87,18 @@ def test_difficult_problems_are_solved_from_nothing(problem, cost, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_an_abnormal_extremal_has_one_status(method):
+    """The straight line is a minimiser, but no change of the costate moves the end in z (R. Montgomery, 1994)."""
+    martinet = ControlAffineSystem(state=(x, y, z), drift=(0, 0, 0), fields=((1, 0, y**2 / 2), (0, 1, 0)))
+    line = solve(OptimalControlProblem(martinet, (0, 0, 0), (1, 0, 0), 1.0, (1, 1)), method)
+    assert line.status is Status.SINGULAR
+    assert line.cost == pytest.approx(0.5, rel=1e-9)
+    assert line.certificate.defect < 1e-8 and line.certificate.controllability < 1e-9
+    other = solve(OptimalControlProblem(martinet, (0, 0, 0), (1, 0, 0.1), 1.0, (1, 1)), method)
+    assert other.success and other.certificate.controllability > 0.01
+
+
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", BY_HAND)
 def test_problems_solved_by_hand(name, method):
     problem, cost = BY_HAND[name]
