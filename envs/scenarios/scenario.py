@@ -38,8 +38,7 @@ class Task(NamedTuple):
 
     Attributes:
         start, goal (n,): states at time 0 and at the end; NaN for a state that is free at the goal.
-        middles, halves (m,): middles and half widths of the intervals of the controls.
-        weights (m,): weights of the squared controls in the running cost.
+        middles, halves, weights (m,): middles and half widths of the intervals of the controls; weights of the squares.
         parameters (p,): parameters of the robot's model.
 
     """
@@ -203,10 +202,8 @@ class Scenario(Frozen):
         if self.horizon is not None and cost.time_weight:
             message = f"cost.time_weight: environments and banks with a fixed horizon need 0, got {cost.time_weight:g}"
             raise ScenarioError(one_line(self.name, [message]))
-        goal = [math.nan if value is None else value for value in self.goal_state]
-        weights, parameters = robot.control_weight(cost), robot.parameters(cost)
-        vectors = self.start_state, goal, *robot.action_scale(), weights, parameters
-        for array in (task := Task(*(np.array(vector, dtype=float) for vector in vectors))):
+        controls = *robot.action_scale(), robot.control_weight(cost), robot.parameters(cost)
+        for array in (task := Task(*(np.array(v, dtype=float) for v in (self.start_state, self.goal_state, *controls)))):
             array.flags.writeable = False
         return task
 
