@@ -198,12 +198,12 @@ class Scenario(Frozen):
             ScenarioError: the horizon is fixed, and the time has a weight.
 
         """
-        robot, cost = self.robot, self.cost
+        bot, cost = self.robot, self.cost
         if self.horizon is not None and cost.time_weight:
             message = f"cost.time_weight: environments and banks with a fixed horizon need 0, got {cost.time_weight:g}"
             raise ScenarioError(one_line(self.name, [message]))
-        controls = *robot.action_scale(), robot.control_weight(cost), robot.parameters(cost)
-        for array in (task := Task(*(np.array(v, dtype=float) for v in (self.start_state, self.goal_state, *controls)))):
+        vectors = self.start_state, self.goal_state, *bot.action_scale(), bot.control_weight(cost), bot.parameters(cost)
+        for array in (task := Task(*(np.array(vector, dtype=float) for vector in vectors))):
             array.flags.writeable = False
         return task
 
