@@ -124,7 +124,7 @@ def certify(
         time_curvature=curvature,
         horizon_error=horizon_error,
         state_margin=margin,
-        controllability=None if arrays.free.any() or at_bounds else _controllability(final),
+        controllability=None if arrays.free.any() or at_bounds else _controllability(extremal, final),
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     if clearance is not None and clearance <= 0:  # an extremal has positive clearance; the path explains the failure
@@ -145,8 +145,23 @@ def _saturates(controls: np.ndarray, bounds: Sequence[tuple[float, float]]) -> b
     return bool(((controls <= low) | (controls >= high)).any())
 
 
-def _controllability(frame: np.ndarray) -> float:
-    """Return the smallest singular value of the upper half of an orthonormal basis of the columns (2n, n)."""
+def _controllability(extremal: Extremal, frame: np.ndarray) -> float:
+    """Return the larger of the smallest singular values at the final time and, if that is small, at half of it."""
+    largest = _smallest_singular_value(frame)
+    if not largest > Certificate.MIN_CONTROLLABILITY:
+        arrays, (size, n) = extremal.problem.arrays, frame.shape
+        times = np.array([0.0, 0.5 * extremal.times[-1]])
+        rows = np.empty((len(extremal.times) + MIN_ROWS, 4 + extremal.controls.shape[1] + 2 * size))
+        terms = np.empty((len(rows), DENSE_TERMS, size + 1))
+        middle = np.empty((size, n))
+        record = TraceRecord(rows, terms, np.empty((size, n)), middle)
+        trace(arrays.flow, arrays.control, times, extremal.interpolate(times), ACCURACY, record)
+        largest = max(largest, _smallest_singular_value(middle))
+    return largest
+
+
+def _smallest_singular_value(frame: np.ndarray) -> float:
+    """Return that of the upper half of an orthonormal basis of the columns (2n, n); NaN if these have diverged."""
     if not np.isfinite(frame).all():
         return math.nan
     return float(np.linalg.svd(np.linalg.qr(frame).Q[: frame.shape[1]], compute_uv=False)[-1])
