@@ -8,7 +8,7 @@ import numpy as np
 
 from leapnav.envs.robots.base import RobotModel
 
-KEY_ACTION = 0.5  # fraction of the limits of the controls
+KEY_ACTION = 0.5  # fraction of the range of the controls on each side of its middle
 
 
 def driving_controls(model: type[RobotModel]) -> np.ndarray:

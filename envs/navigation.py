@@ -49,8 +49,9 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     `leapnav/NavigateGoal-v0` is the same task for goal-conditioned learners, see `NavigateGoalEnv`.
 
     ## Action space
-    `Box(-1, 1, (m,), float32)` for a robot with m controls: each control divided by its limit. The action is held for
-    one control period. Values outside the bounds are clipped. For the unicycle:
+    `Box(-1, 1, (m,), float32)` for a robot with m controls: -1 is the lowest and 1 the highest value of each
+    control. The action is held for one control period. Values outside the bounds are clipped. For the unicycle, unless
+    its limits are intervals (`speed`, `turn_rate`):
 
     | Index | Action | Unit | -1 | +1 |
     |---|---|---|---|---|

@@ -89,6 +89,11 @@ def magnitude(interval: tuple[float, float]) -> float:
     return max(-interval[0], interval[1])
 
 
+def least_magnitude(interval: tuple[float, float]) -> float:
+    """Return the smallest absolute value in an interval."""
+    return max(interval[0], -interval[1], 0.0)
+
+
 class RobotModel(Frozen):
     """A wheeled robot: the base class of all models.
 
@@ -105,8 +110,9 @@ class RobotModel(Frozen):
         control_names: names of the m controls.
         state_units, control_units: their units.
         goal_motion: goal values of the further states; None leaves a state free.
-        limited: names of the limited quantities, by default those of `limits`. Each has two fields: its interval
-            (lowest, highest), and its largest absolute value `max_...`, which counts if the interval is None.
+        limited: names of the limited quantities; `limits` returns their intervals unless a model overrides it. Each has
+            two fields: the interval (lowest, highest), and the largest absolute value `max_...`, which is used if the
+            interval is None.
         cost_fields: names of the weights of `leapnav.envs.Cost` that the model uses, besides the proximity cost.
         advance: kernel of ADVANCE_SIGNATURE, exact or to 1e-9.
         state_cost: kernel of STATE_COST_SIGNATURE, or None without a state cost.
@@ -243,10 +249,7 @@ class RobotModel(Frozen):
 
     def slowest_speed(self) -> float:
         """Return the smallest possible magnitude of the speed (m/s); it is positive if the robot cannot stop."""
-        if "speed" not in self.limited:
-            return 0.0
-        low, high = self.interval("speed")
-        return max(low, -high, 0.0)
+        return least_magnitude(self.interval("speed")) if "speed" in self.limited else 0.0
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:
         """Return the motion primitives on a lattice with cells of the given side (m), in the given metric."""

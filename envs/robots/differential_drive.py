@@ -13,6 +13,7 @@ from leapnav.envs.robots.base import (
     Dynamics,
     RobotModel,
     Symmetry,
+    least_magnitude,
     magnitude,
     register,
 )
@@ -93,8 +94,7 @@ class DifferentialDrive(RobotModel):
         return magnitude((low, high)), (high - low) / self.track
 
     def slowest_speed(self) -> float:  # noqa: D102
-        low, high = self.interval("wheel_speed")
-        return max(low, -high, 0.0)
+        return least_magnitude(self.interval("wheel_speed"))
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
         low, high = self.interval("wheel_speed")

@@ -56,8 +56,11 @@ def start_nodes(
         ValueError: the path has another number of states.
 
     """
-    times = _spread(path.times, segments + 1) if isinstance(segments, int) else segments
-    times[0], times[-1] = 0.0, problem.horizon_of(path)
+    if isinstance(segments, int):
+        times = _spread(path.times, segments + 1)
+        times[0], times[-1] = 0.0, problem.horizon_of(path)  # exactly
+    else:
+        times = segments
     resampled = path.resample(times)
     if resampled.states.shape[1] != problem.system.n:
         raise ValueError(f"states: expected {problem.system.n} columns, got {resampled.states.shape[1]}")

@@ -88,14 +88,11 @@ class GoToGoal:
         heading_error = np.remainder(heading_error + math.pi, 2 * math.pi) - math.pi
         speed = direction * needed_speed
         turn_rate = np.abs(needed_speed) * (BEARING_GAIN * bearing + HEADING_GAIN * heading_error)
-        actions = np.stack([speed, turn_rate], axis=1) / self._limits()
+        controls = np.stack([speed, turn_rate], axis=1)
+        robots = [scenario.robot for scenario in self._scenarios()]
+        actions = np.stack([robot.actions(row) for robot, row in zip(robots, controls, strict=True)])
         actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
         return (actions if np.ndim(observation) > 1 else actions[0]), state
-
-    def _limits(self) -> np.ndarray:
-        """Return the maximum speeds (m/s) and turn rates (rad/s) of all robots (N, 2)."""
-        robots: list[Any] = [scenario.robot for scenario in self._scenarios()]  # unicycles, see `__init__`
-        return np.array([(robot.max_speed, robot.max_turn_rate) for robot in robots])
 
     def _scenarios(self) -> list[Scenario]:
         """Return the scenarios of all robots."""
