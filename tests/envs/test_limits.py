@@ -4,23 +4,17 @@ import json
 
 import numpy as np
 import pytest
+from helpers import scenario_fields
 
 from leapnav.envs import DifferentialDrive, NavigateEnv, Scenario, ScenarioError, Unicycle
 from leapnav.experts import ExpertPolicy, find_optimum
+from leapnav.training.policies.baselines import GoToGoal
 
 FORWARD = {"model": "unicycle", "speed": [0.25, 0.5], "turn_rate": [-0.5, 1.0]}
 
 
 def task(robot, **changes):
-    fields = {
-        "arena": [0, 0, 8, 8],
-        "robot": robot,
-        "start": [1.5, 2.0, 0.4],
-        "goal": [6.0, 5.5, 1.2],
-        "horizon": 8.0,
-        "obstacles": [{"circle": {"center": [3.6, 3.9], "radius": 0.7}}],
-    }
-    return Scenario.from_dict({**fields, **changes})
+    return Scenario.from_dict(scenario_fields(robot=robot, **changes))
 
 
 def test_actions_span_the_intervals_of_the_limits():
@@ -90,3 +84,14 @@ def test_symmetries_need_symmetric_limits():
 def test_invalid_intervals_are_named(limits, message):
     with pytest.raises(ScenarioError, match=message):
         task({"model": "unicycle", **limits})
+
+
+def test_go_to_goal_commands_the_same_controls_with_other_limits():
+    controls = []
+    for limits in ({"max_speed": 2.0}, {"speed": [-1.0, 3.0], "turn_rate": [-4.0, 3.0]}):
+        scenario = task({"model": "unicycle", **limits})
+        env = NavigateEnv(scenario=scenario)
+        observation, _ = env.reset(seed=0)
+        controls.append(scenario.robot.controls(GoToGoal(env).predict(observation)[0]))
+    np.testing.assert_allclose(*controls, rtol=1e-5)
+    assert np.abs(controls[0]).min() > 0.01
