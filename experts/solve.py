@@ -223,8 +223,9 @@ def _from_shorter_horizons(
     def lengthen(fraction: float, guess: Extremal) -> Extremal | None:
         longer = guess.problem.with_horizon(horizon * factor ** (fraction - 1.0))
         times = guess.times * (longer.fixed_horizon / guess.horizon)
+        times[-1] = longer.fixed_horizon  # exactly
         path = Trajectory(times, guess.states, guess.costates)
-        extremal = solver(longer, path, replace(options, segments=len(times) - 1, subdivide=False))
+        extremal = solver(longer, path, replace(options, mesh=times, subdivide=False))
         return extremal if extremal.success else None
 
     return step_halving(lengthen, first, min_step=MIN_STEP)
@@ -257,7 +258,7 @@ def _options(
     polish, update, order = polish is not False, update or "mean_time", order or "sequential"
     check_choice("update", update, ("mean_time", "half_cost"))
     check_choice("order", order, ("sequential", "red_black"))
-    return SolverOptions(tol, max_iterations, segments, segments is None, polish, update, order)
+    return SolverOptions(tol, max_iterations, segments, None, segments is None, polish, update, order)
 
 
 def _check_path(guess: Trajectory, problem: OptimalControlProblem) -> Trajectory:

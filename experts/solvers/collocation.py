@@ -22,7 +22,7 @@ from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
-from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
+from leapnav.experts.solvers.nodes import SolverOptions, first_mesh, start_nodes
 
 # Tolerance if Newton's method follows. The error of the cubics decreases with the fourth power of the step only, so a
 # tight tolerance would need a fine mesh.
@@ -42,7 +42,7 @@ class _DivergedError(Exception):
 def collocation(problem: OptimalControlProblem, path: Trajectory, options: SolverOptions) -> Extremal:
     """Solve by collocation to `tol`, or with `polish` to a coarse tolerance followed by Newton's method."""
     arrays, n = problem.arrays, problem.system.n
-    times, nodes = start_nodes(problem, path, options.segments or default_segments(path))
+    times, nodes = start_nodes(problem, path, first_mesh(path, options))
     at_start = np.zeros((2 * n, 2 * n))
     at_end = np.zeros((2 * n, 2 * n))
     at_start[:n, :n] = np.eye(n)

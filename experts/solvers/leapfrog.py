@@ -23,7 +23,7 @@ from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.feasible_path import LONG_ARC_ACCURACY, FeasiblePath
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
-from leapnav.experts.solvers.nodes import MAX_SEGMENTS, MIN_SEGMENTS, SolverOptions, default_segments, start_nodes
+from leapnav.experts.solvers.nodes import MAX_SEGMENTS, MIN_SEGMENTS, SolverOptions, first_mesh, start_nodes
 from leapnav.experts.solvers.single_shooting import single_shooting
 
 # Largest end error of an arc, and tolerance of the integrator: state defects stay below 1e-9 although errors grow along
@@ -41,7 +41,7 @@ MAX_REJECTED_SWEEPS = 3  # consecutive sweeps with rejected moves before the arc
 
 def leapfrog(problem: OptimalControlProblem, path: Trajectory, options: SolverOptions) -> Extremal:
     """Solve by Leapfrog sweeps, followed by Newton's method (`polish`) or by a reduction of the nodes."""
-    times, nodes = start_nodes(problem, path, options.segments or default_segments(path))
+    times, nodes = start_nodes(problem, path, first_mesh(path, options))
     accuracy = ACCURACY if options.polish else LONG_ARC_ACCURACY
     half_cost = options.update == "half_cost"
     iterate = FeasiblePath(problem, times, nodes, ARC_TOLERANCE, accuracy, half_cost)

@@ -9,7 +9,7 @@ from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.newton import MARGIN, segment_growth, solve_nodes
-from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
+from leapnav.experts.solvers.nodes import SolverOptions, first_mesh, start_nodes
 from leapnav.experts.solvers.outcome import KERNEL_STATUS
 
 # Tolerance of the integrator relative to the tolerance of Newton's method, and where the certificate does not confirm
@@ -28,7 +28,7 @@ def multiple_shooting(problem: OptimalControlProblem, path: Trajectory, options:
     If it fails, the segments over which the flow is too sensitive are divided, or all segments if there are none, and
     Newton's method starts again from the same path.
     """
-    times, nodes = start_nodes(problem, path, options.segments or default_segments(path))
+    times, nodes = start_nodes(problem, path, first_mesh(path, options))
     mesh = times.copy()
     status, history, evaluations = polish(problem, times, nodes, options.tol, options.max_iterations)
     for _ in range(MAX_REFINEMENTS):

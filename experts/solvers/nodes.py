@@ -22,6 +22,7 @@ class SolverOptions:
         tol: largest residual of the boundary and continuity conditions.
         max_iterations: largest number of Newton steps.
         segments: number of shooting segments; None chooses it from the guess.
+        mesh: times (segments + 1,) of the nodes, from 0 to the horizon (s); None for equal segments.
         subdivide: whether multiple shooting may divide segments.
         polish: whether Leapfrog and collocation end with multiple-shooting Newton steps.
         update: where Leapfrog moves a node on the extremal of its sub-problem, at the mean time or at half the cost.
@@ -32,6 +33,7 @@ class SolverOptions:
     tol: float = 1e-9
     max_iterations: int = 60
     segments: int | None = None
+    mesh: np.ndarray | None = None
     subdivide: bool = True
     polish: bool = True
     update: Literal["mean_time", "half_cost"] = "mean_time"
@@ -46,8 +48,7 @@ def start_nodes(
     Args:
         problem: the problem.
         path: the path; its costates are estimated if it has none. Its duration is the guess of a free horizon.
-        segments: number of segments, each with the same number of points of the path, or the times (segments + 1,) of
-            the nodes.
+        segments: number of segments of equal duration, or the times (segments + 1,) of the nodes.
 
     Returns:
         Times (segments + 1,) and nodes (segments + 1, 2n).
@@ -56,11 +57,7 @@ def start_nodes(
         ValueError: the path has another number of states.
 
     """
-    if isinstance(segments, int):
-        times = _spread(path.times, segments + 1)
-        times[0], times[-1] = 0.0, problem.horizon_of(path)  # exactly
-    else:
-        times = segments
+    times = np.linspace(0.0, problem.horizon_of(path), segments + 1) if isinstance(segments, int) else segments
     resampled = path.resample(times)
     if resampled.states.shape[1] != problem.system.n:
         raise ValueError(f"states: expected {problem.system.n} columns, got {resampled.states.shape[1]}")
@@ -78,6 +75,11 @@ def _spread(times: np.ndarray, count: int) -> np.ndarray:
     return np.interp(np.linspace(0.0, len(times) - 1.0, count), np.arange(len(times)), times)
 
 
+def first_mesh(path: Trajectory, options: SolverOptions) -> int | np.ndarray:
+    """Return the times of the first nodes, or the number of segments of equal duration."""
+    return options.segments or default_segments(path) if options.mesh is None else options.mesh.copy()
+
+
 def default_segments(path: Trajectory) -> int:
     """Return the larger of one segment per 0.5 s and one per two points of a lattice path (0.4 to 0.7 m)."""
     return int(np.clip(max(len(path.times) / 2, path.times[-1] / 0.5), MIN_SEGMENTS, MAX_SEGMENTS))
@@ -86,9 +88,9 @@ def default_segments(path: Trajectory) -> int:
 def path_of(
     problem: OptimalControlProblem, extremal: Extremal, options: SolverOptions
 ) -> tuple[Trajectory, SolverOptions]:
-    """Return an extremal as the initial path of a problem, and options with its number of segments.
+    """Return an extremal as the initial path of a problem, and options with nodes on it, as many as it has.
 
-    The points of the path are as dense as the steps of the integrator.
+    Between two nodes there are equal numbers of steps of the integrator.
 
     Raises:
         ValueError: the extremal has no path, or another number of states.
@@ -99,10 +101,12 @@ def path_of(
     n, expected = extremal.states.shape[1], problem.system.n
     if n != expected:
         raise ValueError(f"guess: the extremal has {n} states, the problem {expected}")
-    if options.segments is None and extremal.n_nodes > 2:
-        options = replace(options, segments=extremal.n_nodes - 1)
-    times = _spread(extremal.times, POINTS_PER_SEGMENT * (options.segments or MIN_SEGMENTS) + 1)
+    segments = options.segments or (extremal.n_nodes - 1 if extremal.n_nodes > 2 else MIN_SEGMENTS)
+    times = _spread(extremal.times, POINTS_PER_SEGMENT * segments + 1)
     values = extremal.interpolate(times)
     # If the horizons differ, time is scaled.
-    factor = 1.0 if problem.horizon is None else problem.horizon / float(extremal.times[-1])
-    return Trajectory(factor * times, values[:, :n], values[:, n:]), options
+    duration = float(extremal.times[-1]) if problem.horizon is None else problem.horizon
+    times *= duration / float(extremal.times[-1])
+    times[-1] = duration  # exactly
+    mesh = times[::POINTS_PER_SEGMENT].copy()
+    return Trajectory(times, values[:, :n], values[:, n:]), replace(options, mesh=mesh)

@@ -10,7 +10,7 @@ from leapnav.experts.problem.extremal import Extremal, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.newton import CONVERGED, solve_arc
-from leapnav.experts.solvers.nodes import SolverOptions, default_segments, start_nodes
+from leapnav.experts.solvers.nodes import SolverOptions, first_mesh, start_nodes
 
 # Fraction of the horizon over which the continuation improves a guess, and its first and smallest step, as fractions of
 # that.
@@ -24,7 +24,7 @@ def single_shooting(problem: OptimalControlProblem, path: Trajectory, options: S
     If the guess is too poor for the whole horizon, it is first improved by continuation in the horizon, with points of
     the path as goals.
     """
-    guess = start_nodes(problem, path, options.segments or default_segments(path))[1][0]
+    guess = start_nodes(problem, path, first_mesh(path, options))[1][0]
     times, nodes = segment(problem, guess, problem.horizon_of(path))
     status, history, evaluations = polish(problem, times, nodes, options.tol, options.max_iterations)
     if status is not Status.SUCCESS:
