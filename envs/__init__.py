@@ -2,7 +2,7 @@
 
 from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.robots import Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
+from leapnav.envs.robots import Box, Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import BankError, ScenarioBank
 from leapnav.envs.scenarios.banks.checks import Reference
 from leapnav.envs.scenarios.cost import Cost
@@ -18,6 +18,7 @@ from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 __all__ = [
     "FAMILIES",
     "BankError",
+    "Box",
     "Capsule",
     "Car",
     "Circle",

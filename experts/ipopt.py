@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import casadi
@@ -14,6 +15,7 @@ from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 
 TOLERANCE, MAX_ITERATIONS = 1e-6, 300
+ROUNDING = 1e-9  # m, below which a square root is smooth
 
 
 # CasADi's functions by their names in SymPy.
@@ -54,9 +56,8 @@ class Transcription:
         running = evaluate(sp.sympify(problem.state_cost)) + problem.time_weight
         for j, weight in enumerate(problem.control_weight):
             running += weight * u[j, :] ** 2 / 2
-        for offset, radius in scenario.discs.tolist():
-            x, y = q[0, :] + offset * casadi.cos(q[2, :]), q[1, :] + offset * casadi.sin(q[2, :])
-            running += scenario.cost.proximity_weight * _proximity(scenario, x, y, radius)
+        for row in scenario.outline.tolist():
+            running += scenario.cost.proximity_weight * _proximity(scenario, q, row)
         steps = q[:, 1:] - q[:, :-1] - h / 2 * (rates[:, 1:] + rates[:, :-1])
         fixed = [i for i, value in enumerate(problem.goal) if value is not None]
         constraints = casadi.vertcat(
@@ -108,14 +109,39 @@ class Transcription:
         return Trajectory(times, values[: states.size].reshape(states.shape))
 
 
-def _proximity(scenario: Scenario, x: Any, y: Any, radius: float) -> Any:
-    """The proximity cost of a disc divided by its weight, written independently of the kernels."""
+def _proximity(scenario: Scenario, q: Any, row: Sequence[float]) -> Any:
+    """The proximity cost of a disc or a rectangle divided by its weight, written independently of the kernels.
+
+    Args:
+        scenario: the scenario.
+        q: states (n, N).
+        row: of the outline.
+
+    """
+    rear, front, half_width, radius = row
+    x, y, cos, sin = q[0, :], q[1, :], casadi.cos(q[2, :]), casadi.sin(q[2, :])
+    is_disc = rear == front
+    corners = [(a, b) for a in {rear, front} for b in {half_width, -half_width}]
+    points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in corners]
     x_min, y_min, x_max, y_max = scenario.arena
-    distances = [x - x_min, x_max - x, y - y_min, y_max - y]
+    distances = [d for px, py in points for d in (px - x_min, x_max - px, py - y_min, y_max - py)]
     for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
         vertices, rounding = part.rounded_polygon()
-        distances.append(_polygon_distance(vertices, x, y) - rounding)
+        if is_disc or len(np.unique(vertices, axis=0)) > 1:
+            distances += [_polygon_distance(vertices, px, py) - rounding for px, py in points]
+        if not is_disc:
+            for vx, vy in np.unique(vertices, axis=0).tolist():
+                ahead, left = (vx - x) * cos + (vy - y) * sin, (vy - y) * cos - (vx - x) * sin
+                distances.append(_rectangle_distance(ahead, left, rear, front, half_width) - rounding)
     return sum(_barrier((distance - radius) / scenario.cost.proximity_scale) for distance in distances)
+
+
+def _rectangle_distance(ahead: Any, left: Any, rear: float, front: float, half_width: float) -> Any:
+    """The distance of a point in the frame of a rectangle; inside, the negative distance to the nearest side."""
+    along, across = casadi.fmax(rear - ahead, ahead - front), casadi.fmax(left, -left) - half_width
+    outside = casadi.sqrt(casadi.fmax(along, 0) ** 2 + casadi.fmax(across, 0) ** 2 + ROUNDING**2)
+    inside = casadi.fmax(along, across)
+    return casadi.if_else(inside < 0, inside, outside)
 
 
 def _barrier(s: Any) -> Any:

@@ -16,6 +16,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from leapnav.envs import shapes
+from leapnav.envs.robots.footprints import corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
@@ -49,7 +50,7 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
             axes.add_patch(Polygon(part.outline(), facecolor=OBSTACLE, edgecolor=EDGE))
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
     for pose, color in ((scenario.start, START), (scenario.goal, GOAL)):
-        draw_robot(axes, pose, scenario.discs, color)
+        draw_robot(axes, pose, scenario.outline, color)
     margin = 0.02 * (x_max - x_min)
     axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - margin, y_max + margin), aspect="equal")
     axes.set_xticks([])
@@ -58,15 +59,19 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
         spine.set_visible(False)
 
 
-def draw_robot(axes: Axes, pose: Any, discs: np.ndarray, color: str, **style: Any) -> None:
-    """Draw the discs (D, 2) of a robot, and a line along its heading unless that is None."""
+def draw_robot(axes: Axes, pose: Any, outline: np.ndarray, color: str, **style: Any) -> None:
+    """Draw the outline (K, 4) of a robot, and a line along its heading unless that is None."""
     x, y, heading = pose[:3]
     cos, sin = (1.0, 0.0) if heading is None else (np.cos(heading), np.sin(heading))
-    for offset, radius in discs:
-        centre = x + offset * cos, y + offset * sin
-        axes.add_patch(Circle(centre, radius, fill=False, edgecolor=color, **{"linewidth": 1.4, **style}))
+    lines = {"fill": False, "edgecolor": color, "linewidth": 1.4, **style}
+    for row in outline.tolist():
+        rear, front, _, radius = row
+        if front > rear:
+            axes.add_patch(Polygon(corners_of(row, (x, y, heading or 0.0)), **lines))
+        else:
+            axes.add_patch(Circle((x + rear * cos, y + rear * sin), radius, **lines))
     if heading is not None:
-        reach = max(offset + 1.6 * radius for offset, radius in discs)
+        reach = float((outline[:, 1] + 0.6 * outline[:, 2] + 1.6 * outline[:, 3]).max())
         axes.plot([x, x + reach * cos], [y, y + reach * sin], color=color, **{"linewidth": 1.8, **style})
 
 
@@ -226,7 +231,7 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
     if scenario is not None:
         draw_scenario(axes, scenario)
         for pose in poses[1:-1]:
-            draw_robot(axes, pose, scenario.discs, OPTIMUM, alpha=0.3, zorder=3)
+            draw_robot(axes, pose, scenario.outline, OPTIMUM, alpha=0.3, zorder=3)
         return
     low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
     center, reach = (low + high) / 2, 0.6 * float((high - low).max()) or 1.0

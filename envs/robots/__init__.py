@@ -1,13 +1,14 @@
 """Robot models: one file each, see `leapnav.envs.robots.base`."""
 
-from leapnav.envs.robots.base import Disc, Dynamics, RobotModel, Symmetry, register
+from leapnav.envs.robots.base import Dynamics, RobotModel, Symmetry, register
 from leapnav.envs.robots.car import Car
 from leapnav.envs.robots.differential_drive import DifferentialDrive
 from leapnav.envs.robots.dynamic_unicycle import DynamicUnicycle
-from leapnav.envs.robots.footprints import box_footprint
+from leapnav.envs.robots.footprints import Box, Disc
 from leapnav.envs.robots.unicycle import Unicycle
 
 __all__ = [
+    "Box",
     "Car",
     "DifferentialDrive",
     "Disc",
@@ -16,6 +17,5 @@ __all__ = [
     "RobotModel",
     "Symmetry",
     "Unicycle",
-    "box_footprint",
     "register",
 ]

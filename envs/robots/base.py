@@ -10,15 +10,16 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numba import types
-from pydantic import Field, model_serializer, model_validator
+from pydantic import model_serializer, model_validator
 
 from leapnav.envs.kernels.types import CONSTANT, NOTHING, VECTOR
+from leapnav.envs.robots.footprints import Disc, Footprint, outline_of
 from leapnav.envs.robots.moves import Moves, rotating_moves
-from leapnav.envs.utils.records import Finite, Frozen, Positive
+from leapnav.envs.utils.records import Frozen, Positive
 from leapnav.envs.utils.validation import suggestion
 
 if TYPE_CHECKING:
@@ -77,13 +78,6 @@ class Symmetry:
     controls: tuple[tuple[float, ...], ...]
 
 
-class Disc(Frozen):
-    """A disc of a footprint: offset of its centre along the robot's axis, positive ahead, and radius (m)."""
-
-    offset: Finite = 0.0
-    radius: Positive
-
-
 def magnitude(interval: tuple[float, float]) -> float:
     """Return the largest absolute value in an interval."""
     return max(-interval[0], interval[1])
@@ -103,7 +97,7 @@ class RobotModel(Frozen):
     Args:
         model: name of the model.
         radius: radius (m) of a robot that is one disc around (x, y).
-        footprint: discs along the robot's axis that cover another outline; instead of `radius`.
+        footprint: another outline, instead of `radius`: discs (`Disc`) along the robot's axis, or a rectangle (`Box`).
 
     Attributes:
         state_names: names of the n states, those of POSE first. Further states are observed as `motion`.
@@ -148,12 +142,12 @@ class RobotModel(Frozen):
 
     model: Any = ""  # a literal in each model
     radius: Positive = 0.25
-    footprint: Annotated[tuple[Disc, ...], Field(min_length=1)] | None = None
+    footprint: Footprint | None = None
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Self:
         if self.footprint is not None and "radius" in self.model_fields_set:
-            raise ValueError("radius: cannot be combined with footprint, whose discs have radii of their own")
+            raise ValueError("radius: cannot be combined with footprint, which has a size of its own")
         for name in self._intervals:
             if f"max_{name}" in self.model_fields_set:
                 raise ValueError(f"max_{name}: cannot be combined with {name}, which has both limits")
@@ -224,14 +218,9 @@ class RobotModel(Frozen):
         """Return the values of the parameters of `dynamics`."""
         return ()
 
-    def discs(self) -> np.ndarray:
-        """Return the footprint as a read-only array (D, 2) of offsets and radii (m)."""
-        discs = (
-            [(0.0, self.radius)] if self.footprint is None else [(disc.offset, disc.radius) for disc in self.footprint]
-        )
-        array = np.array(discs, dtype=float)
-        array.flags.writeable = False
-        return array
+    def outline(self) -> np.ndarray:
+        """Return the footprint as a read-only array (K, 4), see `leapnav.envs.robots.footprints.outline_of`."""
+        return outline_of((Disc(radius=self.radius),) if self.footprint is None else self.footprint)
 
     def metric(self, cost: CostWeights) -> tuple[float, float]:
         """Return the weights of the squared speed and turn rate in the metric of the lattice."""

@@ -1,45 +1,101 @@
-"""Footprints of box-shaped robots as discs along the robot's axis."""
+"""Footprints: the outlines of robots that are not one disc around their reference point."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
-from leapnav.envs.robots.base import Disc
-from leapnav.envs.utils.validation import check_at_least, check_positive
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError, WrapValidator, model_serializer
+
+from leapnav.envs.utils.records import Finite, Frozen, Positive, as_tuples, inside
 
 
-def box_footprint(
-    front: float, rear: float, width: float, count: int = 4, *, rounded: bool = False
-) -> tuple[Disc, ...]:
-    """Return discs along the axis of a robot whose outline is a rectangle.
+class Disc(Frozen):
+    """A disc of a footprint: offset of its centre along the robot's axis, positive ahead, and radius (m)."""
 
-    Discs that cover the corners protrude: with `count` discs, by half the difference of their diameter and the width at
-    the sides, and by more at the ends. Rounded discs have the width of the rectangle and end where it ends, so that its
-    corners are left out, and between the discs a narrow part of its sides.
+    offset: Finite = 0.0
+    radius: Positive
 
-    Args:
-        front, rear: distances (m) from (x, y) to the front and to the rear end.
-        width: width (m).
-        count: number of discs.
-        rounded: whether to leave out the corners instead of covering them.
 
-    Raises:
-        ValueError: an argument is not positive; with `rounded`, the rectangle is not longer than wide, or the discs do
-            not overlap.
+class Box(Frozen):
+    """A rectangular footprint: length along the robot's axis, width, and offset of its centre, positive ahead (m).
 
+    In Python `Unicycle(footprint=Box(length=0.5, width=0.25))`, in the scenario file
+    `"footprint": {"box": {"length": 0.5, "width": 0.25}}`.
     """
-    for name, value in (("front", front), ("rear", rear), ("width", width)):
-        check_positive(name, value)
-    check_at_least("count", count, 1)
-    length = front + rear
-    if not rounded:
-        part = length / count
-        radius = math.hypot(part / 2, width / 2)
-        return tuple(Disc(offset=-rear + part * (k + 0.5), radius=radius) for k in range(count))
-    if length <= width:
-        raise ValueError(f"width: expected less than the length {length:g} of a rounded footprint, got {width:g}")
-    needed = math.ceil((length - width) / width - 1e-9) + 1
-    if count < needed:
-        raise ValueError(f"count: expected at least {needed} discs that overlap, got {count}")
-    step = (length - width) / (count - 1)
-    return tuple(Disc(offset=-rear + width / 2 + step * k, radius=width / 2) for k in range(count))
+
+    length: Positive
+    width: Positive
+    offset: Finite = 0.0
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, handler: Any) -> dict[str, Any]:
+        return {"box": handler(self)}
+
+
+DISCS = TypeAdapter(Annotated[tuple[Disc, ...], Field(min_length=1)])
+
+
+def _read(value: Any, _: Any) -> tuple[Disc, ...] | Box:
+    """Return a footprint from its form in a scenario file; the locations of faults are without names of union types."""
+    if isinstance(value, Box):
+        return value
+    if not isinstance(value, Mapping):
+        return DISCS.validate_python(as_tuples(value))
+    if set(value) != {"box"}:
+        raise ValueError('expected discs or {"box": {"length": ..., "width": ...}}')
+    try:
+        return Box.model_validate(value["box"])
+    except ValidationError as error:
+        raise inside("box", error) from None
+
+
+Footprint = Annotated[tuple[Disc, ...] | Box, WrapValidator(_read)]
+
+
+def outline_of(footprint: Sequence[Disc] | Box) -> np.ndarray:
+    """Return an outline (K, 4): rear, front, half width and radius (m) of discs and rectangles, read-only.
+
+    A row is the rectangle from `rear` to `front` along the robot's axis, enlarged by the radius; of a disc, the
+    rectangle is its centre, and of a `Box` the radius is 0.
+    """
+    if isinstance(footprint, Box):
+        middle, half = footprint.offset, footprint.length / 2
+        rows = [(middle - half, middle + half, footprint.width / 2, 0.0)]
+    else:
+        rows = [(disc.offset, disc.offset, 0.0, disc.radius) for disc in footprint]
+    outline = np.array(rows, dtype=float)
+    outline.flags.writeable = False
+    return outline
+
+
+def sizes_of(outline: np.ndarray) -> tuple[float, float]:
+    """Return radius and extent (m) of an outline, see `leapnav.envs.shapes.field.HEADER`."""
+    rear, front, half_width, radius = outline.T
+    return float((half_width + radius).max()), float((np.hypot((front - rear) / 2, half_width) + radius).max())
+
+
+def arm_of(outline: np.ndarray) -> float:
+    """Return the largest distance (m) from the reference point of a point by which the robot may touch an obstacle.
+
+    These are the centres of discs, whose radius is constant, and the corners of rectangles.
+    """
+    return float(np.hypot(np.abs(outline[:, :2]).max(axis=1), outline[:, 2]).max())
+
+
+def enclosed_radius(outline: np.ndarray) -> float:
+    """Return the radius (m) of the largest disc around the reference point in an outline; negative outside of it."""
+    rear, front, half_width, radius = outline.T
+    return float((np.minimum(half_width, np.minimum(front, -rear)) + radius).max())
+
+
+def corners_of(row: Sequence[float], pose: Sequence[float]) -> np.ndarray:
+    """Return the corners (4, 2) (m) of a rectangle of an outline at a pose, counter-clockwise."""
+    rear, front, half_width, _ = row
+    x, y, heading = pose[:3]
+    cos, sin = math.cos(heading), math.sin(heading)
+    ahead = np.array([rear, front, front, rear])
+    left = np.array([-half_width, -half_width, half_width, half_width])
+    return np.column_stack([x + ahead * cos - left * sin, y + ahead * sin + left * cos])

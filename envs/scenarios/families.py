@@ -20,9 +20,10 @@ from typing import Any, cast
 import numpy as np
 
 from leapnav.envs.robots import RobotModel
+from leapnav.envs.robots.footprints import sizes_of
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.files import read_scenarios
-from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Box, ScenarioLayout, rounded
+from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Area, ScenarioLayout, rounded
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
 from leapnav.envs.shapes.clearance import clearances, footprint_clearances
@@ -285,7 +286,7 @@ def _sample_task(
     layout: ScenarioLayout, rng: np.random.Generator, body: RobotModel, horizon: str, obstacles: str
 ) -> dict[str, Any] | None:
     """Return random poses, the horizon and the cost; None if the poses are too close or not connected."""
-    discs, cost = body.discs(), random_cost(horizon, obstacles)
+    outline, cost = body.outline(), random_cost(horizon, obstacles)
     areas = layout.regions
     poses = np.column_stack([rng.uniform(areas[:, :2], areas[:, 2:]), rng.uniform(-math.pi, math.pi, 2)])
     x_min, y_min, x_max, y_max = layout.arena
@@ -295,12 +296,12 @@ def _sample_task(
     field = pack_field(
         [obstacle.shape for obstacle in layout.obstacles],
         layout.arena,
-        float(discs[:, 1].max()),
+        sizes_of(outline),
         cost.proximity_weight,
         cost.proximity_scale,
         grid=False,
     )
-    if footprint_clearances(poses, discs, field).min() < MIN_POSE_CLEARANCE:
+    if footprint_clearances(poses, outline, field).min() < MIN_POSE_CLEARANCE:
         return None
     length = _shortest_path(layout.arena, field, poses[0, :2], poses[1, :2])
     if length is None:
@@ -326,7 +327,7 @@ class _Grid:
 
 
 @lru_cache(maxsize=8)
-def _grid(arena: Box) -> _Grid:
+def _grid(arena: Area) -> _Grid:
     x_min, y_min, x_max, y_max = arena
     columns = np.arange(x_min + GRID_SPACING, x_max, GRID_SPACING)
     rows = np.arange(y_min + GRID_SPACING, y_max, GRID_SPACING)
@@ -343,7 +344,7 @@ def _grid(arena: Box) -> _Grid:
     return _Grid(points, tail, head, (points[tail] + points[head]) / 2, np.concatenate(lengths))
 
 
-def _shortest_path(arena: Box, field: np.ndarray, start: np.ndarray, goal: np.ndarray) -> float | None:
+def _shortest_path(arena: Area, field: np.ndarray, start: np.ndarray, goal: np.ndarray) -> float | None:
     """Return the length (m) of the shortest path on the grid, with the passage margin; None if there is no path."""
     grid = _grid(arena)
     free = clearances(grid.points, field) > PASSAGE_MARGIN

@@ -15,7 +15,7 @@ ARENA = (0.0, 0.0, 10.0, 10.0)
 POSE_MARGIN = 0.5  # m between the walls and the regions of start and goal
 DECIMALS = 4  # of every sampled number, so that scenario files stay short
 
-Box = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
+Area = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class ScenarioLayout:
     """
 
     obstacles: Sequence[Obstacle]
-    start: Box | None = None
-    goal: Box | None = None
-    arena: Box = ARENA
+    start: Area | None = None
+    goal: Area | None = None
+    arena: Area = ARENA
 
     @property
     def regions(self) -> np.ndarray:

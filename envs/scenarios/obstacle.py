@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pydantic import SerializationInfo, ValidationError, model_serializer, model_validator
-from pydantic_core import ErrorDetails, InitErrorDetails
+from pydantic_core import InitErrorDetails
 
 from leapnav.envs.shapes import Circle, Polygon, Shape
 from leapnav.envs.shapes.base import KINDS
-from leapnav.envs.utils.records import Frozen, Positive
+from leapnav.envs.utils.records import Frozen, Positive, inside
 
 
 class Obstacle(Frozen):
@@ -55,7 +55,7 @@ class Obstacle(Frozen):
             try:
                 return {"shape": KINDS[kind].model_validate(value), "mass": mass}
             except ValidationError as error:
-                faults = [_inside(kind, details) for details in error.errors(include_url=False)]
+                raise inside(kind, error) from None
         raise ValidationError.from_exception_data(cls.__name__, faults)
 
     @model_serializer
@@ -72,11 +72,3 @@ class Obstacle(Frozen):
     def polygon(self) -> Polygon | None:
         """The polygon, or None if the shape is another one."""
         return self.shape if isinstance(self.shape, Polygon) else None
-
-
-def _inside(kind: str, details: ErrorDetails) -> InitErrorDetails:
-    """Return a fault of a shape as one of its obstacle."""
-    fault: InitErrorDetails = {"type": details["type"], "loc": (kind, *details["loc"]), "input": details["input"]}
-    if "ctx" in details:
-        fault["ctx"] = details["ctx"]
-    return fault

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
 
-from leapnav.envs.robots import Disc, RobotModel, Unicycle
+from leapnav.envs.robots import Box, Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
+from leapnav.envs.robots.footprints import sizes_of
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.faults import ScenarioError, fault, one_line, read_text, shorten, unique_keys
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangle_vertices
@@ -133,10 +134,10 @@ class Scenario(Frozen):
         faults = []
         for end, pose in (("start", self.start), ("goal", self.goal)):
             x, y, heading = pose
-            distance, nearest = footprint_clearance(x, y, heading or 0.0, self.discs, self.field)
+            distance, nearest = footprint_clearance(x, y, heading or 0.0, self.outline, self.field)
             if heading is None and self.robot.footprint is not None:  # some heading must be free
                 headings = np.linspace(-np.pi, np.pi, 73).tolist()
-                found = [footprint_clearance(x, y, angle, self.discs, self.field) for angle in headings]
+                found = [footprint_clearance(x, y, angle, self.outline, self.field) for angle in headings]
                 distance, nearest = max(found)
             if not distance > 0:
                 faults.append(
@@ -151,13 +152,12 @@ class Scenario(Frozen):
         """The packed obstacle field, see `leapnav.envs.shapes.field` (read-only)."""
         cost = self.cost
         shapes = [obstacle.shape for obstacle in self.obstacles]
-        radius = float(self.discs[:, 1].max())
-        return pack_field(shapes, self.arena, radius, cost.proximity_weight, cost.proximity_scale)
+        return pack_field(shapes, self.arena, sizes_of(self.outline), cost.proximity_weight, cost.proximity_scale)
 
     @cached_property
-    def discs(self) -> np.ndarray:
-        """The discs of the robot's footprint (D, 2): offset along its axis and radius (m) (read-only)."""
-        return self.robot.discs()
+    def outline(self) -> np.ndarray:
+        """The robot's footprint (K, 4), see `leapnav.envs.robots.footprints.outline_of` (read-only)."""
+        return self.robot.outline()
 
     @property
     def start_state(self) -> tuple[float, ...]:
@@ -260,7 +260,7 @@ class Scenario(Frozen):
         # Arrays are writeable after unpickling, so the packed ones are computed again instead.
         return {
             **state,
-            "__dict__": {k: v for k, v in state["__dict__"].items() if k not in ("field", "discs", "task")},
+            "__dict__": {k: v for k, v in state["__dict__"].items() if k not in ("field", "outline", "task")},
         }
 
     def to_json(self, path: str | Path | None = None) -> str:
@@ -444,7 +444,7 @@ def check_headings(scenario: Scenario) -> None:
 
 def _known_fields(location: Sequence[Any], robot: type[RobotModel] = Unicycle) -> tuple[str, ...]:
     """Return the fields of the part of a scenario at a location."""
-    parts: dict[Any, type[BaseModel]] = {"robot": robot, "footprint": Disc, "cost": Cost, **KINDS}
+    parts: dict[Any, type[BaseModel]] = {"robot": robot, "footprint": Disc, "box": Box, "cost": Cost, **KINDS}
     names = [key for key in location if isinstance(key, str)]
     model = parts.get(names[-1]) if names else Scenario
     return tuple(KINDS) if model is None else tuple(model.model_fields)

@@ -11,6 +11,7 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.distance import part_geometry, wall_distance
 from leapnav.envs.shapes.field import header_of, parts_in
+from leapnav.envs.shapes.rectangle import ROW, separation, wall_separation
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
@@ -44,57 +45,78 @@ def clearance(x, y, field):
     return distance - header_of(field).radius, nearest
 
 
+@kernel(tuple_of(float64, int64)(float64, float64, float64, float64, ROW, CONSTANT))
+def _rectangle_clearance(x, y, cos, sin, row, field):
+    """Signed distance (m) from a rectangle to the nearest obstacle or wall, and the index of that obstacle."""
+    middle, rim = (row[0] + row[1]) / 2.0, math.hypot((row[1] - row[0]) / 2.0, row[2]) + row[3]
+    middle_x, middle_y = x + middle * cos, y + middle * sin
+    best, nearest = wall_separation(x, y, cos, sin, row, np.inf, header_of(field)), -1
+    for part in parts_in(field):
+        dx, dy = middle_x - part.x, middle_y - part.y
+        if dx * dx + dy * dy < max(best + part.rim + rim, 0.0) ** 2:
+            distance = separation(x, y, cos, sin, row, field, part)
+            if distance < best:
+                best, nearest = distance, part.obstacle
+    return best, nearest
+
+
 @kernel(tuple_of(float64, int64)(float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
-def footprint_clearance(x, y, heading, discs, field):
+def footprint_clearance(x, y, heading, outline, field):
     """Signed distance (m) from the robot's outline to the nearest obstacle or wall, and the index of that obstacle.
 
     Args:
         x, y, heading: pose (m, rad).
-        discs (D, 2): offsets along the robot's axis and radii (m); a radius that is not positive is unused.
+        outline (K, 4): see `leapnav.envs.robots.footprints.outline_of`; rows of zeros are unused.
         field: packed obstacle field.
 
     """
-    if len(discs) == 1 and discs[0, 0] == 0.0:
+    if len(outline) == 1 and outline[0, 0] == 0.0 and outline[0, 1] == 0.0:
         distance, nearest = obstacle_distance(x, y, field)
-        return distance - discs[0, 1], nearest
+        return distance - outline[0, 3], nearest
     cos, sin = math.cos(heading), math.sin(heading)
     best, found = np.inf, -1
-    for k in range(len(discs)):
-        if discs[k, 1] <= 0.0:  # unused
+    for k in range(len(outline)):
+        a = outline[k, 0]
+        if outline[k, 1] > a:
+            row = (a, outline[k, 1], outline[k, 2], outline[k, 3])
+            distance, nearest = _rectangle_clearance(x, y, cos, sin, row, field)
+        elif outline[k, 3] > 0.0:
+            distance, nearest = obstacle_distance(x + a * cos, y + a * sin, field)
+            distance -= outline[k, 3]
+        else:
             continue
-        distance, nearest = obstacle_distance(x + discs[k, 0] * cos, y + discs[k, 0] * sin, field)
-        if distance - discs[k, 1] < best:
-            best, found = distance - discs[k, 1], nearest
+        if distance < best:
+            best, found = distance, nearest
     return best, found
 
 
 @kernel(VECTOR(MATRIX, CONSTANT_MATRIX, CONSTANT))
-def footprint_clearances(poses, discs, field):
+def footprint_clearances(poses, outline, field):
     """Clearance (m) of the robot's outline at many poses, shape (N, >= 3) -> (N,)."""
     result = np.empty(len(poses))
     for i in range(len(poses)):
-        result[i] = footprint_clearance(poses[i, 0], poses[i, 1], poses[i, 2], discs, field)[0]
+        result[i] = footprint_clearance(poses[i, 0], poses[i, 1], poses[i, 2], outline, field)[0]
     return result
 
 
 @kernel(float64(MATRIX, CONSTANT_MATRIX, CONSTANT))
-def path_clearance(poses, discs, field):
+def path_clearance(poses, outline, field):
     """Smallest clearance (m) of the robot's outline along a path of poses (N, >= 3), N >= 2, also between them.
 
-    In the middle between two poses, the chord of a circle of the smallest disc's radius, such as around a vertex of an
-    obstacle, is closer to its centre than the arc, by the sagitta that is added.
+    In the middle between two poses, the chord of a circle of the radius of the smallest disc in the outline, such as
+    around a vertex of an obstacle, is closer to its centre than the arc, by the sagitta that is added.
     """
-    radius = discs[0, 1]
-    for k in range(len(discs)):
-        radius = min(radius, discs[k, 1])
-    best = footprint_clearance(poses[0, 0], poses[0, 1], poses[0, 2], discs, field)[0]
+    radius = np.inf
+    for k in range(len(outline)):
+        radius = min(radius, outline[k, 2] + outline[k, 3])
+    best = footprint_clearance(poses[0, 0], poses[0, 1], poses[0, 2], outline, field)[0]
     for i in range(1, len(poses)):
         x, y, heading = poses[i, 0], poses[i, 1], poses[i, 2]
         last_x, last_y, last = poses[i - 1, 0], poses[i - 1, 1], poses[i - 1, 2]
-        best = min(best, footprint_clearance(x, y, heading, discs, field)[0])
+        best = min(best, footprint_clearance(x, y, heading, outline, field)[0])
         sagitta = ((x - last_x) ** 2 + (y - last_y) ** 2) / (8.0 * radius)
         x, y, heading = 0.5 * (x + last_x), 0.5 * (y + last_y), 0.5 * (heading + last)
-        best = min(best, footprint_clearance(x, y, heading, discs, field)[0] + sagitta)
+        best = min(best, footprint_clearance(x, y, heading, outline, field)[0] + sagitta)
     return best
 
 

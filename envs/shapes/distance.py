@@ -18,6 +18,7 @@ from leapnav.envs.shapes.field import HEADER_TYPE, PART_TYPE, edges_of
 # Smallest distance (m) from a point, the centre of a circle or a vertex, with which normal and curvature are computed;
 # only guesses deep in an obstacle come closer.
 MIN_DISTANCE = 1e-3
+HASH_FACTOR = 31  # of numbers that are combined to one
 
 
 @kernel(float64(float64, float64, HEADER_TYPE, int64), inline="always")

@@ -27,7 +27,8 @@ HEADER = np.dtype(
     [
         ("weight", "f8"),  # proximity weight
         ("scale", "f8"),  # proximity scale (m)
-        ("radius", "f8"),  # largest radius (m) of a disc of the robot's footprint
+        ("radius", "f8"),  # radius (m) of the largest disc in the robot's outline
+        ("extent", "f8"),  # largest distance (m) of the outline from the middle of a disc or rectangle of the footprint
         ("least_distance", "f8"),  # distance (scales) below which the barrier is a quadratic polynomial
         ("arena", "f8", (4,)),  # x_min, y_min, x_max, y_max (m)
         ("grid_x", "f8"),  # corner (m) of the grid
@@ -64,7 +65,7 @@ HEADER_SIZE, PART_SIZE, EDGE_SIZE = (kind.itemsize // 8 for kind in (HEADER, PAR
 HEADER_TYPE, PART_TYPE, EDGE_TYPE = from_dtype(HEADER), from_dtype(PART), from_dtype(EDGE)
 PARTS_TYPE, EDGES_TYPE, NUMBERS = (types.Array(kind, 1, "C", readonly=True) for kind in (PART_TYPE, EDGE_TYPE, int64))
 COUNT = np.dtype("i8")
-COSTS = ("weight", "scale", "radius")
+COSTS = ("weight", "scale", "radius", "extent")
 
 # Terms of obstacles farther away than 30 sigma are skipped: they are below 1e-13 k, 1/10 of the integrator's tolerance.
 CUTOFF = 30.0
@@ -128,7 +129,7 @@ class FieldPart(NamedTuple):
 def pack_field(
     shapes: Sequence[Shape],
     arena: tuple[float, float, float, float],
-    radius: float,
+    sizes: tuple[float, float],
     weight: float,
     scale: float,
     *,
@@ -139,7 +140,7 @@ def pack_field(
     Args:
         shapes: the obstacles.
         arena: (x_min, y_min, x_max, y_max) (m).
-        radius: largest radius of a disc of the robot's footprint (m).
+        sizes: radius and extent (m) of the robot, see `HEADER`.
         weight, scale: proximity weight and proximity scale (m).
         grid: whether to compute the grid, which takes most of the time; clearances do not need it.
 
@@ -150,13 +151,14 @@ def pack_field(
             vertices, rounding = part.rounded_polygon()
             # A capsule of length zero is a disc.
             parts.append(FieldPart(vertices[:1] if (vertices == vertices[0]).all() else vertices, rounding, index))
-    return _pack(parts, arena, (weight, scale, radius), grid=grid)
+    return _pack(parts, arena, (weight, scale, *sizes), grid=grid)
 
 
 def _pack(parts: Sequence[FieldPart], arena: Any, costs: Sequence[float], *, grid: bool = True) -> np.ndarray:
-    """Return the packed field of parts, an arena, and proximity weight, proximity scale and radius."""
+    """Return the packed field of parts, an arena, and the values of COSTS."""
     header = np.zeros(1, HEADER)
-    header["weight"], header["scale"], header["radius"] = costs
+    for name, value in zip(COSTS, costs, strict=True):
+        header[name] = value
     header["least_distance"], header["arena"] = CONTACT, arena
     discs = [part for part in parts if len(part.vertices) == 1]
     polygons = [part for part in parts if len(part.vertices) > 1]
@@ -185,9 +187,9 @@ def _pack(parts: Sequence[FieldPart], arena: Any, costs: Sequence[float], *, gri
 def _grid_lists(parts: Sequence[FieldPart], edges: Sequence[np.ndarray], header: Any) -> list[Sequence[int]]:
     """Return the parts that contribute in each cell of a grid, which is written to the header.
 
-    Obstacles contribute up to CUTOFF proximity scales from the robot's rim. They may extend beyond the arena.
+    Obstacles contribute up to CUTOFF proximity scales from the robot's outline. They may extend beyond the arena.
     """
-    reach = float(header["radius"] + CUTOFF * header["scale"])
+    reach = float(header["extent"] + CUTOFF * header["scale"])
     corners = [header["arena"].reshape(2, 2)]
     corners += [part.vertices + side * part.rounding for part in parts for side in (-1.0, 1.0)]
     low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
@@ -338,8 +340,8 @@ def _pack_again(packed: np.ndarray, *, grid: bool) -> np.ndarray:
     if len(packed) < HEADER_SIZE or not np.isfinite(packed).all():
         raise IndexError("expected a header and finite numbers")
     header, n = read_header(packed), len(packed)
-    if not (header["weight"] >= 0 and header["scale"] > 0 and header["radius"] > 0):
-        raise IndexError("weight, scale or radius is invalid")
+    if not (header["weight"] >= 0 and header["scale"] > 0 and 0 < header["radius"] <= header["extent"]):
+        raise IndexError("weight, scale, radius or extent is invalid")
     if not (0 <= header["parts"] <= n and 0 <= header["edges"] <= n):
         raise IndexError("a number of parts or edges is invalid")
     _, shapes, edges = _unpack(packed)

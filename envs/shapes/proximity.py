@@ -14,11 +14,12 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.distance import closest_feature, part_geometry, wall_distance
+from leapnav.envs.shapes.distance import HASH_FACTOR, closest_feature, part_geometry, wall_distance
 from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, header_of, parts_in, parts_near
+from leapnav.envs.shapes.rectangle import add_rectangle, rectangle_features
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
-HASH_FACTOR = 31  # of numbers that are combined to one
+OUTLINE_ENTRIES = 4  # in a row of an outline, see `leapnav.envs.shapes.rectangle`
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, HEADER_TYPE), inline="always")
@@ -109,11 +110,12 @@ def proximity_value(x, y, radius, field):
 
 @kernel(tuple_of(*[float64] * 10)(float64, float64, float64, CONSTANT, int64, CONSTANT))
 def footprint_proximity(x, y, heading, data, first, field):
-    """Proximity cost of a footprint: the sum over its discs.
+    """Proximity cost of a footprint: the sum over the rows of its outline.
 
     Args:
         x, y, heading: pose (m, rad).
-        data: offset along the robot's axis and radius (m) of each disc, from the index `first` to the end.
+        data: rows of an outline, see `leapnav.envs.shapes.rectangle`, from the index `first` to the end. A disc has the
+            half width 0, and its rear and its front are its centre.
         first: see `data`.
         field: packed obstacle field.
 
@@ -123,9 +125,22 @@ def footprint_proximity(x, y, heading, data, first, field):
     """
     cos, sin = math.cos(heading), math.sin(heading)
     value = gx = gy = gh = hxx = hxy = hxh = hyy = hyh = hhh = 0.0
-    for k in range(first, len(data), 2):
+    for k in range(first, len(data), OUTLINE_ENTRIES):
         a = data[k]
-        term, tx, ty, txx, txy, tyy = disc_proximity(x + a * cos, y + a * sin, data[k + 1], field)
+        if data[k + 1] > a:
+            total, row = np.zeros(10), (a, data[k + 1], data[k + 2], data[k + 3])
+            add_rectangle(x, y, cos, sin, row, field, total)
+            weight = header_of(field).weight
+            value, gx, gy, gh = (
+                value + weight * total[0],
+                gx + weight * total[1],
+                gy + weight * total[2],
+                gh + weight * total[3],
+            )
+            hxx, hxy, hxh = hxx + weight * total[4], hxy + weight * total[5], hxh + weight * total[6]
+            hyy, hyh, hhh = hyy + weight * total[7], hyh + weight * total[8], hhh + weight * total[9]
+            continue
+        term, tx, ty, txx, txy, tyy = disc_proximity(x + a * cos, y + a * sin, data[k + 3], field)
         # Derivatives of the disc's centre with respect to the heading.
         dx, dy = -a * sin, a * cos
         value += term
@@ -139,6 +154,22 @@ def footprint_proximity(x, y, heading, data, first, field):
         hyh += txy * dx + tyy * dy
         hhh += (txx * dx + 2.0 * txy * dy) * dx + tyy * dy * dy - a * (tx * cos + ty * sin)
     return value, gx, gy, gh, hxx, hxy, hxh, hyy, hyh, hhh
+
+
+@kernel(float64(float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
+def footprint_value(x, y, heading, outline, field):
+    """Proximity cost of the outline (K, 4) of a robot at a pose (m, rad), without derivatives."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    value, weight = 0.0, header_of(field).weight
+    for k in range(len(outline)):
+        a = outline[k, 0]
+        if outline[k, 1] > a:
+            total = np.zeros(10)
+            add_rectangle(x, y, cos, sin, (a, outline[k, 1], outline[k, 2], outline[k, 3]), field, total)
+            value += weight * total[0]
+        elif outline[k, 3] > 0.0:  # otherwise unused
+            value += proximity_value(x + a * cos, y + a * sin, outline[k, 3], field)
+    return value
 
 
 @kernel(int64(float64, float64, float64, CONSTANT))
@@ -163,19 +194,21 @@ def footprint_features(x, y, heading, data, first, field):
     """Number of the closest features of a footprint, see `disc_features` and `footprint_proximity`."""
     cos, sin = math.cos(heading), math.sin(heading)
     number = 0
-    for k in range(first, len(data), 2):
-        features = disc_features(x + data[k] * cos, y + data[k] * sin, data[k + 1], field)
+    for k in range(first, len(data), OUTLINE_ENTRIES):
+        a = data[k]
+        if data[k + 1] > a:
+            features = rectangle_features(x, y, cos, sin, (a, data[k + 1], data[k + 2], data[k + 3]), field)
+        else:
+            features = disc_features(x + a * cos, y + a * sin, data[k + 3], field)
         number = HASH_FACTOR * number + features
     return number
 
 
 @kernel(VECTOR(MATRIX, CONSTANT_MATRIX, CONSTANT))
-def footprint_proximities(poses, discs, field):
-    """Proximity cost of the discs of a robot at many poses, shape (N, >= 3) -> (N,)."""
+def footprint_proximities(poses, outline, field):
+    """Proximity cost of the outline (K, 4) of a robot at many poses, shape (N, >= 3) -> (N,)."""
     result = np.zeros(len(poses))
+    data = outline.ravel()
     for i in range(len(poses)):
-        cos, sin = math.cos(poses[i, 2]), math.sin(poses[i, 2])
-        for k in range(len(discs)):
-            x, y = poses[i, 0] + discs[k, 0] * cos, poses[i, 1] + discs[k, 0] * sin
-            result[i] += disc_proximity(x, y, discs[k, 1], field)[0]
+        result[i] = footprint_proximity(poses[i, 0], poses[i, 1], poses[i, 2], data, 0, field)[0]
     return result

@@ -21,10 +21,11 @@ from pymunk.constraints import Constraint, GearJoint, PivotJoint
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
+from leapnav.envs.robots.footprints import corners_of
 from leapnav.envs.settings import Motor
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import FieldPart, field_parts, read_header, replace_parts
-from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.envs.shapes.proximity import footprint_value
 from leapnav.envs.simulation.stepping import GRAVITY
 
 WALL_THICKNESS = 1.0  # m, outside the arena
@@ -90,7 +91,7 @@ class ContactWorld:
 
     Args:
         field: the packed field of the scenario.
-        discs (D, 2): footprint of the robot, offset along its heading and radius (m).
+        outline (K, 4): footprint of the robot, see `leapnav.envs.robots.footprints.outline_of`.
         motor: mass, moment of inertia and friction of the robot.
         masses: mass (kg) of each obstacle; None: it does not move.
 
@@ -99,8 +100,14 @@ class ContactWorld:
 
     """
 
-    def __init__(self, field: np.ndarray, discs: np.ndarray, motor: Motor, masses: Sequence[float | None] = ()) -> None:
-        self.field, self._discs, self._motor = field, discs, motor
+    def __init__(
+        self, field: np.ndarray, outline: np.ndarray, motor: Motor, masses: Sequence[float | None] = ()
+    ) -> None:
+        self.field, self._outline, self._motor = field, outline, motor
+        # For the proximity cost: Chipmunk does not resolve the position of a robot in contact more finely.
+        self._smaller = outline - CONTACT_MARGIN * np.where(
+            outline[:, 1:2] > outline[:, :1], (-1, 1, 1, 0), (0, 0, 0, 1)
+        )
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
@@ -164,11 +171,7 @@ class ContactWorld:
 
         # A new body in each period: the memory of bodies and contacts must not carry over to the next period.
         body = pymunk.Body(self._motor.mass, self._motor.moment)
-        outline = [
-            pymunk.Circle(body, radius + CONTACT_MARGIN, (offset, 0.0)) for offset, radius in self._discs.tolist()
-        ]
-        for disc in outline:
-            disc.friction = self._motor.friction
+        outline = [self._shape(body, row) for row in self._outline.tolist()]
         x, y, angle = row[:3].tolist()
         body.position, body.angle = (x, y), angle
         body.velocity, body.angular_velocity = (velocity[0], velocity[1]), velocity[2]
@@ -182,7 +185,7 @@ class ContactWorld:
             self._space.step(step)
             to_x, to_y, to_angle = _pose(body)
             self._move_obstacles()
-            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, to_angle, self._discs, self.field)
+            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, to_angle, self._outline, self.field)
             body.position = to_x, to_y
             lowest = min(lowest, depth)
             speed_integral += ((to_x - x) ** 2 + (to_y - y) ** 2) / step
@@ -208,13 +211,20 @@ class ContactWorld:
 
         self.field = replace_parts(self.field, [moved(part) for part in self._parts])
 
-    def _proximity(self, x: float, y: float, heading: float) -> float:
-        """Return the proximity cost at a pose, with clearances larger by CONTACT_MARGIN.
+    def _shape(self, body: pymunk.Body, row: Sequence[float]) -> pymunk.Shape:
+        """Return a disc or a rectangle of the footprint, enlarged by the margin."""
+        rear, front, _, radius = row
+        if front > rear:
+            corners = [(x, y) for x, y in corners_of(row, (0.0, 0.0, 0.0)).tolist()]
+            shape: pymunk.Shape = pymunk.Poly(body, corners, radius=radius + CONTACT_MARGIN)
+        else:
+            shape = pymunk.Circle(body, radius + CONTACT_MARGIN, (rear, 0.0))
+        shape.friction = self._motor.friction
+        return shape
 
-        Chipmunk does not resolve the position of a robot in contact more finely, and Phi varies by a multiple there.
-        """
-        cos, sin, discs = math.cos(heading), math.sin(heading), self._discs.tolist()
-        return sum(proximity_value(x + a * cos, y + a * sin, r - CONTACT_MARGIN, self.field) for a, r in discs)
+    def _proximity(self, x: float, y: float, heading: float) -> float:
+        """Return the proximity cost at a pose, with clearances larger by CONTACT_MARGIN."""
+        return footprint_value(x, y, heading, self._smaller, self.field)
 
 
 def _ground_friction(static: pymunk.Body, body: pymunk.Body) -> tuple[Constraint, ...]:
@@ -234,7 +244,7 @@ def _pose(body: pymunk.Body) -> tuple[float, float, float]:
 
 
 @kernel(types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
-def resolve_overlap(x, y, to_x, to_y, heading, discs, field):
+def resolve_overlap(x, y, to_x, to_y, heading, outline, field):
     """Move a robot out of an obstacle that it overlaps after a step of Chipmunk from (x, y) to (to_x, to_y).
 
     Chipmunk detects a contact only after bodies overlap, by up to the length of a step. After a short step, the robot
@@ -246,17 +256,19 @@ def resolve_overlap(x, y, to_x, to_y, heading, discs, field):
 
     """
     step = math.hypot(to_x - x, to_y - y)
-    before = footprint_clearance(to_x, to_y, heading, discs, field)[0]
-    smallest = discs[0, 1]
-    for k in range(len(discs)):
-        smallest = min(smallest, discs[k, 1])
+    before = footprint_clearance(to_x, to_y, heading, outline, field)[0]
+    smallest = np.inf
+    for k in range(len(outline)):
+        smallest = min(smallest, outline[k, 2] + outline[k, 3])
     if step > MAX_CORRECTED_STEP * smallest:
         # Steps of at most the clearance, so that the first contact is not missed.
         fraction = 0.0
-        here = max(footprint_clearance(x, y, heading, discs, field)[0], MAX_OVERLAP)
+        here = max(footprint_clearance(x, y, heading, outline, field)[0], MAX_OVERLAP)
         while fraction < 1.0:
             following = min(fraction + here / step, 1.0)
-            here = footprint_clearance(x + following * (to_x - x), y + following * (to_y - y), heading, discs, field)[0]
+            here = footprint_clearance(x + following * (to_x - x), y + following * (to_y - y), heading, outline, field)[
+                0
+            ]
             if here < MAX_OVERLAP:
                 break
             fraction = following
@@ -267,14 +279,14 @@ def resolve_overlap(x, y, to_x, to_y, heading, discs, field):
     for _ in range(50):
         if depth >= -MAX_OVERLAP:
             return new_x, new_y, before
-        nx = footprint_clearance(new_x + h, new_y, heading, discs, field)[0]
-        nx -= footprint_clearance(new_x - h, new_y, heading, discs, field)[0]
-        ny = footprint_clearance(new_x, new_y + h, heading, discs, field)[0]
-        ny -= footprint_clearance(new_x, new_y - h, heading, discs, field)[0]
+        nx = footprint_clearance(new_x + h, new_y, heading, outline, field)[0]
+        nx -= footprint_clearance(new_x - h, new_y, heading, outline, field)[0]
+        ny = footprint_clearance(new_x, new_y + h, heading, outline, field)[0]
+        ny -= footprint_clearance(new_x, new_y - h, heading, outline, field)[0]
         size = math.hypot(nx, ny)
         if size == 0.0:
             break
         new_x -= depth * nx / size
         new_y -= depth * ny / size
-        depth = footprint_clearance(new_x, new_y, heading, discs, field)[0]
+        depth = footprint_clearance(new_x, new_y, heading, outline, field)[0]
     return x, y, before

@@ -19,7 +19,7 @@ from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
 from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import header_of
-from leapnav.envs.shapes.proximity import proximity_values
+from leapnav.envs.shapes.proximity import footprint_value, proximity_values
 
 ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
@@ -70,7 +70,7 @@ class Path(NamedTuple):
         q (n,): state at the start.
         u (m,): held controls.
         parameters: parameters of the model.
-        discs (D, 2): footprint.
+        outline (K, 4): footprint, see `leapnav.envs.robots.footprints.outline_of`.
         field: packed obstacle field.
         duration: s.
         samples (5 or more, n): working memory: the states at the nodes of a panel, and two other states. Further rows
@@ -82,7 +82,7 @@ class Path(NamedTuple):
     q: np.ndarray
     u: np.ndarray
     parameters: np.ndarray
-    discs: np.ndarray
+    outline: np.ndarray
     field: np.ndarray
     duration: float
     samples: np.ndarray
@@ -94,7 +94,7 @@ PATH = record_type(
     q=VECTOR,
     u=VECTOR,
     parameters=VECTOR,
-    discs=MATRIX,
+    outline=MATRIX,
     field=CONSTANT,
     duration=float64,
     samples=MATRIX,
@@ -122,24 +122,27 @@ def state_after(path, fraction, new):
 @kernel(float64(PATH, VECTOR), inline="always")
 def clearance_at(path, q):
     """Return the clearance (m) at a state of the path."""
-    return footprint_clearance(q[0], q[1], q[2], path.discs, path.field)[0]
+    return footprint_clearance(q[0], q[1], q[2], path.outline, path.field)[0]
 
 
 @kernel(float64(PATH, VECTOR), inline="always")
 def _speed_after(path, q):
-    """Return the largest speed (m/s) of the robot's position and discs at a state of the path."""
+    """Return the largest speed (m/s) of the robot's position and of its outline at a state of the path."""
     new, time = path.samples[4], SHORT * path.duration
     path.motion.advance(q, path.u, time, path.parameters, new)
     speed = math.sqrt((new[0] - q[0]) ** 2 + (new[1] - q[1]) ** 2) / time
     turn_rate, arm = abs(new[2] - q[2]) / time, 0.0
-    for k in range(len(path.discs)):
-        arm = max(arm, abs(path.discs[k, 0]))
+    for k in range(len(path.outline)):
+        reach = max(abs(path.outline[k, 0]), abs(path.outline[k, 1]))
+        if path.outline[k, 2] > 0.0:  # the corners of a rectangle
+            reach = math.hypot(reach, path.outline[k, 2])
+        arm = max(arm, reach)
     return speed + arm * turn_rate
 
 
 @kernel(float64(PATH, VECTOR), inline="always")
 def largest_distance(path, end):
-    """Return a bound of the distance (m) that a disc travels along the path to the state `end`."""
+    """Return a bound of the distance (m) that a disc or corner of the robot travels along the path to the state `end`."""
     first, last = _speed_after(path, path.q), _speed_after(path, end)
     return path.duration * (max(first, last) + SPEED_MARGIN * abs(first - last))
 
@@ -214,13 +217,18 @@ def _panel_costs(path, start, width):
 
     The panel is from a fraction `start` to `start` + `width`.
     """
-    samples, discs, proximity, state_cost = path.samples, path.discs, 0.0, 0.0
+    samples, outline, proximity, state_cost = path.samples, path.outline, 0.0, 0.0
     for k in range(3):
         state_after(path, start + NODES[k] * width, samples[k])
         state_cost += NODE_WEIGHTS[k] * path.motion.state_cost(samples[k], path.parameters)
     first, second, third = samples[0], samples[1], samples[2]
-    for d in range(len(discs)):
-        a, radius = discs[d, 0], discs[d, 1]
+    if outline[0, 1] > outline[0, 0]:  # a rectangle, which is alone
+        for k in range(3):
+            phi = footprint_value(samples[k, 0], samples[k, 1], samples[k, 2], outline, path.field)
+            proximity += NODE_WEIGHTS[k] * phi
+        return proximity * width, state_cost * width
+    for d in range(len(outline)):
+        a, radius = outline[d, 0], outline[d, 3]
         if radius <= 0.0:
             continue
         x0, y0, x1, y1, x2, y2 = first[0], first[1], second[0], second[1], third[0], third[1]
@@ -228,8 +236,8 @@ def _panel_costs(path, start, width):
             x0, y0 = x0 + a * math.cos(first[2]), y0 + a * math.sin(first[2])
             x1, y1 = x1 + a * math.cos(second[2]), y1 + a * math.sin(second[2])
             x2, y2 = x2 + a * math.cos(third[2]), y2 + a * math.sin(third[2])
-        phi = proximity_values(x0, y0, x1, y1, x2, y2, radius, path.field)
-        proximity += NODE_WEIGHTS[0] * phi[0] + NODE_WEIGHTS[1] * phi[1] + NODE_WEIGHTS[2] * phi[2]
+        three = proximity_values(x0, y0, x1, y1, x2, y2, radius, path.field)
+        proximity += NODE_WEIGHTS[0] * three[0] + NODE_WEIGHTS[1] * three[1] + NODE_WEIGHTS[2] * three[2]
     return proximity * width, state_cost * width
 
 
@@ -288,6 +296,6 @@ def drive_path(path, before, new):
     if fraction == 0.0:
         return lowest, fraction, after, 0.0, 0.0
     driven = path.duration * fraction
-    part = Path(path.motion, path.q, path.u, path.parameters, path.discs, path.field, driven, path.samples)
+    part = Path(path.motion, path.q, path.u, path.parameters, path.outline, path.field, driven, path.samples)
     proximity, state_cost = path_costs(part, total * fraction, lowest)
     return lowest, fraction, after, proximity * driven, state_cost * driven

@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 import pygame
 
+from leapnav.envs.robots.footprints import corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
@@ -125,17 +126,13 @@ def draw_scene(scene: Scene) -> np.ndarray:
 
     if scene.optimum is not None:
         _draw_path(canvas, OPTIMUM, [to_pixels(x, y) for x, y in scene.optimum[:, :2].tolist()], 2 * line)
-    discs = scenario.discs.tolist()
-    radius = min(disc_radius for _, disc_radius in discs)
     goal = scenario.goal
-    cos, sin = math.cos(goal[2] or 0.0), math.sin(goal[2] or 0.0)
-    for offset, disc_radius in discs:
-        centre = to_pixels(goal[0] + offset * cos, goal[1] + offset * sin)
-        pygame.draw.circle(canvas, GOAL, centre, disc_radius * scale, 2 * line)
+    at_goal = goal[0], goal[1], goal[2] or 0.0
+    _draw_outline(canvas, GOAL, to_pixels, at_goal, scenario.outline, scale, 2 * line)
     if goal[2] is not None:
-        _draw_arrow(canvas, GOAL, to_pixels, (goal[0], goal[1], goal[2]), radius, 2 * line)
+        _draw_arrow(canvas, GOAL, to_pixels, at_goal, _smallest_radius(scenario.outline), 2 * line)
     _draw_path(canvas, POLICY, [to_pixels(x, y) for x, y, _ in scene.trail], 2 * line)
-    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.pose, discs, scale)
+    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.pose, scenario.outline, scale)
     small = pygame.transform.smoothscale(canvas, (width // SUPERSAMPLING, height // SUPERSAMPLING))
     whole = pygame.Surface((small.get_width(), small.get_height() + STATUS_HEIGHT))
     whole.fill(WHITE)
@@ -179,23 +176,48 @@ def _draw_arrow(
     pygame.draw.polygon(canvas, color, [to_pixels(*tip), *(to_pixels(*barb) for barb in barbs)])
 
 
+def _smallest_radius(outline: np.ndarray) -> float:
+    """Return the radius (m) of the smallest disc in an outline, the unit of the symbols of a robot."""
+    return float(outline[:, 2:].sum(axis=1).min())
+
+
+def _draw_outline(
+    canvas: pygame.Surface,
+    color: str,
+    to_pixels: ToPixels,
+    pose: tuple[float, float, float],
+    outline: np.ndarray,
+    scale: float,
+    line: int = 0,
+) -> None:
+    """Draw the outline (K, 4) of a robot at a pose, filled unless `line` is its width in pixels."""
+    x, y, heading = pose
+    for row in outline.tolist():
+        rear, front, _, radius = row
+        if front > rear:
+            corners = [to_pixels(*corner) for corner in corners_of(row, pose).tolist()]
+            pygame.draw.polygon(canvas, color, corners, line)
+        else:
+            centre = to_pixels(x + rear * math.cos(heading), y + rear * math.sin(heading))
+            pygame.draw.circle(canvas, color, centre, radius * scale, line)
+
+
 def _draw_robot(
     canvas: pygame.Surface,
     color: str,
     to_pixels: ToPixels,
     pose: tuple[float, float, float],
-    discs: Sequence[Sequence[float]],
+    robot: np.ndarray,
     scale: float,
 ) -> None:
     x, y, heading = pose
     cos, sin = math.cos(heading), math.sin(heading)
-    radius = min(disc_radius for _, disc_radius in discs)
+    radius = _smallest_radius(robot)
 
     def outline(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         return [to_pixels(x + radius * (a * cos - b * sin), y + radius * (a * sin + b * cos)) for a, b in corners]
 
-    for offset, disc_radius in discs:
-        pygame.draw.circle(canvas, color, to_pixels(x + offset * cos, y + offset * sin), disc_radius * scale)
+    _draw_outline(canvas, color, to_pixels, pose, robot, scale)
     for side in (-0.75, 0.75):  # wheels
         wheel = [(a, side + b) for a, b in ((-0.4, -0.12), (0.4, -0.12), (0.4, 0.12), (-0.4, 0.12))]
         pygame.draw.polygon(canvas, WHEEL, outline(wheel))

@@ -16,7 +16,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.shapes.clearance import clearances, footprint_clearance, footprint_clearances
-from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.envs.shapes.proximity import OUTLINE_ENTRIES, footprint_value
 from leapnav.envs.simulation import stepping
 from leapnav.envs.simulation.bodies import ContactWorld, MotorBodies, VelocityFunction, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
@@ -73,7 +73,7 @@ class BatchSimulator:
             halves=np.zeros((count, m)),
             weights=np.zeros((count, m)),
             parameters=np.zeros((count, 0)),
-            discs=np.zeros((count, 1, 2)),
+            outlines=np.zeros((count, 1, OUTLINE_ENTRIES)),
             fields=self.fields.places,
             guides=np.zeros((count, N_GUIDE_POINTS, 3)),
             noise=self._noise,
@@ -137,9 +137,9 @@ class BatchSimulator:
         self.episodes[indices] = np.zeros((), EPISODE)
         self.layout.actions[indices] = 0.0
         for i, scenario, reference in zip(indices.tolist(), scenarios, references, strict=True):
-            self.fields[i], task, discs = scenario.field, scenario.task, scenario.discs
+            self.fields[i], task, outline = scenario.field, scenario.task, scenario.outline
             self.states[i], sim.goals[i], sim.middles[i], sim.halves[i], sim.weights[i], sim.parameters[i] = task
-            sim.discs[i], sim.discs[i, : len(discs)] = 0.0, discs
+            sim.outlines[i], sim.outlines[i, : len(outline)] = 0.0, outline
             self.episodes["horizon"][i] = scenario.episode_limit
             self.episodes["time_weight"][i] = scenario.cost.time_weight
             if self.settings.shaped:
@@ -186,9 +186,9 @@ class BatchSimulator:
     def _make_room(self, scenarios: Sequence[Scenario]) -> None:
         """Enlarge the arrays of footprints and parameters."""
         sim = self._simulation
-        n_discs = max(len(scenario.discs) for scenario in scenarios) - sim.discs.shape[1]
-        if n_discs > 0:
-            self._replace(discs=np.pad(sim.discs, ((0, 0), (0, n_discs), (0, 0))))
+        rows = max(len(scenario.outline) for scenario in scenarios) - sim.outlines.shape[1]
+        if rows > 0:
+            self._replace(outlines=np.pad(sim.outlines, ((0, 0), (0, rows), (0, 0))))
         n_parameters = len(scenarios[0].task.parameters)
         if n_parameters != sim.parameters.shape[1]:
             self._replace(parameters=np.zeros((len(self.states), n_parameters)))
@@ -264,10 +264,10 @@ class BatchSimulator:
         """Simulate the rest of a period after a contact."""
         sim, episode, state, model = self._simulation, self.episodes[i], self.states[i], self.settings.model
         controls = sim.controls[i]
-        discs = sim.discs[i][sim.discs[i, :, 1] > 0.0]
-        discs.flags.writeable = False
+        outline = sim.outlines[i][sim.outlines[i, :, 2:].any(axis=1)]
+        outline.flags.writeable = False
         if i not in self._contacts:
-            self._contacts[i] = ContactWorld(self.fields[i], discs, self.settings.motor, self._masses[i])
+            self._contacts[i] = ContactWorld(self.fields[i], outline, self.settings.motor, self._masses[i])
         duration = float(episode["remaining"])
         substeps = math.ceil(duration / MAX_CONTACT_STEP)
         steer = self._velocity_function(i, duration / substeps)
@@ -297,7 +297,7 @@ class BatchSimulator:
             ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
             episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
-        episode["pose_clearance"] = footprint_clearance(*pose.tolist(), discs, self.fields[i])[0]
+        episode["pose_clearance"] = footprint_clearance(*pose.tolist(), outline, self.fields[i])[0]
         episode["clearance"] = min(episode["clearance"], lowest)
 
     def _velocity_function(self, i: int, step: float) -> VelocityFunction:
@@ -355,9 +355,9 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     else:
         kernels += [stepping.drive, model.advance, model.state_cost or no_state_cost]
     if settings.shaped:  # the optima of banks, which guide the robots, are checked
-        kernels += [footprint_clearance, proximity_value]
+        kernels += [footprint_clearance, footprint_value]
     if settings.observation == "geodesic":
         kernels.append(solve_eikonal)
     if not settings.terminate_on_collision:
-        kernels += [resolve_overlap, proximity_value, stepping.effort, stepping.wheel_forces]
+        kernels += [resolve_overlap, footprint_value, stepping.effort, stepping.wheel_forces]
     return tuple(kernels)

@@ -92,7 +92,7 @@ class FieldStore:
     """
 
     def __init__(self, count: int) -> None:
-        self._set([pack_field((), (0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 1.0)] * count)
+        self._set([pack_field((), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0), 0.0, 1.0)] * count)
 
     def _set(self, fields: list[np.ndarray]) -> None:
         self._fields = fields
@@ -141,8 +141,7 @@ class Simulation(NamedTuple):
         middles, halves (count, m): middles and half widths of the intervals of the controls.
         weights (count, m): weights of the squared controls.
         parameters (count, p): parameters of the robots' model.
-        discs (count, D, 2): footprints of at most D discs, each with its offset along the heading and its radius (m),
-            which is 0 if the disc is unused.
+        outlines (count, K, 4): footprints, see `leapnav.envs.robots.footprints.outline_of`; unused rows are zero.
         fields (count, 2): the places of the packed obstacle fields, see `field_of`.
         guides (count, N_GUIDE_POINTS, 3): points (m) of the reference path, and the path length (m) from
             each to the goal.
@@ -160,7 +159,7 @@ class Simulation(NamedTuple):
     halves: np.ndarray
     weights: np.ndarray
     parameters: np.ndarray
-    discs: np.ndarray
+    outlines: np.ndarray
     fields: np.ndarray
     guides: np.ndarray
     noise: np.ndarray
@@ -178,7 +177,7 @@ SIMULATION = record_type(
     halves=MATRIX,
     weights=MATRIX,
     parameters=MATRIX,
-    discs=CUBE,
+    outlines=CUBE,
     fields=PLACES,
     guides=CUBE,
     noise=CUBE,

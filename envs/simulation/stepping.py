@@ -22,10 +22,10 @@ GRAVITY = 9.81  # m/s^2
 
 
 @kernel(MATRIX(SIMULATION, int64), inline="always")
-def discs_of(sim, i):
-    """Return the footprint (D, 2) of robot i, a view."""
-    count = sim.discs.shape[1]
-    return matrix_of(sim.discs, 2 * count * i, count, 2)
+def outline_of(sim, i):
+    """Return the outline (K, 4) of robot i, a view."""
+    rows, entries = sim.outlines.shape[1], sim.outlines.shape[2]
+    return matrix_of(sim.outlines, rows * entries * i, rows, entries)
 
 
 @kernel(float64(float64))
@@ -75,7 +75,7 @@ def start_episodes(robots, packed):
         episode, state = sim.episodes[i], row_of(sim.states, i)
         # A remainder of less than 1e-6 periods is a rounding error of the horizon, not another period.
         episode.last_step = max(1, math.ceil(episode.horizon / settings.control_period - 1e-6))
-        clearance, _ = footprint_clearance(state[0], state[1], state[2], discs_of(sim, i), field_of(sim.fields, i))
+        clearance, _ = footprint_clearance(state[0], state[1], state[2], outline_of(sim, i), field_of(sim.fields, i))
         episode.pose_clearance = episode.clearance = clearance
         if settings.shaped:
             episode.potential = potential(i, sim)
@@ -154,7 +154,7 @@ def _follow(sim, i, motion, u, duration, scratch):
     for k in range(n):
         q[k] = state[k]
     field = field_of(sim.fields, i)
-    path = Path(motion, q, u, row_of(sim.parameters, i), discs_of(sim, i), field, duration, scratch)
+    path = Path(motion, q, u, row_of(sim.parameters, i), outline_of(sim, i), field, duration, scratch)
     lowest, fraction, after, proximity, state_cost = drive_path(path, episode.pose_clearance, new)
     episode.in_contact = fraction < 1.0
     # A robot in contact does not reach the rest of the path.

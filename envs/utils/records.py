@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails
 
 # Squares of larger numbers (m or s) would leave too little of a double's precision for distances of the robot's size.
 MAX_MAGNITUDE = 1e6
@@ -43,3 +44,14 @@ def as_tuples(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return tuple(as_tuples(item) for item in value)
     return value
+
+
+def inside(key: str, error: ValidationError) -> ValidationError:
+    """Return an error whose faults are those of the value of a key."""
+    faults: list[InitErrorDetails] = []
+    for details in error.errors(include_url=False):
+        fault: InitErrorDetails = {"type": details["type"], "loc": (key, *details["loc"]), "input": details["input"]}
+        if "ctx" in details:
+            fault["ctx"] = details["ctx"]
+        faults.append(fault)
+    return ValidationError.from_exception_data(error.title, faults)

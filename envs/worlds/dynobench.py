@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from leapnav.envs.robots import Unicycle, box_footprint
+from leapnav.envs.robots import Box, Unicycle
 from leapnav.envs.robots.base import magnitude
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.obstacle import Obstacle
@@ -21,7 +21,6 @@ from leapnav.envs.shapes import Polygon
 from leapnav.envs.worlds.yaml_files import Number, Pair, YamlRecord, as_record, read_yaml
 
 MODEL = "unicycle1"  # the dynamics that leapnav has: speed and turn rate
-DISCS = 9  # of the footprint that covers the robot's box; they protrude by 3 mm at its sides
 # Scale (m) of the barrier. With 0.1 m, the minimum time of one of five problems was 3 % longer, another local minimum.
 PROXIMITY_SCALE = 0.02
 SOLUTION = "_solution_"  # part of the names of the files of solutions
@@ -45,8 +44,6 @@ class DynobenchProblem:
 
 def read_dynobench(folder: str | os.PathLike[str]) -> dict[str, DynobenchProblem]:
     """Read the problems of dynobench with one wheeled robot, by their names such as "unicycle1_v0-kink_0".
-
-    The robot's box is covered by discs, which protrude at its front and rear, see `box_footprint`.
 
     Args:
         folder: a clone of the repository, with the directories `envs` and `models`.
@@ -147,7 +144,7 @@ def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
         name=name,
         arena=(*problem.environment.min, *problem.environment.max),
         robot=Unicycle(
-            footprint=box_footprint(length / 2, length / 2, width, DISCS),
+            footprint=Box(length=length, width=width),
             speed=speed,
             turn_rate=turn_rate,
         ),

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pymunk.autogeometry import convex_decomposition
 
-from leapnav.envs.robots import Car, box_footprint
+from leapnav.envs.robots import Box, Car
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
@@ -24,7 +24,6 @@ from leapnav.envs.shapes import Polygon
 # The car of the competition: dimensions (m) from the middle of the rear axle, and limits (m/s, rad, rad/s).
 WHEELBASE, FRONT_OVERHANG, REAR_OVERHANG, WIDTH = 2.8, 0.96, 0.929, 1.942
 MAX_SPEED, MAX_STEERING, MAX_STEERING_RATE = 2.5, 0.75, 0.5
-DISCS = 6  # of the footprint, whose corners are rounded
 MARGIN = 8.0  # m around start and goal, which is the area of the competition
 PROXIMITY_WEIGHT, PROXIMITY_SCALE = 1.0, 0.05
 CASE = "Case"
@@ -33,7 +32,7 @@ CASE = "Case"
 def read_tpcap(folder: str | os.PathLike[str]) -> list[Scenario]:
     """Read the cases of the competition as scenarios with a free horizon, in the order of their numbers.
 
-    The car has no limit of the acceleration, its corners are rounded, and its sides are indented by up to 4 cm.
+    The car has no limit of the acceleration.
     Obstacles that are not convex are divided into convex polygons.
 
     Args:
@@ -67,7 +66,11 @@ def _scenario(path: Path) -> Scenario:
     start, goal = values[:3], values[3:6]
     low, high = np.minimum(start[:2], goal[:2]) - MARGIN, np.maximum(start[:2], goal[:2]) + MARGIN
     car = Car(
-        footprint=box_footprint(WHEELBASE + FRONT_OVERHANG, REAR_OVERHANG, WIDTH, DISCS, rounded=True),
+        footprint=Box(
+            length=WHEELBASE + FRONT_OVERHANG + REAR_OVERHANG,
+            width=WIDTH,
+            offset=(WHEELBASE + FRONT_OVERHANG - REAR_OVERHANG) / 2,
+        ),
         wheelbase=WHEELBASE,
         max_steering=MAX_STEERING,
         max_speed=MAX_SPEED,

@@ -228,7 +228,7 @@ class Feedback:
         count = math.ceil((times[-1] - times[0]) / CLEARANCE_SAMPLING) + 1
         moments = np.linspace(times[0], times[-1], count)
         states = follow_all(arrays.flow, times, nodes, moments)
-        return float(footprint_clearances(states, self.scenario.discs, self.scenario.field).min())
+        return float(footprint_clearances(states, self.scenario.outline, self.scenario.field).min())
 
     def _remaining_scenario(self, state: np.ndarray, time: float) -> Scenario | None:
         """The rest of the episode as a scenario, None in collision or without time left."""

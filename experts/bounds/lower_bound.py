@@ -321,7 +321,7 @@ def first_grid(scenario: Scenario) -> Grid:
 
     """
     x_min, y_min, x_max, y_max = scenario.arena
-    radius = float(scenario.discs[0, 1])
+    radius = float(scenario.outline[0, 3])
     spacing = min(SPACING_IN_RADII * radius, SPACING_IN_ARENAS * max(x_max - x_min, y_max - y_min))
     metric = scenario.robot.metric(scenario.cost)
     turns = 2 * math.pi * math.sqrt(metric[1] / metric[0]) / (0.7 * spacing)

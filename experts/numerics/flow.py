@@ -45,7 +45,7 @@ class ExtremalFlow(NamedTuple):
         piece: the number of a smooth piece of the flow, of type PIECE_SIGNATURE. The derivatives of the flow are
             discontinuous where a control reaches a limit, and where the closest edge or vertex of a polygon changes.
         data: control weights (m,), lower and upper control bounds (2m,), parameters of the system, three numbers for
-            each limit of a state (`leapnav.experts.numerics.state_bounds`), offsets and radii of the discs of a
+            each limit of a state (`leapnav.experts.numerics.state_bounds`), rows of the outline of a
             footprint.
         field: packed obstacle field; empty without obstacles.
 

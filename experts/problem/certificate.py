@@ -105,7 +105,7 @@ def certify(
         system = problem.system
         heading = -1 if system.heading is None else system.state.index(system.heading)
         places = np.array([*map(system.state.index, problem.system.position), heading])
-        clearance = float(dense_clearance(problem.field, problem.discs, places, extremal.times, z, terms))
+        clearance = float(dense_clearance(problem.field, problem.outline, places, extremal.times, z, terms))
     margin = state_margin(problem.state_limits, _dense_states(extremal)) if problem.state_limits else None
     residual = float(max(np.abs(states[0] - arrays.start).max(), np.abs(end).max()))
     curvature, horizon_error = None, None

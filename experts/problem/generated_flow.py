@@ -22,7 +22,7 @@ from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
 
 # What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or
-# that of the discs of a footprint.
+# that of a footprint.
 Obstacles = Literal["none", "disc", "footprint"]
 
 
@@ -160,7 +160,7 @@ def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[st
     Args:
         at: indices of the states on which the proximity cost depends.
         limited: for each limit the index of the state.
-        first: index of the limits in the data, after which those of a footprint's discs follow.
+        first: index of the limits in the data, after which the rows of an outline follow.
 
     """
     lines: list[str] = []
@@ -172,7 +172,7 @@ def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[st
 
 
 def _call(name: str, at: Sequence[int], first: int) -> str:
-    """Return the call of a function of a disc or of a footprint, whose discs begin at an index of the data."""
+    """Return the call of a function of a disc or of a footprint, whose outline begins at an index of the data."""
     states = ", ".join(f"q{i}" for i in at)
     disc, footprint = (
         f"disc_{name}({states}, header_of(field).radius, field)",

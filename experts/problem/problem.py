@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from leapnav.envs.kernels.internals import FunctionPointer
+from leapnav.envs.robots.footprints import Box, Disc, outline_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.field import check_field, read_header, with_weight
 from leapnav.envs.shapes.proximity import footprint_proximities
@@ -82,8 +83,8 @@ class OptimalControlProblem:
         control_bounds: m pairs (minimum, maximum); None for unbounded controls.
         field: packed obstacle field (`Scenario.field`) whose proximity cost is added to Phi at the system's position.
         parameters: values of the system's parameters, in the order of their declaration.
-        footprint: offset along the heading and radius (m) of each disc of the robot; None for one disc with the radius
-            of the field.
+        footprint: outline of the robot, `leapnav.envs.Disc`s along its heading or a `Box`; None for one disc with the
+            radius of the field.
         time_weight: c >= 0, cost per second.
         barrier_weight: weight of the barrier that approximates hard limits: if the proximity weight of the field is
             smaller, this is used instead. `solve` and `find_optimum` reduce it, see `leapnav.experts.hard_limits`.
@@ -107,7 +108,7 @@ class OptimalControlProblem:
     control_bounds: Sequence[tuple[float, float]] | None = None
     field: np.ndarray | None = None
     parameters: Sequence[float] = ()
-    footprint: tuple[tuple[float, float], ...] | None = None
+    footprint: Sequence[Disc] | Box | None = None
     time_weight: float = 0.0
     barrier_weight: float = 0.0
     state_bounds: Sequence[tuple[float, float] | None] | None = None
@@ -167,13 +168,10 @@ class OptimalControlProblem:
             )
 
     def _check_footprint(self) -> None:
-        if self.footprint is not None and not (
-            len(self.footprint) > 0
-            and all(len(disc) == 2 and all(map(_is_finite, disc)) and disc[1] > 0 for disc in self.footprint)
-        ):
-            raise ValueError(
-                f"footprint: expected pairs (offset, radius > 0) of finite numbers, got {self.footprint!r}"
-            )
+        if self.footprint is None or isinstance(self.footprint, Box):
+            return
+        if not self.footprint or not all(isinstance(disc, Disc) for disc in self.footprint):
+            raise ValueError(f"footprint: expected discs or a box (Disc, Box), got {self.footprint!r}")
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> OptimalControlProblem:
@@ -189,7 +187,7 @@ class OptimalControlProblem:
             control_bounds=[(low, high) for low, high in robot.control_bounds().tolist()],
             field=scenario.field,
             parameters=robot.parameters(cost),
-            footprint=None if robot.footprint is None else tuple(map(tuple, scenario.discs.tolist())),
+            footprint=robot.footprint,
             time_weight=cost.time_weight,
         )
 
@@ -265,7 +263,7 @@ class OptimalControlProblem:
         if self.field is None or self.proximity_weight == 0.0:
             return cost
         added = 1.0 - float(read_header(self.field)["weight"]) / self.proximity_weight
-        return cost + added * footprint_proximities(states, self.discs, self.arrays.field)
+        return cost + added * footprint_proximities(states, self.outline, self.arrays.field)
 
     @property
     def fixed_horizon(self) -> float:
@@ -296,11 +294,11 @@ class OptimalControlProblem:
         return "disc" if self.footprint is None else "footprint"
 
     @property
-    def discs(self) -> np.ndarray:
-        """The discs of the robot (D, 2), offset along its heading and radius (m); (0, 2) without obstacles."""
+    def outline(self) -> np.ndarray:
+        """The robot's outline (K, 4), see `leapnav.envs.robots.footprints.outline_of`; (0, 4) without obstacles."""
         if self.field is None:
-            return _constant(()).reshape(-1, 2)
-        return _constant(self.footprint or ((0.0, float(read_header(self.field)["radius"])),))
+            return outline_of(()).reshape(-1, 4)
+        return outline_of(self.footprint or (Disc(radius=float(read_header(self.field)["radius"])),))
 
     @cached_property
     def compiled_dynamics(self) -> CompiledDynamics:
@@ -324,10 +322,10 @@ class OptimalControlProblem:
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
         goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
-        discs = () if self._obstacles != "footprint" else self.discs.ravel().tolist()
+        outline = () if self._obstacles != "footprint" else self.outline.ravel().tolist()
         parameters = self.parameters if self.time_weight == 0.0 else (*self.parameters, self.time_weight)
         barriers = [number for limit in limits for number in (limit.bound, limit.slope, self.barrier_weight)]
-        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *discs])
+        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *outline])
         field = _constant([]) if self.field is None else with_weight(self.field, self.proximity_weight)
         return ProblemArrays(
             flow=ExtremalFlow(flow, piece, data, field),
@@ -406,7 +404,7 @@ class ProblemArrays:
 
     @property
     def data(self) -> np.ndarray:
-        """Control weights (m,), control bounds (2m,), parameters, limits of states, and the discs of a footprint."""
+        """Control weights (m,), control bounds (2m,), parameters, limits of states, and the outline."""
         return self.flow.data
 
     @property

@@ -32,7 +32,7 @@ class ControlAffineSystem:
             (`OptimalControlProblem.parameters`). A new value needs no compilation.
         labels: names of the n states and the m controls with their units, in Matplotlib's mathtext, for plots; by
             default the symbols of the states, and u_1, ..., u_m.
-        heading: the state symbol that is the heading, for systems with a footprint of several discs.
+        heading: the state symbol that is the heading, for systems with a footprint.
 
     Attributes:
         n: number of states.

@@ -149,24 +149,24 @@ def trace(flow, control, times, Z, accuracy, record):
 
 
 @kernel(float64(CONSTANT, CONSTANT_MATRIX, INTEGERS, VECTOR, MATRIX, CUBE))
-def dense_clearance(field, discs, places, times, starts, terms):
+def dense_clearance(field, outline, places, times, starts, terms):
     """Return the smallest clearance (m) along the interpolated path.
 
-    Clearance changes by at most the distance travelled by a disc, so parts of the path that cannot contain a smaller
-    value are skipped.
+    Clearance changes by at most the distance travelled by a disc or a corner, so parts of the path that cannot contain a
+    smaller value are skipped.
 
     Args:
         field: packed obstacle field.
-        discs (D, 2): offsets along the heading and radii (m) of the robot's discs.
+        outline (K, 4): of the robot, see `leapnav.envs.robots.footprints.outline_of`.
         places (3,): indices of x, y and the heading in the state; the heading may be -1 for one disc without an offset.
         times, starts, terms: see `Extremal`.
 
     """
     ix, iy, ih = places[0], places[1], places[2]
     arm = 0.0
-    for d in range(len(discs)):
-        arm = max(arm, abs(discs[d, 0]))
-    smallest, _ = footprint_clearance(starts[0, ix], starts[0, iy], starts[0, ih], discs, field)
+    for k in range(len(outline)):
+        arm = max(arm, math.hypot(max(abs(outline[k, 0]), abs(outline[k, 1])), outline[k, 2]))
+    smallest, _ = footprint_clearance(starts[0, ix], starts[0, iy], starts[0, ih], outline, field)
     for k in range(len(times) - 1):
         # An upper bound of the speed: the largest mean speed over an eighth of the step, with a safety factor of 1.5.
         length = 0.0
@@ -189,12 +189,12 @@ def dense_clearance(field, discs, places, times, starts, terms):
                 evaluate_interpolant(starts[k, ix], s, terms[k], ix),
                 evaluate_interpolant(starts[k, iy], s, terms[k], iy),
                 heading,
-                discs,
+                outline,
                 field,
             )
             smallest = min(smallest, value)
             # Advance by the distance to a smaller value, at least 0.1 to 5 mm. Over 5 mm the path deviates from a line
             # by about 0.01 mm; close to contact the steps are shorter.
             s += max(value - smallest, min(max(0.1 * smallest, 1e-4), 5e-3)) / length
-    value, _ = footprint_clearance(starts[-1, ix], starts[-1, iy], starts[-1, ih], discs, field)
+    value, _ = footprint_clearance(starts[-1, ix], starts[-1, iy], starts[-1, ih], outline, field)
     return min(smallest, value)

@@ -151,7 +151,7 @@ def find_ends(scenario: Scenario) -> tuple[Pose, Pose]:
     robot = scenario.robot
     if not isinstance(robot, Unicycle | DifferentialDrive):
         raise ValueError(f"robot: lower bounds need a unicycle or a differential_drive, got {robot.model!r}")
-    if len(scenario.discs) != 1 or scenario.discs[0, 0] != 0.0:
+    if len(scenario.outline) != 1 or scenario.outline[0, :3].any():
         raise ValueError(f"robot.footprint: lower bounds need one disc at the centre, got {robot.footprint!r}")
     x, y, heading = scenario.goal
     if heading is None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
+from leapnav.envs.robots.footprints import arm_of, enclosed_radius
 from leapnav.envs.robots.moves import ANGLES, HEADINGS, Moves
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.field import with_weight
@@ -49,7 +50,7 @@ class Lattice:
         columns: number of cells in x.
         lines: number of cells in y.
         phi: (K, 2 columns - 1, 2 lines - 1), proximity cost on the half-cell grid, infinite where the robot cannot be;
-            one layer for all headings, or for a footprint of several discs one for each heading.
+            one layer for all headings, or one for each heading if the robot has a `footprint`.
         weight: proximity weight of phi.
         weights: weights of the squared speed and turn rate in the metric.
         moves: motion primitives of the robot.
@@ -68,7 +69,7 @@ class Lattice:
         strict: bool = False,
     ) -> None:
         self.scenario, self.is_whole = scenario, whole
-        robot, discs = scenario.robot, scenario.discs
+        robot = scenario.robot
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
         cell = min(max(distance / CELLS_PER_DISTANCE, MIN_CELL), MAX_CELL, robot.max_lattice_cell()) / refinement
@@ -106,10 +107,8 @@ class Lattice:
         layers = []
         for heading in ANGLES if scenario.robot.footprint is not None else ANGLES[:1]:
             total = np.zeros(outside.shape)
-            for offset, radius in discs.tolist():
-                shift = offset * math.cos(heading), offset * math.sin(heading)
-                moved = grid._replace(x0=grid.x0 + shift[0], y0=grid.y0 + shift[1])
-                phi, clearance = sample_grid(field, radius, moved, band)
+            for row in scenario.outline.tolist():
+                phi, clearance = sample_grid(field, tuple(row), float(heading), grid, band)
                 phi[clearance < depth] = np.inf
                 total += phi
             total[outside] = np.inf
@@ -190,9 +189,8 @@ def is_connected(scenario: Scenario) -> bool:
     certain if points with positive clearance do. Otherwise the grid is refined; passages that differ from the disc by
     less than MIN_SPACING are closed.
     """
-    discs = scenario.discs
-    radius = float((discs[:, 1] - np.abs(discs[:, 0])).max())
-    if radius <= 0:  # no disc contains (x, y), which may lie in an obstacle
+    radius = enclosed_radius(scenario.outline)
+    if radius <= 0:  # the outline does not contain (x, y), which may lie in an obstacle
         return True
     low, high = _occupied(scenario)
     side = float((high - low).max())
@@ -202,7 +200,7 @@ def is_connected(scenario: Scenario) -> bool:
         # the grid may be inside an obstacle.
         for pose, other in ((scenario.start, scenario.goal), (scenario.goal, scenario.start)):
             at = _AlignedGrid.around(pose, low, high, spacing)
-            clearance = sample_grid(scenario.field, radius, at.points, 2.0 * spacing)[1]
+            clearance = sample_grid(scenario.field, (0.0, 0.0, 0.0, radius), 0.0, at.points, 2.0 * spacing)[1]
             ends = (at.first, at.cell_of(other))
             if not _joins(clearance > -math.sqrt(0.5) * spacing, ends, structure=CROSS):
                 return False
@@ -257,7 +255,9 @@ def _occupied(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """
     outlines = [part.outline() for obstacle in scenario.obstacles for part in obstacle.shape.parts()]
     points = np.concatenate([*outlines, [scenario.start[:2], scenario.goal[:2]]])
-    margin = RELEVANT_DISTANCE * scenario.cost.proximity_scale + 2.0 * float(np.abs(scenario.discs).sum(axis=1).max())
+    margin = RELEVANT_DISTANCE * scenario.cost.proximity_scale + 2.0 * (
+        arm_of(scenario.outline) + float(scenario.outline[:, 3].max())
+    )
     x_min, y_min, x_max, y_max = scenario.arena
     low = np.maximum(points.min(axis=0) - margin, (x_min, y_min))
     high = np.minimum(points.max(axis=0) + margin, (x_max, y_max))

@@ -122,7 +122,7 @@ class LocalOptima:
         self.scenario, self.problem = scenario, softened(problem, energy, SEARCH_WEIGHT)
         self.verdicts: list[Verdict] = []
         self._relaxed_weight, self._budget = RELAXED_WEIGHT * energy, budget
-        self._radius = float(scenario.discs[:, 1].min())
+        self._radius = float(scenario.outline[:, 2:].sum(axis=1).min())  # of the smallest disc inside
         self._lift = Lifting(scenario, self.problem, self._relaxed_weight)
         self._bounds = scenario.robot.control_bounds()
         self._duplicate_distance = DUPLICATE_DISTANCE * min(
@@ -323,14 +323,14 @@ class LocalOptima:
         one interval. The intervals there are divided into steps that resolve the proximity cost.
         """
         middles = 0.5 * (path.states[1:] + path.states[:-1])
-        clearance = footprint_clearances(middles, self.scenario.discs, self.scenario.field)
+        clearance = footprint_clearances(middles, self.scenario.outline, self.scenario.field)
         steps = np.hypot(*np.diff(path.states[:, :2], axis=0).T)
         resolved = RESOLUTION * (np.maximum(clearance, 0.0) + self.scenario.cost.proximity_scale)
         return np.ceil(steps / resolved).astype(int).clip(2, MAX_PIECES)
 
     def _clearance(self, path: DirectPath) -> float:
         """Return the smallest clearance (m) along a path."""
-        return path_clearance(path.states, self.scenario.discs, self.scenario.field)
+        return path_clearance(path.states, self.scenario.outline, self.scenario.field)
 
     def _is_expensive(self, path: DirectPath, error: float) -> bool:
         """Return whether a path costs more than the best extremal, apart from the relative error of its cost.

@@ -15,7 +15,7 @@ from leapnav.experts.search.candidates import CandidateSearch, Tree, cell_costs,
 from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.shortest_paths import plane_parents
 
-# Cells per side. For a footprint of several discs, the speeds of 16 headings are stored.
+# Cells per side. With a `footprint`, the speeds of 16 headings are stored.
 MAX_CELLS, MAX_CELLS_OF_HEADINGS = 1024, 384
 DISTINCT_DISTANCE = 2.0  # m, by which the paths differ somewhere
 

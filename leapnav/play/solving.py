@@ -193,7 +193,7 @@ def _path(scenario: Scenario, optimum: Optimum, points: int = OPTIMUM_POINTS) ->
 
 def _clearances(scenario: Scenario, values: np.ndarray) -> np.ndarray:
     """Return the clearance (m) of the robot at states and costates (N, 2n)."""
-    return footprint_clearances(values, scenario.discs, scenario.field)
+    return footprint_clearances(values, scenario.outline, scenario.field)
 
 
 def _summary(optimum: Optimum, points: int) -> dict[str, Any]:

@@ -146,7 +146,9 @@ class Dataset:
     @property
     def is_reversible(self) -> bool:
         """Whether a rotation of all headings by 180 degrees changes neither footprints nor limits of the robots."""
-        return self._has("reversal") and all(bool((robot.discs()[:, 0] == 0.0).all()) for robot, _ in self._robots)
+        return self._has("reversal") and all(
+            bool((robot.outline()[:, :2].sum(axis=1) == 0.0).all()) for robot, _ in self._robots
+        )
 
     @property
     def is_mirrored(self) -> bool:

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.robots.footprints import arm_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.proximity import proximity_value
+from leapnav.envs.shapes.proximity import footprint_value
 from leapnav.envs.utils.validation import is_integer
 
 MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
@@ -193,11 +194,11 @@ def _check_states(scenario: Scenario, states: np.ndarray, certified: float) -> N
     x_min, y_min, x_max, y_max = scenario.arena
     if not ((states[:, :2] >= (x_min, y_min)) & (states[:, :2] <= (x_max, y_max))).all():
         raise ValueError("states: expected positions in the arena")
-    discs, field = scenario.discs, scenario.field
-    found = min(footprint_clearance(x, y, heading, discs, field)[0] for x, y, heading in states[:, :3].tolist())
-    # Every disc of the footprint is always within half of this of its position at a stored point, and so are the points
+    outline, field = scenario.outline, scenario.field
+    found = min(footprint_clearance(x, y, heading, outline, field)[0] for x, y, heading in states[:, :3].tolist())
+    # Every point of the outline is always within half of this of its position at a stored point, and so are the points
     # of the certificate.
-    steps, arm = np.abs(np.diff(states[:, :3], axis=0)), float(np.abs(discs[:, 0]).max())
+    steps, arm = np.abs(np.diff(states[:, :3], axis=0)), arm_of(outline)
     step = float((np.hypot(steps[:, 0], steps[:, 1]) + arm * steps[:, 2]).max())
     if not abs(found - certified) <= step + float(rounding[:, :3].max()):
         raise ValueError(f"states: expected a smallest clearance of {certified:.3g} m, got {found:.3g} m")
@@ -250,12 +251,11 @@ def _check_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, in
 def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float) -> float:
     """Return the cost of a path by the trapezoidal rule."""
     robot = scenario.robot
-    parameters, discs = np.array(robot.parameters(scenario.cost), dtype=float), scenario.discs.tolist()
+    parameters = np.array(robot.parameters(scenario.cost), dtype=float)
     running = np.square(controls) @ np.array(robot.control_weight(scenario.cost)) / 2 + scenario.cost.time_weight
     state_cost = type(robot).state_cost
     for k, state in enumerate(states):
         x, y, heading = state[:3].tolist()
-        cos, sin = math.cos(heading), math.sin(heading)
-        running[k] += sum(proximity_value(x + a * cos, y + a * sin, radius, scenario.field) for a, radius in discs)
+        running[k] += footprint_value(x, y, heading, scenario.outline, scenario.field)
         running[k] += 0.0 if state_cost is None else state_cost(state, parameters)
     return float(np.trapezoid(running, dx=interval))
