@@ -29,6 +29,8 @@ FACTOR, MAX_FACTOR = 0.3, 0.95
 # Tolerance of the extremals on the way, which are not certified: with 1e-9 and certificates, the continuation took 1.6
 # times as long.
 TOLERANCE = 1e-3
+# ... except after a step that failed: where corners pass corners, Newton's method needs accurate sensitivities.
+FINE_TOLERANCE = 1e-6
 # Steps of the integrator per segment: the segments are short where the barrier is steep. With 2 the continuation took
 # 1.3 times as long; with 8 (16 from the first extremal) too, and one extremal of 100 stalled. If the last extremal
 # stalls, 1 is tried.
@@ -204,7 +206,8 @@ class _Continuation:
         """Decrease the weight until the limit is reached or costs more than `max_cost`; False if a step fails."""
         factor = FACTOR
         while not self._is_reached and self.lowest < max_cost:
-            found = self._step(max(factor * _weight(self._extremal.problem), self._weight))
+            tolerance = TOLERANCE if factor == FACTOR else FINE_TOLERANCE
+            found = self._step(max(factor * _weight(self._extremal.problem), self._weight), tolerance)
             if found is not None:
                 self._before = self._extremal
                 self._set(found)
@@ -226,11 +229,11 @@ class _Continuation:
                 return found
         return None
 
-    def _step(self, weight: float) -> Extremal | None:
+    def _step(self, weight: float, tolerance: float) -> Extremal | None:
         """Return the extremal at another weight, not certified; None if Newton's method does not converge."""
         problem = self._extremal.problem.with_barrier(weight if weight > self._weight else 0.0)
         for times, nodes in self._guesses(weight):
-            status, _, _ = polish(problem, times, nodes, TOLERANCE, OPTIONS.max_iterations)
+            status, _, _ = polish(problem, times, nodes, tolerance, OPTIONS.max_iterations)
             if status is Status.SUCCESS:
                 found = certify(problem, times, nodes, Status.MAX_ITERATIONS)
                 if found.status is Status.MAX_ITERATIONS and len(found.times):

@@ -51,6 +51,9 @@ LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow that may be spent on candidates that cost more than the best one. With 144,000, 3 of 40
 # alternatives in 12 scenarios of `slalom` would be missed; 360,000 find no others.
 ALTERNATIVES_BUDGET = 240_000
+# Of a second search with hard limits, see `LocalOptima`: with 1, a rectangle of 0.5 x 0.25 m does not pass from the side
+# through a gap of 0.26 m.
+SHARPNESS = 4.0
 # `shortest_horizon`: relative tolerance, and largest multiple of the scenario's horizon.
 HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 0.02, 1000.0
 
@@ -179,9 +182,10 @@ def find_optimum(
     if optima is None or (failed is not None and not optima.certified):
         return as_optimum(failure(problem, failed or Status.NO_PATH))
     found = _result(optima, barrier_tolerance, effort)
-    if optima.certified and not found.success:  # the continuation stalled at a barrier weight
-        weight = max(FACTOR * found.problem.barrier_weight, scenario.cost.proximity_weight)
-        optima, _ = _search(scenario, problem.with_barrier(weight), effort)
+    if found.problem.barrier_weight > 0.0 and not found.success:
+        # The continuation stalled at a barrier weight, or the barrier makes the flow in a narrow gap too sensitive.
+        weight = max(FACTOR**2 * found.problem.barrier_weight, scenario.cost.proximity_weight)
+        optima, _ = _search(scenario, problem.with_barrier(weight), effort, SHARPNESS)
         if optima is not None and optima.certified:
             found = _result(optima, barrier_tolerance, effort)
     return found
@@ -252,7 +256,7 @@ def shortest_horizon(scenario: Scenario) -> float | None:
 
 
 def _search(
-    scenario: Scenario, problem: OptimalControlProblem, effort: Effort
+    scenario: Scenario, problem: OptimalControlProblem, effort: Effort, sharpness: float = 1.0
 ) -> tuple[LocalOptima | None, Status | None]:
     """Search the lattices until a better path is unlikely.
 
@@ -269,7 +273,7 @@ def _search(
         if energy > 0.0:
             if optima is None:
                 budget = ALTERNATIVES_BUDGET if effort == "high" else 0.0
-                optima = LocalOptima(scenario, problem, energy, budget)
+                optima = LocalOptima(scenario, problem, energy, budget, sharpness)
             found = _candidate_search(lattice.with_weight(optima.problem.proximity_weight), energy, effort)
             for _ in range(1 if lattice.is_whole or effort == "low" else MAX_ROUNDS):
                 batch, last = _add(optima, found, effort)

@@ -54,7 +54,7 @@ def draw_robots() -> None:
             optimum = find_optimum(scenario)
             draw_scenario(axes, scenario)
             for pose in optimum.evaluate(np.linspace(0.0, scenario.horizon, 12))[0][1:-1]:
-                draw_robot(axes, pose, scenario.discs, OPTIMUM, alpha=0.3)
+                draw_robot(axes, pose, scenario.outline, OPTIMUM, alpha=0.3)
             axes.plot(*optimum.states[:, :2].T, color=OPTIMUM, linewidth=1.5)
             axes.set_title(f"{family}, J = {optimum.cost:.2f}")
         figure.savefig(IMAGES / f"robot_{model.name()}.png", dpi=100)

@@ -77,7 +77,7 @@ def main() -> None:
     plane.plot(driven[:, 0], driven[:, 1], "--", color=POLICY, linewidth=1.8, label=label)
     for fraction in np.linspace(0.0, 1.0, 9)[1:-1]:
         pose = path[round(fraction * 399), :3]
-        draw_robot(plane, pose, scenario.discs, OPTIMUM, alpha=0.5)
+        draw_robot(plane, pose, scenario.outline, OPTIMUM, alpha=0.5)
     plane.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=9)
     plane.set_title("Leapfrog finds a local optimum, the search the best one", fontsize=10)
     names = list(SCORES)

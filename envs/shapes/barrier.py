@@ -15,12 +15,12 @@ from numba import float64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import tuple_of
 
-CONTACT = 5e-4  # scales, below which the barrier continues as a quadratic polynomial
+CONTACT = 5e-5  # scales, below which the barrier continues as a quadratic polynomial
 
 
 @kernel(tuple_of(*[float64] * 3)(float64, float64), inline="always")
 def barrier(s, contact):
-    """Return b(s), with a relative error of 1e-12, and its first and second derivative.
+    """Return b(s), with a relative error of 1e-11, and its first and second derivative.
 
     Below `contact` it is a quadratic polynomial.
     """

@@ -15,9 +15,9 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
 from leapnav.envs.shapes.field import HEADER_TYPE, PART_TYPE, edges_of
 
-# Smallest distance (m) from a point, the centre of a circle or a vertex, with which normal and curvature are computed;
-# only guesses deep in an obstacle come closer.
-MIN_DISTANCE = 1e-3
+# Smallest distance (m) from a point, the centre of a circle or a vertex, with which normal and curvature are computed.
+# It is smaller than the distance at which the barrier becomes a polynomial: a corner of a rectangle comes that close.
+MIN_DISTANCE = 1e-6
 HASH_FACTOR = 31  # of numbers that are combined to one
 
 

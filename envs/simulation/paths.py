@@ -142,7 +142,7 @@ def _speed_after(path, q):
 
 @kernel(float64(PATH, VECTOR), inline="always")
 def largest_distance(path, end):
-    """Return a bound of the distance (m) that a disc or corner of the robot travels along the path to the state `end`."""
+    """Return a bound of the distance (m) that a disc or corner of the robot travels along the path to a state."""
     first, last = _speed_after(path, path.q), _speed_after(path, end)
     return path.duration * (max(first, last) + SPEED_MARGIN * abs(first - last))
 

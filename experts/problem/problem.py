@@ -170,7 +170,9 @@ class OptimalControlProblem:
     def _check_footprint(self) -> None:
         if self.footprint is None or isinstance(self.footprint, Box):
             return
-        if not self.footprint or not all(isinstance(disc, Disc) for disc in self.footprint):
+        if not isinstance(cast(object, self.footprint), (tuple, list)) or not (
+            len(self.footprint) and all(isinstance(cast(object, disc), Disc) for disc in self.footprint)
+        ):
             raise ValueError(f"footprint: expected discs or a box (Disc, Box), got {self.footprint!r}")
 
     @classmethod

@@ -152,8 +152,8 @@ def trace(flow, control, times, Z, accuracy, record):
 def dense_clearance(field, outline, places, times, starts, terms):
     """Return the smallest clearance (m) along the interpolated path.
 
-    Clearance changes by at most the distance travelled by a disc or a corner, so parts of the path that cannot contain a
-    smaller value are skipped.
+    Clearance changes by at most the distance travelled by a disc or a corner, so parts of the path without a smaller
+    value are skipped.
 
     Args:
         field: packed obstacle field.

@@ -22,7 +22,7 @@ from leapnav.envs import (
     Unicycle,
     sample_scenario,
 )
-from leapnav.envs.robots import box_footprint, register
+from leapnav.envs.robots import register
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.shapes.clearance import footprint_clearance
@@ -32,6 +32,7 @@ from leapnav.experts.problem.system import switching_functions, system_of
 
 ROBOTS = {model.name(): model for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer)}
 BOX = [{"offset": offset, "radius": 0.16} for offset in (-0.2, 0.0, 0.2)]
+RECTANGLE = {"box": {"length": 0.7, "width": 0.32, "offset": 0.1}}
 each_robot = pytest.mark.parametrize("name", ROBOTS)
 
 
@@ -256,7 +257,7 @@ def test_a_box_of_three_discs(name, width):
         y = states[:, 1] + offset * np.sin(states[:, 2])
         assert np.abs(y[inside] - 4.0).max() + 0.16 < width / 2
     assert optimum.certificate.clearance == pytest.approx(
-        min(footprint_clearance(*q[:3], scenario.discs, scenario.field)[0] for q in states), abs=1e-3
+        min(footprint_clearance(*q[:3], scenario.outline, scenario.field)[0] for q in states), abs=1e-3
     )
     env = NavigateEnv(scenario=scenario)
     env.reset()
@@ -268,7 +269,7 @@ def test_a_box_of_three_discs(name, width):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("footprint", [None, BOX])
+@pytest.mark.parametrize("footprint", [None, BOX, RECTANGLE])
 def test_a_collision_ends_where_the_outline_is_in_contact(name, footprint):
     robot = {"model": name} if footprint is None else {"model": name, "footprint": footprint}
     wall = [{"polygon": {"vertices": [[5, 0], [6, 0], [6, 8], [5, 8]]}}]
@@ -281,7 +282,7 @@ def test_a_collision_ends_where_the_outline_is_in_contact(name, footprint):
         for _ in range(60):
             _, _, terminated, _, info = env.step(np.array(ahead, dtype=np.float32))
             x, y, heading = env.pose
-            clearance = footprint_clearance(x, y, heading, scenario.discs, scenario.field)[0]
+            clearance = footprint_clearance(x, y, heading, scenario.outline, scenario.field)[0]
             assert clearance > -2e-3
             if info["collision"] and terminate:
                 assert terminated
@@ -393,23 +394,3 @@ def test_the_system_of_a_model_is_that_of_its_problem():
         assert problem.system is system_of(model)
         assert len(problem.start) == len(model.state_names)
     assert leapnav.envs.RobotModel is not None
-
-
-def test_a_box_footprint_covers_the_box_or_leaves_out_its_corners():
-    box = np.array([(x, y) for x in np.linspace(-0.2, 0.6, 81) for y in np.linspace(-0.15, 0.15, 31)])
-    for count in (1, 3, 5):
-        discs = box_footprint(0.6, 0.2, 0.3, count)
-        depths = [disc.radius - np.hypot(box[:, 0] - disc.offset, box[:, 1]) for disc in discs]
-        assert len(discs) == count and np.max(depths, axis=0).min() > -1e-12
-    rounded = box_footprint(0.6, 0.2, 0.3, 4, rounded=True)
-    ends = [disc.offset + side * disc.radius for disc in rounded for side in (-1, 1)]
-    assert (min(ends), max(ends)) == pytest.approx((-0.2, 0.6))
-    box = {"front": 0.6, "rear": 0.2, "width": 0.3}
-    for change, message in (
-        ({"front": 0.0}, "front: expected a positive"),
-        ({"count": 0}, "count: expected at least 1, got 0"),
-        ({"width": 0.9, "rounded": True}, "width: expected less than the length 0.8"),
-        ({"count": 2, "rounded": True}, "count: expected at least 3 discs that overlap, got 2"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            box_footprint(**(box | change))

@@ -134,7 +134,7 @@ def test_a_term_is_skipped_only_where_it_is_negligible(shape):
 @each_shape
 def test_cost_and_clearance_on_a_grid_of_points_are_those_of_single_points(shape):
     field = scenario_of(shape).field
-    phi, free = sample_grid(field, ROBOT, PointGrid(2.5, 1.5, 0.25, 12, 12), 2.0)
+    phi, free = sample_grid(field, (0.0, 0.0, 0.0, ROBOT), 0.0, PointGrid(2.5, 1.5, 0.25, 12, 12), 2.0)
     for i, j in np.ndindex(12, 12):
         x, y = 2.5 + 0.25 * i, 1.5 + 0.25 * j
         distances = [part_distance(part, np.array([x, y])) for part in shape.parts()] + [x, 8 - x, y, 6 - y]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from leapnav.cli import main
-from leapnav.envs import Polygon, ScenarioBank, ScenarioError, Unicycle
+from leapnav.envs import Box, Polygon, ScenarioBank, ScenarioError, Unicycle
 from leapnav.envs.scenarios.files import read_scenarios
 from leapnav.envs.worlds.barn import path_lengths, read_barn, read_cylinders
 from leapnav.envs.worlds.dynobench import read_dynobench
@@ -222,10 +222,7 @@ def test_problems_of_dynobench_are_scenarios_with_the_durations_of_other_planner
     assert "unicycle2" in problems["unicycle2_v0-wall_0"].reason
     scenario = problems["unicycle1_v0-wall_0"].scenario
     assert scenario.arena == (0, 0, 3, 2) and scenario.robot.control_bounds().tolist() == [[-0.5, 0.5]] * 2
-    # The discs cover the box of the robot.
-    box = np.array([(x, y) for x in np.linspace(-0.25, 0.25, 41) for y in (-0.125, 0.125)])
-    distances = np.hypot(box[:, :1] - scenario.discs[:, 0], box[:, 1:]) - scenario.discs[:, 1]
-    assert distances.min(axis=1).max() < 1e-9
+    assert scenario.robot.footprint == Box(length=0.5, width=0.25)
     found = minimum_time(scenario, 0.2)
     assert found.extremal.success
     assert 1.2 / 0.5 < found.horizon < 4.0  # the distance at the largest speed
@@ -284,7 +281,7 @@ def test_a_case_of_tpcap_is_a_car_that_parks(tmp_path):
     assert [second.name, first.name] == ["tpcap-2", "tpcap-10"]
     assert first.robot.model == "car" and first.horizon is None and first.start_state[2] == 0.0
     assert first.arena == pytest.approx((-14.0, -10.5, 8.0, 12.0))
-    assert first.discs[:, 0].max() + first.discs[0, 1] == pytest.approx(3.76)  # the front of the car
+    assert first.outline.tolist() == [pytest.approx([-0.929, 3.76, 0.971, 0.0])]
     assert len(second.obstacles) == 2  # since the polygon is not convex
     optimum = find_optimum(first)
     assert optimum.success and optimum.driving_modes[-1] == "backward"

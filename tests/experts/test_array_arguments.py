@@ -69,7 +69,6 @@ ENTRIES = {
     "problem: start": (lambda a: replace(PROBLEM, start=a), STATES[0]),
     "problem: goal": (lambda a: replace(PROBLEM, goal=a), STATES[-1]),
     "problem: field": (lambda a: replace(PROBLEM, field=a), SCENARIO.field),
-    "problem: footprint": (lambda a: replace(PROBLEM, footprint=a), np.array([[0.0, 0.2], [0.1, 0.2]])),
     "problem.dynamics": (PROBLEM.dynamics, STATES),
     "problem.estimate_costates: states": (lambda a: PROBLEM.estimate_costates(Trajectory(TIMES, a)), STATES),
     "problem.estimate_costates: times": (lambda a: PROBLEM.estimate_costates(Trajectory(a, STATES)), TIMES),

@@ -91,7 +91,7 @@ def walls_and_corners(**cost: float) -> Scenario:
 
 def barrier_sums(points: np.ndarray, scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """Return the clearance (N,) and the sum of 1 / (exp(d / scale) - 1) over all obstacles, from their geometry."""
-    radius, scale = float(scenario.discs[0, 1]), scenario.cost.proximity_scale
+    radius, scale = float(scenario.outline[0, 3]), scenario.cost.proximity_scale
     x_min, y_min, x_max, y_max = scenario.arena
     x, y = points.T
     distances = [x - x_min, x_max - x, y - y_min, y_max - y]

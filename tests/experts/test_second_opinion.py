@@ -5,7 +5,8 @@ import pytest
 from helpers import ROBOTS, scenario_fields
 
 from leapnav.envs import Scenario, ScenarioBank, sample_scenario
-from leapnav.envs.shapes.proximity import disc_proximity
+from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.shapes.proximity import disc_proximity, footprint_proximity
 from leapnav.experts import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.second_opinion import Opinion, second_opinion, verify_bank
@@ -64,7 +65,7 @@ def test_the_proximity_cost_of_the_transcription_is_that_of_the_kernels():
     ]
     small = Scenario.from_dict(scenario_fields(obstacles=obstacles))
     x, y = casadi.SX.sym("x"), casadi.SX.sym("y")
-    value = _proximity(small, x, y, 0.3)
+    value = _proximity(small, casadi.vertcat(x, y, 0), (0.0, 0.0, 0.0, 0.3))
     hessian, gradient = casadi.hessian(value, casadi.vertcat(x, y))
     entries = [value, gradient[0], gradient[1], hessian[0, 0], hessian[0, 1], hessian[1, 1]]
     function = casadi.Function("proximity", [x, y], entries)
@@ -74,6 +75,30 @@ def test_the_proximity_cost_of_the_transcription_is_that_of_the_kernels():
         assert np.ravel(function(*point)) == pytest.approx(
             expected, rel=1e-9, abs=1e-10 + 1e-9 * np.abs(expected).max()
         )
+
+
+def test_the_proximity_cost_of_a_rectangle_in_the_transcription_is_that_of_the_kernels():
+    casadi = pytest.importorskip("casadi")
+    from leapnav.experts.ipopt import _proximity
+
+    robot = {"model": "unicycle", "footprint": {"box": {"length": 0.6, "width": 0.3, "offset": 0.1}}}
+    obstacles = [
+        {"circle": {"center": [3, 3], "radius": 0.5}},
+        {"capsule": {"start": [5, 2], "end": [7, 3], "radius": 0.2}},
+        {"polygon": {"vertices": [[3, 6], [3, 8], [5, 7]]}},
+    ]
+    small = Scenario.from_dict(scenario_fields(obstacles=obstacles, robot=robot))
+    q = casadi.SX.sym("q", 3)
+    value = _proximity(small, q, small.outline[0].tolist())
+    hessian, gradient = casadi.hessian(value, q)
+    entries = [value, *(gradient[i] for i in range(3)), *(hessian[i, j] for i in range(3) for j in range(i, 3))]
+    function, data = casadi.Function("proximity", [q], entries), small.outline.ravel().copy()
+    for pose in np.random.default_rng(0).uniform((0, 0, -3), (10, 10, 3), (500, 3)):
+        if footprint_clearance(*pose, small.outline, small.field)[0] > 1e-3:
+            expected = np.array(footprint_proximity(*pose, data, 0, small.field))
+            assert np.ravel(function(pose)) == pytest.approx(
+                expected, rel=1e-7, abs=1e-8 + 1e-7 * np.abs(expected).max()
+            )
 
 
 def test_ipopt_finds_the_same_optimum_by_other_means(scenario):

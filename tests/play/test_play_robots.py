@@ -5,11 +5,10 @@ import pytest
 from play_helpers import SCENARIO, dragged, fields, load, opened, rest, screen, served
 
 from leapnav.envs import Scenario
-from leapnav.envs.robots import box_footprint
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.play.episodes import Driving
 
-FOOTPRINT = [disc.model_dump() for disc in box_footprint(0.9, 0.2, 0.4, 4)]  # the front is 0.9 m ahead of the pose
+FOOTPRINT = [{"offset": offset, "radius": 0.24} for offset in (-0.06, 0.21, 0.49, 0.66)]  # the front is 0.9 m ahead
 CAR = fields(robot={"model": "car", "footprint": FOOTPRINT}, start=[1, 2.5, np.pi / 2], goal=[6, 2.5, 0], horizon=12)
 
 
