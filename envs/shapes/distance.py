@@ -15,9 +15,10 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
 from leapnav.envs.shapes.field import HEADER_TYPE, PART_TYPE, edges_of
 
-# Smallest distance (m) from a point, the centre of a circle or a vertex, with which normal and curvature are computed.
-# It is smaller than the distance at which the barrier becomes a polynomial: a corner of a rectangle comes that close.
-MIN_DISTANCE = 1e-6
+# Smallest distances (m) from the centre of a circle, and from a vertex, with which normal and curvature are computed.
+# Only guesses deep in an obstacle come so close to a centre. The corner of a rectangle comes close to a vertex; the
+# distance is below that at which the barrier becomes a polynomial.
+MIN_CENTRE_DISTANCE, MIN_DISTANCE = 1e-3, 1e-6
 HASH_FACTOR = 31  # of numbers that are combined to one
 
 
@@ -76,7 +77,7 @@ def part_geometry(x, y, radius, field, part):
     if part.edges == 0:
         dx, dy = x - part.x, y - part.y
         distance = math.sqrt(dx * dx + dy * dy)
-        curvature = 1.0 / (distance if distance > MIN_DISTANCE else MIN_DISTANCE)
+        curvature = 1.0 / (distance if distance > MIN_CENTRE_DISTANCE else MIN_CENTRE_DISTANCE)
         return distance - (part.rounding + radius), dx * curvature, dy * curvature, curvature
     largest, nearest, beyond = _nearest_edge(x, y, field, part)
     edge = edges_of(field, part)[nearest]

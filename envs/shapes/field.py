@@ -19,7 +19,7 @@ from numba import from_dtype, int64, types
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import records_of
 from leapnav.envs.kernels.types import CONSTANT
-from leapnav.envs.shapes.barrier import CONTACT
+from leapnav.envs.shapes.barrier import CONTACT, CORNER_CONTACT
 from leapnav.envs.shapes.base import Shape
 from leapnav.envs.shapes.polygon import edge_rows
 
@@ -159,7 +159,8 @@ def _pack(parts: Sequence[FieldPart], arena: Any, costs: Sequence[float], *, gri
     header = np.zeros(1, HEADER)
     for name, value in zip(COSTS, costs, strict=True):
         header[name] = value
-    header["least_distance"], header["arena"] = CONTACT, arena
+    has_corners = header["extent"] > header["radius"]
+    header["least_distance"], header["arena"] = np.where(has_corners, CORNER_CONTACT, CONTACT), arena
     discs = [part for part in parts if len(part.vertices) == 1]
     polygons = [part for part in parts if len(part.vertices) > 1]
     edges = [edge_rows(part.vertices) for part in polygons]
@@ -282,16 +283,19 @@ def blend_fields(first: np.ndarray, second: np.ndarray, fraction: float) -> np.n
     return _pack(parts, blend(one["arena"], other["arena"]), costs)
 
 
-def with_weight(packed: np.ndarray, weight: float, least_distance: float = CONTACT) -> np.ndarray:
+def with_weight(packed: np.ndarray, weight: float, least_distance: float | None = None) -> np.ndarray:
     """Return a packed field with a given proximity weight.
 
     Args:
         packed: the field.
         weight: proximity weight.
-        least_distance: distance (proximity scales) below which the barrier is a quadratic polynomial.
+        least_distance: distance (proximity scales) below which the barrier is a quadratic polynomial; None for that of
+            the field.
 
     """
     header = read_header(packed)
+    if least_distance is None:
+        least_distance = float(header["least_distance"])
     if header["weight"] == weight and header["least_distance"] == least_distance:
         return packed
     field = packed.copy()

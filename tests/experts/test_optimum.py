@@ -427,7 +427,7 @@ def test_the_search_is_repeated_where_the_continuation_stalls(monkeypatch):
     found = find_optimum(scenario)
     assert found.success and found.barrier <= 1e-3
     assert found.cost == pytest.approx(expected.cost, rel=1e-3)
-    assert weights[1] == pytest.approx(0.3 * weights[0])
+    assert weights[1] == pytest.approx(0.09 * weights[0])
 
 
 def test_the_methods_solve_a_scenario_with_hard_obstacles():
