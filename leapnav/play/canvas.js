@@ -2,7 +2,7 @@
 // server (`play.colors`).
 
 import { byId, play, shownScenario } from "./state.js";
-import { discsOf, frontOf, hasHeading, partsOf, placedDiscs } from "./shapes.js";
+import { frontOf, halfWidthOf, hasHeading, partsOf, robotParts } from "./shapes.js";
 
 export const canvas = byId("view");
 export let context = canvas.getContext("2d");
@@ -41,27 +41,25 @@ export function drawPoints(points, color, radius) {
 }
 
 export const arrowTip = ([x, y, heading]) => {
-  const { robot } = shownScenario(), widest = Math.max(...discsOf(robot).map(({ radius }) => radius));
-  const length = Math.max(frontOf(robot) + 1.2 * widest, (26 * unit) / view.scale);
+  const { robot } = shownScenario();
+  const length = Math.max(frontOf(robot) + 1.2 * halfWidthOf(robot), (26 * unit) / view.scale);
   return [x + length * Math.cos(heading), y + length * Math.sin(heading)];
 };
 
 export function drawRobot(pose, color, hasArrow, isSelected = false) {
-  const { robot } = shownScenario(), [x, y] = toScreen(pose), pixels = (radius) => Math.max(view.scale * radius, 3 * unit);
-  const discs = placedDiscs(robot, pose).map(({ center, radius }) => [...toScreen(center), pixels(radius)]);
+  const { robot } = shownScenario(), [x, y] = toScreen(pose), smallest = (3 * unit) / view.scale;
+  const parts = robotParts(robot, pose).map((part) => (part.polygon ? part
+    : { circle: { ...part.circle, radius: Math.max(part.circle.radius, smallest) } }));
   context.lineWidth = (isSelected ? 4 : 2) * unit;
   context.strokeStyle = color;
   context.beginPath();
-  for (const [cx, cy, radius] of discs) {
-    context.moveTo(cx + radius, cy);
-    context.arc(cx, cy, radius, 0, 2 * Math.PI);
-  }
+  parts.forEach(addPart);
   context.fillStyle = color + "44";
   context.fill();
   context.stroke();
-  if (isSelected) drawSelection(discs);
+  if (isSelected) drawSelection(parts);
   if (!hasHeading(pose)) return;
-  const front = pixels(frontOf(robot));
+  const front = view.scale * Math.max(frontOf(robot), smallest);
   const end = hasArrow ? toScreen(arrowTip(pose)) : [x + front * Math.cos(pose[2]), y - front * Math.sin(pose[2])];
   context.lineWidth = 2 * unit;
   context.beginPath();
@@ -75,10 +73,13 @@ export function drawRobot(pose, color, hasArrow, isSelected = false) {
   context.fill();
 }
 
-// A dashed circle around discs on a line (pixels).
-function drawSelection(discs) {
-  const first = discs[0], last = discs[discs.length - 1], [x, y] = [0, 1].map((i) => (first[i] + last[i]) / 2);
-  const radius = Math.max(...discs.map(([cx, cy, pixels]) => Math.hypot(cx - x, cy - y) + pixels));
+// A dashed circle around the parts of a robot.
+function drawSelection(parts) {
+  const points = parts.flatMap(({ circle, polygon }) => (polygon ? polygon.vertices.map((vertex) => [vertex, 0])
+    : [[circle.center, circle.radius]]));
+  const centre = [0, 1].map((i) => points.reduce((sum, [point]) => sum + point[i], 0) / points.length);
+  const [x, y] = toScreen(centre);
+  const radius = view.scale * Math.max(...points.map(([[px, py], r]) => Math.hypot(px - centre[0], py - centre[1]) + r));
   context.strokeStyle = play.colors.wall;
   context.lineWidth = unit;
   context.setLineDash([4 * unit, 3 * unit]);
@@ -96,11 +97,12 @@ export function poseAt(states, time, duration) {
   return states[k].map((value, i) => value + (position - k) * (states[k + 1][i] - value));
 }
 
-// Makes the outline of a part the path of the canvas.
-function tracePart({ circle, capsule, polygon }) {
-  context.beginPath();
+// Adds the outline of a part to the path of the canvas.
+function addPart({ circle, capsule, polygon }) {
   if (circle) {
-    context.arc(...toScreen(circle.center), Math.max(view.scale * circle.radius, 0), 0, 2 * Math.PI);
+    const [x, y] = toScreen(circle.center), pixels = Math.max(view.scale * circle.radius, 0);
+    context.moveTo(x + pixels, y);
+    context.arc(x, y, pixels, 0, 2 * Math.PI);
     return;
   }
   if (capsule) {
@@ -126,7 +128,8 @@ export function drawScenario(scenario, selected = null) {
     context.lineWidth = (isSelected ? 3 : 1) * unit;
     context.setLineDash(isSelected ? [6 * unit, 3 * unit] : []);
     for (const part of partsOf(obstacle)) {
-      tracePart(part);
+      context.beginPath();
+      addPart(part);
       context.fill();
       context.stroke();
     }

@@ -1,7 +1,7 @@
 // Editing of the scenario by mouse, touch and keyboard.
 
 import { byId, canEdit, edit, isFree, play, redo, scheduleSearch, setText, show, undo } from "./state.js";
-import { canRotate, centerOf, hasHeading, isInside, moved, placedDiscs, transformed } from "./shapes.js";
+import { canRotate, centerOf, hasHeading, isInside, isInsidePart, moved, robotParts, transformed } from "./shapes.js";
 import { arrowTip, canvas, toPlane, view } from "./canvas.js";
 
 const STEP = 0.05, FINE_STEP = 0.01; // m per key press
@@ -102,8 +102,7 @@ function findHandle(point, pointerType = "mouse") {
   for (const name of ["goal", "start"]) {
     const pose = poseOf(name);
     if (hasHeading(pose) && isWithin(arrowTip(pose), point, size)) return { kind: "heading", name };
-    const discs = placedDiscs(play.scenario.robot, pose);
-    const isOnRobot = discs.some(({ center, radius }) => isWithin(center, point, view.scale * radius));
+    const isOnRobot = robotParts(play.scenario.robot, pose).some((part) => isInsidePart(part, point));
     if (isOnRobot || isWithin(pose, point, size)) return { kind: "position", name };
   }
   const obstacles = obstaclesOf();

@@ -115,7 +115,7 @@ function showSettings() {
 
 let shownFields = null; // the names of the robot's numbers that have inputs, as one text
 
-// A robot of several discs has no radius; its discs are not edited.
+// A robot with a footprint has no radius; the footprint is not edited.
 function showRobotFields() {
   byId("model").value = modelOf(play.scenario);
   const hidden = (play.scenario.robot || {}).footprint ? ["model", "radius"] : ["model"];
@@ -139,7 +139,7 @@ document.addEventListener("change", ({ target: input }) => {
   if (group && canEdit()) edit({ [group]: { ...play.scenario[group], [field]: Number(input.value) } });
 });
 
-// Another model starts with its defaults and the present radius or discs; weights that it does not use get their default.
+// Another model starts with its defaults and the present radius or footprint; weights that it does not use get their default.
 byId("model").addEventListener("change", () => {
   if (!canEdit()) return;
   const { fields: { radius, ...fields }, weights } = play.robots[byId("model").value];

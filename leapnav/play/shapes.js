@@ -1,25 +1,37 @@
-// Geometry of robots, which consist of discs, and of obstacles: discs, convex polygons and capsules. Obstacles of other
+// Geometry of robots (discs or a rectangle), and of obstacles: discs, convex polygons and capsules. Obstacles of other
 // shapes are unions of these; they are drawn, not edited.
 
 import { request, show, showError } from "./state.js";
 
-// The discs of a robot: offsets along its axis, positive ahead, and radii (m).
-export const discsOf = (robot) => robot.footprint || [{ offset: 0, radius: robot.radius }];
-
 export const hasHeading = (pose) => pose[2] !== null && pose[2] !== undefined;
 
-// The discs of a robot at a pose. If its heading is free: the one that is covered at any heading, or a point.
-export function placedDiscs(robot, [x, y, heading]) {
-  const discs = discsOf(robot);
-  if (!hasHeading([x, y, heading])) {
-    return [{ center: [x, y], radius: Math.max(...discs.map(({ offset, radius }) => radius - Math.abs(offset)), 0) }];
+// The rows of a robot's outline: rear, front, half width and radius (m) of its discs, or of its rectangle.
+function outlineOf({ footprint, radius }) {
+  const { box } = footprint || {};
+  if (box) {
+    const middle = box.offset || 0;
+    return [[middle - box.length / 2, middle + box.length / 2, box.width / 2, 0]];
   }
-  return discs.map(({ offset, radius }) =>
-    ({ center: [x + offset * Math.cos(heading), y + offset * Math.sin(heading)], radius }));
+  return (footprint || [{ offset: 0, radius }]).map((disc) => [disc.offset, disc.offset, 0, disc.radius]);
 }
 
-// The distance (m) from the reference point of a robot to its front.
-export const frontOf = (robot) => Math.max(...discsOf(robot).map(({ offset, radius }) => offset + radius));
+// The discs or the rectangle of a robot at a pose, as obstacles. If its heading is free: the disc that is covered at any
+// heading, or a point.
+export function robotParts(robot, [x, y, heading]) {
+  const rows = outlineOf(robot);
+  if (!hasHeading([x, y, heading])) {
+    const covered = rows.map(([rear, front, halfWidth, radius]) => Math.min(halfWidth, front, -rear) + radius);
+    return [{ circle: { center: [x, y], radius: Math.max(...covered, 0) } }];
+  }
+  const c = Math.cos(heading), s = Math.sin(heading), place = ([a, b]) => [x + a * c - b * s, y + a * s + b * c];
+  return rows.map(([rear, front, w, radius]) => (w
+    ? { polygon: { vertices: [[rear, -w], [front, -w], [front, w], [rear, w]].map(place) } }
+    : { circle: { center: place([rear, 0]), radius } }));
+}
+
+// The distance (m) from the reference point of a robot to its front, and half of its largest width.
+export const frontOf = (robot) => Math.max(...outlineOf(robot).map(([, front, , radius]) => front + radius));
+export const halfWidthOf = (robot) => Math.max(...outlineOf(robot).map(([, , halfWidth, radius]) => halfWidth + radius));
 
 function segmentDistance([x, y], [ax, ay], [bx, by]) {
   const [dx, dy] = [bx - ax, by - ay], length = dx * dx + dy * dy;
@@ -46,7 +58,7 @@ export function partsOf(obstacle) {
 // Whether a point is inside an obstacle.
 export const isInside = (obstacle, point) => partsOf(obstacle).some((part) => isInsidePart(part, point));
 
-function isInsidePart(part, point) {
+export function isInsidePart(part, point) {
   if (part.circle) {
     const { center: [cx, cy], radius } = part.circle;
     return Math.hypot(point[0] - cx, point[1] - cy) <= radius;

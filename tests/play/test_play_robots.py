@@ -1,4 +1,4 @@
-"""The page of `leapnav play` in Chromium with robots of several discs, and with the larger families."""
+"""The page of `leapnav play` in Chromium with robots that have a footprint, and with the larger families."""
 
 import numpy as np
 import pytest
@@ -45,6 +45,19 @@ def test_every_disc_of_a_robot_is_drawn_and_can_be_dragged(page):
     assert opacity(page, [x + front, y + side]) > 0
 
 
+def test_a_rectangle_is_drawn_and_can_be_dragged(page):
+    box = {"length": 1.0, "width": 0.4, "offset": 0.2}
+    load(page, {**CAR, "robot": {"model": "car", "footprint": {"box": box}}})
+    assert page.inner_text("#status") == "Certified optimum"
+    corner = [1 + 0.17, 2.5 + 0.66]  # at the heading pi / 2, the front is at y = 2.5 + 0.7
+    assert opacity(page, corner) > 0
+    assert opacity(page, [1 + 0.24, 2.5 + 0.66]) == opacity(page, [1 + 0.17, 2.5 + 0.74]) == 0
+    dragged(page, corner, [corner[0] + 0.5, corner[1] - 0.5])
+    assert page.evaluate("play.scenario.start") == pytest.approx([1.5, 2.0, np.pi / 2], abs=0.05)
+    load(page, {**CAR, "robot": {"model": "car", "footprint": {"box": box}}, "goal": [6, 2.5, None]})
+    assert page.evaluate("robotParts(play.scenario.robot, play.scenario.goal)[0].circle.radius") == pytest.approx(0.2)
+
+
 def test_the_arrow_of_a_robot_is_ahead_of_its_discs(page):
     load(page, CAR)
     length = page.evaluate("arrowTip(play.scenario.goal)[0]") - 6
@@ -54,8 +67,8 @@ def test_the_arrow_of_a_robot_is_ahead_of_its_discs(page):
 def test_a_goal_with_a_free_heading_shows_what_is_covered_at_any_heading(page):
     load(page, {**CAR, "goal": [6, 2.5, None]})
     covered = max(disc["radius"] - abs(disc["offset"]) for disc in FOOTPRINT)
-    assert page.evaluate("placedDiscs(play.scenario.robot, play.scenario.goal)") == [
-        {"center": [6, 2.5], "radius": pytest.approx(max(covered, 0))}
+    assert page.evaluate("robotParts(play.scenario.robot, play.scenario.goal)") == [
+        {"circle": {"center": [6, 2.5], "radius": pytest.approx(max(covered, 0))}}
     ]
     dragged(page, [6, 2.5], [5.5, 2.0])
     assert page.evaluate("play.scenario.goal.slice(0, 2)") == pytest.approx([5.5, 2.0], abs=0.05)
