@@ -132,8 +132,9 @@ def curved_moves(
 ) -> Moves:
     """Return the moves of a robot with a minimum turning radius.
 
-    Forward and backward: straight, or along the old and then along the new heading, both so far that an arc of the
-    radius fits into the corner between them.
+    Forward and backward: straight, or along the old and then along the new heading, both about so far that an arc of
+    the radius fits into the corner between them. The legs are rounded to whole cells, since the mean radius of several
+    turns should be right; rounded up, a half turn would not fit between walls where one is possible.
 
     Args:
         cell: side of a cell (m).
@@ -154,7 +155,7 @@ def curved_moves(
                     leg = radii[0 if change > 0 else 1] * math.tan(turn_angle(heading, change) / 2.0)
                     path = []
                     for k in (heading, (heading + change) % HEADINGS):
-                        count = max(1, math.ceil(leg / (cell * math.hypot(*DIRECTIONS[k])) - 1e-9))
+                        count = max(1, round(leg / (cell * math.hypot(*DIRECTIONS[k]))))
                         path += [tuple((mode * DIRECTIONS[k]).tolist())] * count
                 rows.append(path)
         rows_of.append(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, Literal, Self
 
 from pydantic import model_validator
@@ -20,6 +21,7 @@ from leapnav.envs.robots.base import (
 from leapnav.envs.robots.moves import Moves, curved_moves, driving_modes, rotating_moves
 from leapnav.envs.utils.records import Interval, Positive
 
+MAX_LATTICE_CELL = 0.25  # smallest turning radii, of a robot that cannot stop
 POSE_LABELS = ("$x$ (m)", "$y$ (m)", r"$\theta$ (rad)")
 
 
@@ -84,8 +86,16 @@ class Unicycle(RobotModel):
         return magnitude(self.interval("speed")), magnitude(self.interval("turn_rate"))
 
     def lattice_moves(self, cell: float, speed_weight: float, turn_weight: float) -> Moves:  # noqa: D102
-        modes, slowest = driving_modes(self.interval("speed")), self.slowest_speed()
-        if slowest == 0.0:
+        modes = driving_modes(self.interval("speed"))
+        if self.slowest_speed() == 0.0:
             return rotating_moves(cell, speed_weight, turn_weight, modes)
+        return curved_moves(cell, speed_weight, turn_weight, self._turning_radii, modes)
+
+    def max_lattice_cell(self) -> float:  # noqa: D102
+        return MAX_LATTICE_CELL * min(self._turning_radii) if self.slowest_speed() > 0.0 else math.inf
+
+    @property
+    def _turning_radii(self) -> tuple[float, float]:
+        """Smallest turning radii (m) to the left and to the right."""
         right, left = self.interval("turn_rate")
-        return curved_moves(cell, speed_weight, turn_weight, (slowest / left, -slowest / right), modes)
+        return self.slowest_speed() / left, -self.slowest_speed() / right

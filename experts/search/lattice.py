@@ -44,7 +44,7 @@ class Lattice:
             between the points, and paths may lead through passages that are slightly too narrow.
 
     Attributes:
-        scenario: the scenario.
+        scenario, refinement: see above.
         cell: side of a cell (m).
         origin: position (m) of cell (0, 0).
         columns: number of cells in x.
@@ -62,13 +62,13 @@ class Lattice:
     def __init__(
         self,
         scenario: Scenario,
-        refinement: int = 1,
+        refinement: float = 1,
         *,
         max_cells: int = MAX_CELLS,
         whole: bool = False,
         strict: bool = False,
     ) -> None:
-        self.scenario, self.is_whole = scenario, whole
+        self.scenario, self.refinement, self.is_whole = scenario, refinement, whole
         robot = scenario.robot
         x_min, y_min, x_max, y_max = scenario.arena
         distance = math.dist(scenario.start[:2], scenario.goal[:2])
