@@ -54,7 +54,7 @@ LONG_DISTANCE, N_PLANE_PATHS = 40.0, 4
 # Evaluations of the flow that may be spent on candidates that cost more than the best one. With 144,000, 3 of 40
 # alternatives in 12 scenarios of `slalom` would be missed; 360,000 find no others.
 ALTERNATIVES_BUDGET = 240_000
-# Of a second search with hard limits, see `LocalOptima`: with 1, a rectangle of 0.5 x 0.25 m does not pass through a gap
+# Of a second search with hard limits, see `LocalOptima`: with 1, a box of 0.5 x 0.25 m does not pass through a gap
 # of 0.26 m from the side.
 SHARPNESS = 4.0
 # `shortest_horizon`: relative tolerance, and largest multiple of the scenario's horizon.
