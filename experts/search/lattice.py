@@ -98,6 +98,8 @@ class Lattice:
         band = max(RELEVANT_DISTANCE * scenario.cost.proximity_scale, 0.1)
         # A passage that just admits the robot may lie between the points, half a diagonal of their squares away.
         depth = 0.0 if strict else -math.sqrt(0.5) * self.cell / 2
+        if not strict and not self.moves.rotating:  # on an arc, the heading is up to half a step from that of a node
+            depth -= arm_of(scenario.outline) * math.pi / HEADINGS
         self.weight = scenario.cost.proximity_weight
         field = with_weight(scenario.field, 1.0)
         grid = PointGrid(*self.origin, self.cell / 2, 2 * self.columns - 1, 2 * self.lines - 1)

@@ -243,17 +243,15 @@ class LocalOptima:
         self, problem: OptimalControlProblem, guess: DirectPath, relaxed_distance: float | None = None
     ) -> DirectPath:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
-        barrier: dict[str, float] = {}
-        if relaxed_distance is not None:
-            barrier = {"relaxed_weight": self._relaxed_weight, "relaxed_distance": relaxed_distance}
-        path = optimise(problem, guess, **barrier)
+        weight = None if relaxed_distance is None else self._relaxed_weight
+        path = optimise(problem, guess, relaxed_weight=weight, relaxed_distance=relaxed_distance)
         if problem.horizon is None:
             for _ in range(MAX_LENGTHENED):
                 # Otherwise more time would not help: the path is feasible, or the descent is slow.
                 if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):
                     break
                 guess = guess.scaled(LENGTHENING)
-                path = optimise(problem, guess, **barrier)
+                path = optimise(problem, guess, relaxed_weight=weight, relaxed_distance=relaxed_distance)
         return path
 
     def _is_limited(self, path: DirectPath) -> bool:

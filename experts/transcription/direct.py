@@ -128,7 +128,7 @@ def optimise(
     guess: DirectPath,
     max_iterations: int = MAX_ITERATIONS,
     relaxed_weight: float | None = None,
-    relaxed_distance: float = RELAXED_DISTANCE,
+    relaxed_distance: float | None = None,
 ) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
 
@@ -139,7 +139,8 @@ def optimise(
             2 INTERVALS_PER_LIMIT intervals.
         relaxed_weight: proximity weight, at least, with a relaxed barrier, from which a guess in collision moves out
             of the obstacles; None for the barrier of the problem.
-        relaxed_distance: distance (proximity scales) below which the relaxed barrier is a quadratic polynomial.
+        relaxed_distance: distance (proximity scales) below which the relaxed barrier is a quadratic polynomial; by
+            default RELAXED_DISTANCE.
 
     """
     max_iterations *= min(max(1, len(guess.controls) // INTERVALS_PER_LIMIT), MAX_LIMITS)
@@ -150,7 +151,7 @@ def optimise(
     states[0] = arrays.start
     field = arrays.field
     if relaxed_weight is not None and problem.field is not None:
-        field = with_weight(field, max(relaxed_weight, problem.proximity_weight), relaxed_distance)
+        field = with_weight(field, max(relaxed_weight, problem.proximity_weight), relaxed_distance or RELAXED_DISTANCE)
     unit = problem.control_weight[0]  # the penalties of the descent are relative to it
     costates = guess.costates / unit
     dynamics = problem.compiled_dynamics

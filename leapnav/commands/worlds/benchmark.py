@@ -69,8 +69,8 @@ class BenchmarkBarn(TaskOptions):
 class BenchmarkDynobench:
     """Compare the minimum time of the problems of dynobench with the durations of its stored solutions.
 
-    The robot's box is covered by discs, and the paths keep a few centimetres from the obstacles, so that the times are
-    upper bounds of the minimum time of the benchmark. Problems whose robot differs from those of leapnav are left out.
+    The robot's box is exact, and the paths end at the goal, which the stored solutions reach within a tolerance. The
+    times are upper bounds of the minimum time. Problems whose robot differs from those of leapnav are left out.
     """
 
     folder: tyro.conf.Positional[Path]
