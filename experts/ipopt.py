@@ -77,9 +77,11 @@ class Transcription:
         self._solver: Any = casadi.nlpsol("solver", "ipopt", program, options)
         self._count = constraints.shape[0]
         low, high = scenario.robot.control_bounds().T
-        free = np.full(n * (intervals + 1), np.inf)
-        lower = np.append(-free, np.tile(low, intervals + 1))
-        upper = np.append(free, np.tile(high, intervals + 1))
+        limits = np.array([pair or (-np.inf, np.inf) for pair in problem.state_bounds or [None] * n])
+        lower, upper = (
+            np.append(np.tile(states, intervals + 1), np.tile(controls, intervals + 1))
+            for states, controls in ((limits[:, 0], low), (limits[:, 1], high))
+        )
         self._bounds = np.append(lower, 0.0 if unknown else []), np.append(upper, np.inf if unknown else [])
 
     def solve(self, problem: OptimalControlProblem, path: Trajectory) -> Trajectory | None:

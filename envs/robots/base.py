@@ -107,6 +107,7 @@ class RobotModel(Frozen):
         limited: names of the limited quantities; `limits` returns their intervals unless a model overrides it. Each has
             two fields: the interval (lowest, highest), and the largest absolute value `max_...`, which is used if the
             interval is None.
+        limited_states: the same for further states, whose limits are optional: without them, both fields are None.
         cost_fields: names of the weights of `leapnav.envs.Cost` that the model uses, besides the proximity cost.
         advance: kernel of ADVANCE_SIGNATURE, exact or to 1e-9.
         state_cost: kernel of STATE_COST_SIGNATURE, or None without a state cost.
@@ -130,6 +131,7 @@ class RobotModel(Frozen):
     control_units: ClassVar[tuple[str, ...]]
     goal_motion: ClassVar[tuple[float | None, ...]] = ()
     limited: ClassVar[tuple[str, ...]] = ()
+    limited_states: ClassVar[tuple[str, ...]] = ()
     cost_fields: ClassVar[tuple[str, ...]] = ("speed_weight", "turn_weight")
     advance: ClassVar[Any]
     state_cost: ClassVar[Any] = None
@@ -158,14 +160,16 @@ class RobotModel(Frozen):
         fields = handler(self)
         if self.footprint is not None:
             del fields["radius"]
-        for name in self.limited:
+        for name in (*self.limited, *self.limited_states):
             fields.pop(f"max_{name}" if name in self._intervals else name, None)
+            if fields.get(f"max_{name}", 0.0) is None:
+                del fields[f"max_{name}"]
         return fields
 
     @property
     def _intervals(self) -> list[str]:
         """Names of the limits that are given as intervals."""
-        return [name for name in self.limited if getattr(self, name) is not None]
+        return [name for name in (*self.limited, *self.limited_states) if getattr(self, name) is not None]
 
     def interval(self, name: str) -> tuple[float, float]:
         """Return the lowest and the highest value of one of `limited`."""
@@ -174,6 +178,31 @@ class RobotModel(Frozen):
             largest = float(getattr(self, f"max_{name}"))
             return -largest, largest
         return interval
+
+    def state_bounds(self) -> tuple[tuple[float, float] | None, ...] | None:
+        """Return the lowest and the highest value of each state, None without limits; None if no state has limits."""
+        given = [n for n in self.limited_states if n in self._intervals or getattr(self, f"max_{n}") is not None]
+        bounds = tuple(self.interval(name) if name in given else None for name in self.state_names)
+        return bounds if given else None
+
+    def check_motion(self, field: str, values: Sequence[float | None] | None) -> None:
+        """Check the further states of a start or a goal; `field` is its name.
+
+        Raises:
+            ValueError: their number is wrong, or one is beyond its limits.
+
+        """
+        names = self.state_names[3:]
+        if values is None:
+            return
+        if len(values) != len(names):
+            expected = f"{len(names)} ({', '.join(names)})" if names else "0"
+            raise ValueError(f"{field}: expected {expected} numbers for the robot {self.model!r}, got {values!r}")
+        bounds = (self.state_bounds() or (None,) * len(self.state_names))[3:]
+        for name, value, pair in zip(names, values, bounds, strict=True):
+            low, high = pair or (-math.inf, math.inf)
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{field}: expected a {name} from {low:g} to {high:g}, got {value:g}")
 
     @classmethod
     @abstractmethod

@@ -108,12 +108,8 @@ class Scenario(Frozen):
     @model_validator(mode="after")
     def _check_robot(self) -> Self:
         name, robot = self.robot.model, self.robot
-        further = robot.state_names[3:]
         for field in ("start_motion", "goal_motion"):
-            values = getattr(self, field)
-            if values is not None and len(values) != len(further):
-                expected = f"{len(further)} ({', '.join(further)})" if further else "0"
-                raise ValueError(f"{field}: expected {expected} numbers for the robot {name!r}, got {values!r}")
+            robot.check_motion(field, getattr(self, field))
         for field in ("speed_weight", "turn_weight"):
             value = getattr(self.cost, field)
             if field not in robot.cost_fields and value != Cost.model_fields[field].default:

@@ -8,11 +8,12 @@ the repository https://github.com/quimortiz/dynobench (MIT licence), in the dire
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from leapnav.envs.robots import Box, Unicycle
+from leapnav.envs.robots import Box, DynamicUnicycle, RobotModel, Unicycle
 from leapnav.envs.robots.base import magnitude
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.obstacle import Obstacle
@@ -20,7 +21,11 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 from leapnav.envs.worlds.yaml_files import Number, Pair, YamlRecord, as_record, read_yaml
 
-MODEL = "unicycle1"  # the dynamics that leapnav has: speed and turn rate
+KINEMATIC, DYNAMIC = (
+    "unicycle1",
+    "unicycle2",
+)  # the dynamics that leapnav has: commanded by velocities, or by accelerations
+STATE_WEIGHT = 1e-6  # of the squared velocities of a robot with accelerations as controls, whose cost is the time
 # Scale (m) of the barrier. With 0.1 m, the minimum time of one of five problems was 3 % longer, another local minimum.
 PROXIMITY_SCALE = 0.02
 SOLUTION = "_solution_"  # part of the names of the files of solutions
@@ -86,6 +91,8 @@ class _BoxModel(YamlRecord):
     max_vel: Number
     min_angular_vel: Number
     max_angular_vel: Number
+    max_acc_abs: Number | None = None
+    max_angular_acc: Number | None = None
 
 
 class _Box(YamlRecord):
@@ -101,8 +108,8 @@ class _Environment(YamlRecord):
 
 
 class _Poses(YamlRecord):
-    start: tuple[Number, Number, Number]
-    goal: tuple[Number, Number, Number]
+    start: tuple[Number, ...]
+    goal: tuple[Number, ...]
 
 
 class _Problem(YamlRecord):
@@ -121,7 +128,7 @@ def _problem(root: Path, path: Path, content: Any) -> DynobenchProblem:
     given = read_yaml(place)
     model = as_record(_Model, given, place)
     reason, scenario = "", None
-    if model.dynamics != MODEL:
+    if model.dynamics not in (KINEMATIC, DYNAMIC):
         reason = f"dynamics {model.dynamics!r}"
     elif model.shape != "box":
         reason = f"shape {model.shape!r}"
@@ -140,26 +147,45 @@ def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
         obstacles.append(Obstacle(polygon=Polygon(vertices=corners)))
     (length, width), (poses,) = model.size, problem.robots
     speed, turn_rate = (model.min_vel, model.max_vel), (model.min_angular_vel, model.max_angular_vel)
+    footprint, (further, rest) = Box(length=length, width=width), (poses.start[3:], poses.goal[3:])
+    motion: dict[str, Any] = {}
+    if model.max_acc_abs is None or model.max_angular_acc is None:
+        robot: RobotModel = Unicycle(footprint=footprint, speed=speed, turn_rate=turn_rate)
+        weights = 1.0 / magnitude(speed) ** 2, 1.0 / magnitude(turn_rate) ** 2
+    else:
+        robot = DynamicUnicycle(
+            footprint=footprint,
+            speed=speed,
+            turn_rate=turn_rate,
+            max_acceleration=model.max_acc_abs,
+            max_angular_acceleration=model.max_angular_acc,
+            acceleration_weight=1.0 / model.max_acc_abs**2,
+            angular_acceleration_weight=1.0 / model.max_angular_acc**2,
+        )
+        weights = STATE_WEIGHT, STATE_WEIGHT
+        motion = {"start_motion": further, "goal_motion": rest}
     return Scenario(
         name=name,
         arena=(*problem.environment.min, *problem.environment.max),
-        robot=Unicycle(
-            footprint=Box(length=length, width=width),
-            speed=speed,
-            turn_rate=turn_rate,
-        ),
-        start=poses.start,
-        goal=poses.goal,
+        robot=robot,
+        start=_pose(poses.start),
+        goal=_pose(poses.goal),
         horizon=None,
         obstacles=tuple(obstacles),
         cost=Cost(
             time_weight=1.0,
-            speed_weight=1.0 / magnitude(speed) ** 2,
-            turn_weight=1.0 / magnitude(turn_rate) ** 2,
+            speed_weight=weights[0],
+            turn_weight=weights[1],
             proximity_weight=0.0,
             proximity_scale=PROXIMITY_SCALE,
         ),
+        **motion,
     )
+
+
+def _pose(state: Sequence[float]) -> tuple[float, float, float]:
+    x, y, heading = state[:3]
+    return x, y, heading
 
 
 def _durations(folder: Path, dt: float) -> dict[str, float]:

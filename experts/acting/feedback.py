@@ -24,8 +24,8 @@ from leapnav.experts.solvers.newton import CONVERGED, MARGIN
 from leapnav.experts.solvers.nodes import start_nodes
 
 # Maximum time (s) between nodes, tried in this order. Fewer nodes are faster, but the flow close to an obstacle can be
-# too sensitive for long segments.
-SEGMENT_DURATIONS = (0.5, 0.25, 0.125)
+# too sensitive for long segments, and so can that along a limit of the speed.
+SEGMENT_DURATIONS = (0.5, 0.25, 0.125, 0.03)
 TOLERANCE = 1e-6  # residual of the boundary and continuity conditions; the controls have a similar error
 SEARCH_PAUSE = 0.5  # s after an unsuccessful search before the next one
 MIN_STEP = 1 / 16  # smallest step of the continuation in the state, as a fraction of the distance

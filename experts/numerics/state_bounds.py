@@ -23,6 +23,7 @@ from leapnav.envs.shapes.barrier import barrier
 # start and goal from it. The optimum for a vanishing weight does not depend on it.
 RELATIVE_SCALE = 0.1
 CONTACT = 1e-4  # scales, below which the barrier is a quadratic polynomial
+MARGIN = 3e-3  # see `move_inside`; with 1e-4, a search from the limit fails, with 1e-3 one of 8 misses the optimum
 ENTRIES = 3  # numbers per limit in the data of a flow
 
 
@@ -73,6 +74,18 @@ def check_state_bounds(
                 )
         checked.append((low, high) if math.isfinite(low) or math.isfinite(high) else None)
     return tuple(checked)
+
+
+def move_inside(bounds: Sequence[tuple[float, float] | None] | None, state: Sequence[Any]) -> tuple[Any, ...]:
+    """Return a state, moved off its bounds by MARGIN of their distance; a robot may be at its limits."""
+
+    def moved(value: Any, pair: tuple[float, float] | None) -> Any:
+        if pair is None or value is None:
+            return value
+        margin = MARGIN * (pair[1] - pair[0])
+        return min(max(value, pair[0] + margin), pair[1] - margin)
+
+    return tuple(state) if bounds is None else tuple(map(moved, state, bounds))
 
 
 def state_limits(

@@ -19,7 +19,7 @@ from leapnav.envs.shapes.proximity import footprint_proximities
 from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.numerics.interpolation import interpolate
-from leapnav.experts.numerics.state_bounds import StateLimit, check_state_bounds, limit_costs, state_limits
+from leapnav.experts.numerics.state_bounds import StateLimit, check_state_bounds, limit_costs, move_inside, state_limits
 from leapnav.experts.problem.dynamics import least_norm_costates, least_squares_controls, sample_dynamics
 from leapnav.experts.problem.system import (
     ControlAffineSystem,
@@ -170,9 +170,8 @@ class OptimalControlProblem:
     def _check_footprint(self) -> None:
         if self.footprint is None or isinstance(self.footprint, Box):
             return
-        if not isinstance(cast(object, self.footprint), (tuple, list)) or not (
-            len(self.footprint) and all(isinstance(cast(object, disc), Disc) for disc in self.footprint)
-        ):
+        discs: Any = self.footprint
+        if not isinstance(discs, (tuple, list)) or not discs or not all(isinstance(disc, Disc) for disc in discs):
             raise ValueError(f"footprint: expected discs or a box (Disc, Box), got {self.footprint!r}")
 
     @classmethod
@@ -181,8 +180,8 @@ class OptimalControlProblem:
         robot, cost = scenario.robot, scenario.cost
         return cls(
             system=system_of(type(robot)),
-            start=scenario.start_state,
-            goal=scenario.goal_state,
+            start=move_inside(robot.state_bounds(), scenario.start_state),
+            goal=move_inside(robot.state_bounds(), scenario.goal_state),
             horizon=scenario.horizon,
             control_weight=robot.control_weight(cost),
             state_cost=state_cost_of(type(robot)),
@@ -191,6 +190,7 @@ class OptimalControlProblem:
             parameters=robot.parameters(cost),
             footprint=robot.footprint,
             time_weight=cost.time_weight,
+            state_bounds=robot.state_bounds(),
         )
 
     def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:

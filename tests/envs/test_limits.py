@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 from helpers import scenario_fields
+from scipy.integrate import cumulative_trapezoid
 
-from leapnav.envs import DifferentialDrive, NavigateEnv, Scenario, ScenarioError, Unicycle
+from leapnav.envs import DifferentialDrive, DynamicUnicycle, NavigateEnv, Scenario, ScenarioError, Unicycle
 from leapnav.experts import ExpertPolicy, find_optimum
+from leapnav.experts.acting.policy import plan_actions
 from leapnav.training.policies.baselines import GoToGoal
 
 FORWARD = {"model": "unicycle", "speed": [0.25, 0.5], "turn_rate": [-0.5, 1.0]}
@@ -95,3 +97,69 @@ def test_go_to_goal_commands_the_same_controls_with_other_limits():
         controls.append(scenario.robot.controls(GoToGoal(env).predict(observation)[0]))
     np.testing.assert_allclose(*controls, rtol=1e-5)
     assert np.abs(controls[0]).min() > 0.01
+
+
+LIMITED = {"model": "dynamic_unicycle", "max_speed": 0.8, "turn_rate": [-1.0, 1.5]}
+
+
+@pytest.mark.parametrize(("acceleration", "angular"), [(1.0, 3.0), (-2.0, -1.0), (3.0, 0.0), (0.0, -3.0)])
+def test_a_robot_does_not_accelerate_beyond_the_limits_of_its_states(acceleration, angular):
+    scenario = task(LIMITED)
+    parameters, new = np.array(scenario.robot.parameters(scenario.cost)), np.zeros(5)
+    start = np.array([0.0, 0.0, 0.0, 0.5, -0.5])
+    DynamicUnicycle.advance(start, np.array([acceleration, angular]), 1.5, parameters, new)
+    times = np.linspace(0.0, 1.5, 200_001)
+    speed, turn_rate = np.clip(0.5 + acceleration * times, -0.8, 0.8), np.clip(-0.5 + angular * times, -1.0, 1.5)
+    heading = cumulative_trapezoid(turn_rate, times, initial=0.0)
+    position = [np.trapezoid(speed * function(heading), times) for function in (np.cos, np.sin)]
+    assert new == pytest.approx([*position, heading[-1], speed[-1], turn_rate[-1]], abs=1e-8)
+
+
+def test_optima_respect_the_limits_of_states():
+    scenario = task(LIMITED, horizon=None, cost={"time_weight": 1.0})
+    assert json.loads(scenario.to_json())["robot"].keys() >= {"max_speed", "turn_rate"}
+    assert "max_speed" not in DynamicUnicycle().model_dump() and Scenario.from_json(scenario.to_json()) == scenario
+    optimum = find_optimum(scenario)
+    assert optimum.success and optimum.barrier <= 1e-3
+    states, controls, _ = optimum.evaluate(np.linspace(0.0, optimum.horizon, 1001))
+    assert 0.75 < np.abs(states[:, 3]).max() < 0.8
+    assert states[:, 4].min() > -1.0 and states[:, 4].max() < 1.5
+    low, high = scenario.robot.control_bounds().T
+    assert (controls >= low - 1e-9).all() and (controls <= high + 1e-9).all()
+    without = task({"model": "dynamic_unicycle"}, horizon=None, cost={"time_weight": 1.0})
+    assert optimum.cost > find_optimum(without).cost
+    env = NavigateEnv(scenario=scenario)
+    env.reset()
+    info = {}
+    for action in plan_actions(optimum, scenario, env.control_period):
+        info = env.step(action)[-1]
+    assert info["is_success"] and info["cost"] == pytest.approx(optimum.cost, rel=5e-3)
+
+
+def test_the_expert_drives_at_the_limit_of_the_speed():
+    scenario = task(LIMITED, horizon=None, start_motion=[0.8, 0.0], cost={"time_weight": 1.0})
+    env = NavigateEnv(scenario=scenario)
+    observation, _ = env.reset()
+    expert, done, info = ExpertPolicy(env), False, {}
+    while not done:
+        observation, _, terminated, truncated, info = env.step(expert.predict(observation)[0])
+        assert abs(env.state[3]) <= 0.8
+        done = terminated or truncated
+    assert info["is_success"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start_motion": [0.9, 0.0]}, "start_motion: expected a speed from -0.8 to 0.8, got 0.9"),
+        ({"goal_motion": [0.0, 2.0]}, "goal_motion: expected a turn_rate from -1 to 1.5, got 2"),
+        ({"robot": {**LIMITED, "speed": [-1.0, 1.0]}}, "max_speed: cannot be combined with speed"),
+        (
+            {"robot": {"model": "dynamic_unicycle", "speed": [0.1, 1.0]}},
+            r"speed: expected an interval that contains 0 inside, got \[0.1, 1.0\]",
+        ),
+    ],
+)
+def test_errors_of_limits_of_states(changes, message):
+    with pytest.raises(ScenarioError, match=message):
+        task(**{"robot": LIMITED, **changes})

@@ -187,25 +187,31 @@ environment:
       size: [0.2, 0.4]
 robots:
   - type: {model}
-    start: [0.5, 1.2, 0]
-    goal: [1.7, 1.2, 0] # x, y, theta
+    start: {start}
+    goal: {goal} # x, y, theta
 """
+DYNO_STATES = {"start": "[0.5, 1.2, 0]", "goal": "[1.7, 1.2, 0]"}
 
 
 @pytest.fixture
 def dynobench(tmp_path):
-    """A directory with the structure of dynobench: two problems, and one of a robot that leapnav does not have."""
+    """A directory with the structure of dynobench: three problems, and one of a robot that leapnav does not have."""
     folder = tmp_path / "dynobench"
     (folder / "models").mkdir(parents=True)
     for model, dynamics, slowest in (
         ("unicycle1_v0", "unicycle1", -0.5),
         ("unicycle1_v1", "unicycle1", 0.25),
         ("unicycle2_v0", "unicycle2", -0.5),
+        ("car1_v0", "car_with_trailers", -0.1),
     ):
-        (folder / "models" / f"{model}.yaml").write_text(DYNO_MODEL.format(dynamics=dynamics, slowest=slowest))
+        text, states = DYNO_MODEL.format(dynamics=dynamics, slowest=slowest), DYNO_STATES
+        if model == "unicycle2_v0":
+            text += "max_acc_abs: 0.25\nmax_angular_acc: 0.25\n"
+            states = {name: state.replace("]", ", 0, 0]") for name, state in DYNO_STATES.items()}
+        (folder / "models" / f"{model}.yaml").write_text(text)
         solutions = folder / "envs" / model / "wall_0"
         solutions.mkdir(parents=True)
-        solutions.with_suffix(".yaml").write_text(DYNO_PROBLEM.format(model=model))
+        solutions.with_suffix(".yaml").write_text(DYNO_PROBLEM.format(model=model, **states))
         for planner, feasible, states in (("idbastar_v0", 1, 41), ("rrt_to_v0", 0, 10)):
             rows = "\n".join("  - [0, 0, 0]" for _ in range(states))
             (solutions / f"{planner}_solution_v0.yaml").write_text(f"feasible: {feasible}\nstates:\n{rows}\n")
@@ -215,11 +221,16 @@ def dynobench(tmp_path):
 
 def test_problems_of_dynobench_are_scenarios_with_the_durations_of_other_planners(dynobench):
     problems = read_dynobench(dynobench)
-    assert list(problems) == ["unicycle1_v0-wall_0", "unicycle1_v1-wall_0", "unicycle2_v0-wall_0"]
+    models = ["car1_v0", "unicycle1_v0", "unicycle1_v1", "unicycle2_v0"]
+    assert sorted(problems) == [f"{model}-wall_0" for model in models]
     assert all(problem.durations == {"idbastar_v0": 4.0} for problem in problems.values())  # the other is not feasible
     robot = problems["unicycle1_v1-wall_0"].scenario.robot
     assert robot.control_bounds().tolist() == [[0.25, 0.5], [-0.5, 0.5]]
-    assert "unicycle2" in problems["unicycle2_v0-wall_0"].reason
+    assert "car_with_trailers" in problems["car1_v0-wall_0"].reason
+    dynamic = problems["unicycle2_v0-wall_0"].scenario
+    assert dynamic.robot.state_bounds() == (None, None, None, (-0.5, 0.5), (-0.5, 0.5))
+    assert dynamic.robot.control_bounds().tolist() == [[-0.25, 0.25]] * 2
+    assert dynamic.start_state == (0.5, 1.2, 0.0, 0.0, 0.0)
     scenario = problems["unicycle1_v0-wall_0"].scenario
     assert scenario.arena == (0, 0, 3, 2) and scenario.robot.control_bounds().tolist() == [[-0.5, 0.5]] * 2
     assert scenario.robot.footprint == Box(length=0.5, width=0.25)
@@ -232,11 +243,12 @@ def test_the_table_of_dynobench(dynobench, tmp_path, capsys):
     out = tmp_path / "table.json"
     assert main(["worlds", "benchmark", "dynobench", str(dynobench), "--tol", "0.2", "--json", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "unicycle2_v0-wall_0: left out: dynamics 'unicycle2'" in printed and "idbastar_v0" in printed
+    assert "car1_v0-wall_0: left out: dynamics 'car_with_trailers'" in printed and "idbastar_v0" in printed
     row = json.loads(out.read_text())["unicycle1_v0-wall_0"]
     assert row["idbastar_v0"] == 4.0 and 2.4 < row["leapnav"] < 4.0 and row["clearance"] > 0
     assert main(["worlds", "import", "dynobench", str(dynobench), "--out", str(tmp_path / "scenarios")]) == 0
-    assert [scenario.name for scenario in read_scenarios(tmp_path / "scenarios")] == list(read_dynobench(dynobench))[:2]
+    names = [name for name, problem in read_dynobench(dynobench).items() if problem.scenario is not None]
+    assert sorted(scenario.name for scenario in read_scenarios(tmp_path / "scenarios")) == sorted(names)
 
 
 @pytest.mark.parametrize(
