@@ -49,9 +49,9 @@ def test_a_rectangle_is_drawn_and_can_be_dragged(page):
     box = {"length": 1.0, "width": 0.4, "offset": 0.2}
     load(page, {**CAR, "robot": {"model": "car", "footprint": {"box": box}}})
     assert page.inner_text("#status") == "Certified optimum"
-    corner = [1 + 0.17, 2.5 + 0.66]  # at the heading pi / 2, the front is at y = 2.5 + 0.7
+    corner = [1 - 0.17, 2.5 + 0.66]  # at the heading pi / 2, the front is at y = 2.5 + 0.7; the path is to the right
     assert opacity(page, corner) > 0
-    assert opacity(page, [1 + 0.24, 2.5 + 0.66]) == opacity(page, [1 + 0.17, 2.5 + 0.74]) == 0
+    assert opacity(page, [1 - 0.24, 2.5 + 0.66]) == opacity(page, [1 - 0.17, 2.5 + 0.74]) == 0
     dragged(page, corner, [corner[0] + 0.5, corner[1] - 0.5])
     assert page.evaluate("play.scenario.start") == pytest.approx([1.5, 2.0, np.pi / 2], abs=0.05)
     load(page, {**CAR, "robot": {"model": "car", "footprint": {"box": box}}, "goal": [6, 2.5, None]})
