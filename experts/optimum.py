@@ -286,7 +286,7 @@ def _search(
                 shortest_time = min(shortest_time, *(_shortest_time(c, scenario) for c in batch))
                 if optima.certified and found.suffices(optima.best.cost, last):
                     if cannot_stop and lattice.refinement == 1 and effort != "low":
-                        break  # its turns are those of a lattice with fewer cells, or with more
+                        break  # the optimum may need the tighter turns of the finer lattice
                     if not _omits(lattice, effort) and not lattice.is_whole:
                         optima.add(_trajectories(found.take_elsewhere(N_ELSEWHERE)))
                     return optima, None

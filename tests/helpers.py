@@ -15,9 +15,10 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 from leapnav.cli import main
-from leapnav.envs import Scenario
+from leapnav.envs import NavigateEnv, Scenario
 from leapnav.envs.robots.base import MODELS
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, Trajectory
+from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.solve import METHODS
 from leapnav.training import CloningConfig, make_policy
 
@@ -120,6 +121,16 @@ def shooting_guess(problem, costate):
 def fresh(env, seed=0, hidden=SMALL):
     """Return a small untrained policy."""
     return make_policy(env.observation_space, env.action_space, seed, hidden)
+
+
+def info_of_plan(optimum, scenario):
+    """The last info of an episode with the controls of an optimum."""
+    env = NavigateEnv(scenario=scenario)
+    env.reset()
+    info = {}
+    for action in plan_actions(optimum, scenario, env.control_period):
+        info = env.step(action)[-1]
+    return info
 
 
 def failing(arguments, capsys):

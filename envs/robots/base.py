@@ -172,7 +172,7 @@ class RobotModel(Frozen):
         return [name for name in (*self.limited, *self.limited_states) if getattr(self, name) is not None]
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest value of one of `limited`."""
+        """Return the lowest and the highest value of one of `limited`, or of `limited_states` with limits."""
         interval: tuple[float, float] | None = getattr(self, name)
         if interval is None:
             largest = float(getattr(self, f"max_{name}"))
@@ -238,7 +238,10 @@ class RobotModel(Frozen):
         return middle + half * actions
 
     def has_symmetric_limits(self, symmetry: Symmetry) -> bool:
-        """Return whether a symmetry of the motion maps controls within their limits to such controls."""
+        """Return whether a symmetry of the motion maps controls and states within their limits to such ones."""
+        for factor, pair in zip(symmetry.motion, (self.state_bounds() or ())[3:], strict=False):
+            if pair is not None and sorted((factor * pair[0], factor * pair[1])) != list(pair):
+                return False
         bounds, matrix = self.control_bounds(), np.array(symmetry.controls, dtype=float)
         ends = np.sort(matrix[:, :, None] * bounds, axis=2)
         return bool(np.array_equal(ends.sum(axis=1), bounds))

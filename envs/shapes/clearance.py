@@ -50,7 +50,7 @@ def _rectangle_clearance(x, y, cos, sin, row, field):
     """Signed distance (m) from a rectangle to the nearest obstacle or wall, and the index of that obstacle."""
     middle, rim = (row[0] + row[1]) / 2.0, math.hypot((row[1] - row[0]) / 2.0, row[2]) + row[3]
     middle_x, middle_y = x + middle * cos, y + middle * sin
-    best, nearest = wall_separation(x, y, cos, sin, row, np.inf, header_of(field)), -1
+    best, nearest = wall_separation(x, y, cos, sin, row, header_of(field)), -1
     for part in parts_in(field):
         dx, dy = middle_x - part.x, middle_y - part.y
         if dx * dx + dy * dy < max(best + part.rim + rim, 0.0) ** 2:

@@ -1,4 +1,4 @@
-"""Exact distances from a disc to walls and to the parts of a packed field (kernels).
+"""Exact distances from a disc to walls and to the parts of a packed field, and the barrier of a distance (kernels).
 
 The gradient of a distance is the outward unit normal, and its Hessian is the curvature of the level line times t t'
 with the tangent t.
@@ -13,6 +13,7 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
+from leapnav.envs.shapes.barrier import barrier
 from leapnav.envs.shapes.field import HEADER_TYPE, PART_TYPE, edges_of
 
 # Smallest distances (m) from the centre of a circle, and from a vertex, with which normal and curvature are computed.
@@ -88,3 +89,21 @@ def part_geometry(x, y, radius, field, part):
     across, beside = largest * curvature, beyond * curvature
     nx, ny = across * edge.nx - beside * edge.ny, across * edge.ny + beside * edge.nx
     return distance - part.rounding - radius, nx, ny, curvature
+
+
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, HEADER_TYPE), inline="always")
+def barrier_term(distance, nx, ny, curvature, header):
+    """Barrier of a distance, with gradient and Hessian.
+
+    Args:
+        distance: from the robot's outline (m).
+        nx, ny, curvature: gradient of the distance, and curvature of its level line (1/m).
+        header: header of the packed obstacle field.
+
+    """
+    steepness = 1.0 / header.scale
+    value, slope, bend = barrier(distance * steepness, header.least_distance)
+    slope *= steepness
+    curl = slope * curvature
+    bend = bend * steepness * steepness - curl
+    return value, slope * nx, slope * ny, bend * nx * nx + curl, bend * nx * ny, bend * ny * ny + curl

@@ -14,30 +14,12 @@ from numba import float64, int64
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.distance import HASH_FACTOR, closest_feature, part_geometry, wall_distance
-from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, header_of, parts_in, parts_near
+from leapnav.envs.shapes.distance import HASH_FACTOR, barrier_term, closest_feature, part_geometry, wall_distance
+from leapnav.envs.shapes.field import CUTOFF, header_of, parts_in, parts_near
 from leapnav.envs.shapes.rectangle import add_rectangle, rectangle_features
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 OUTLINE_ENTRIES = 4  # in a row of an outline, see `leapnav.envs.shapes.rectangle`
-
-
-@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, HEADER_TYPE), inline="always")
-def barrier_term(distance, nx, ny, curvature, header):
-    """Barrier of a distance, with gradient and Hessian.
-
-    Args:
-        distance: from the robot's outline (m).
-        nx, ny, curvature: gradient of the distance, and curvature of its level line (1/m).
-        header: header of the packed obstacle field.
-
-    """
-    steepness = 1.0 / header.scale
-    value, slope, bend = barrier(distance * steepness, header.least_distance)
-    slope *= steepness
-    curl = slope * curvature
-    bend = bend * steepness * steepness - curl
-    return value, slope * nx, slope * ny, bend * nx * nx + curl, bend * nx * ny, bend * ny * ny + curl
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))

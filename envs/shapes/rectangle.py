@@ -15,8 +15,14 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, NOTHING, VECTOR, tuple_of
-from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.distance import HASH_FACTOR, MIN_DISTANCE, closest_feature, part_geometry, wall_distance
+from leapnav.envs.shapes.distance import (
+    HASH_FACTOR,
+    MIN_DISTANCE,
+    barrier_term,
+    closest_feature,
+    part_geometry,
+    wall_distance,
+)
 from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, PART_TYPE, edges_of, header_of, parts_in, parts_near
 
 ROW = tuple_of(*[float64] * 4)  # of an outline
@@ -44,14 +50,13 @@ def point_geometry(ahead, left, rear, front, half_width):
     return across, 0.0, (1.0 if left > 0.0 else -1.0), 0.0
 
 
-@kernel(float64(float64, float64, float64, float64, ROW, float64, HEADER_TYPE))
-def wall_separation(x, y, cos, sin, row, reach, header):
-    """Smallest distance (m) from a rectangle to a wall, at most `reach`; negative outside the arena.
+@kernel(float64(float64, float64, float64, float64, ROW, HEADER_TYPE))
+def wall_separation(x, y, cos, sin, row, header):
+    """Smallest distance (m) from a rectangle to a wall; negative outside the arena.
 
     Args:
         x, y, cos, sin: position (m), and cosine and sine of the heading.
         row: row of an outline.
-        reach: largest result (m).
         header: header of the packed obstacle field.
 
     """
@@ -59,7 +64,7 @@ def wall_separation(x, y, cos, sin, row, reach, header):
     width = abs(cos) * half + abs(sin) * row[2] + row[3]
     height = abs(sin) * half + abs(cos) * row[2] + row[3]
     x, y = x + middle * cos, y + middle * sin
-    best = reach
+    best = np.inf
     for side in range(4):
         best = min(best, wall_distance(x, y, header, side) - (width if side % 2 == 0 else height))
     return best
@@ -106,23 +111,18 @@ def separation(x, y, cos, sin, row, field, part):
 @kernel(NOTHING(float64, float64, float64, float64, float64, float64, HEADER_TYPE, VECTOR), inline="always")
 def _add_corner(distance, nx, ny, curvature, ox, oy, header, total):
     """Add the barrier of the distance of a corner (ox, oy) (m), relative to the robot's position, from an obstacle."""
-    steepness = 1.0 / header.scale
-    value, slope, bend = barrier(distance * steepness, header.least_distance)
-    slope *= steepness
-    curl = slope * curvature
-    bend = bend * steepness * steepness - curl
-    hxx, hxy, hyy = bend * nx * nx + curl, bend * nx * ny, bend * ny * ny + curl
+    value, gx, gy, hxx, hxy, hyy = barrier_term(distance, nx, ny, curvature, header)
     dx, dy = -oy, ox  # derivatives of the corner with respect to the heading
     total[0] += value
-    total[1] += slope * nx
-    total[2] += slope * ny
-    total[3] += slope * (nx * dx + ny * dy)
+    total[1] += gx
+    total[2] += gy
+    total[3] += gx * dx + gy * dy
     total[4] += hxx
     total[5] += hxy
     total[6] += hxx * dx + hxy * dy
     total[7] += hyy
     total[8] += hxy * dx + hyy * dy
-    total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - slope * (nx * ox + ny * oy)
+    total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - (gx * ox + gy * oy)
 
 
 @kernel(NOTHING(float64, float64, float64, float64, ROW, float64, HEADER_TYPE, VECTOR), inline="always")
@@ -131,23 +131,18 @@ def _add_point(rx, ry, cos, sin, row, rounding, header, total):
     ahead, left = cos * rx + sin * ry, cos * ry - sin * rx
     distance, along, across, curvature = point_geometry(ahead, left, row[0], row[1], row[2])
     nx, ny = cos * along - sin * across, sin * along + cos * across
-    steepness = 1.0 / header.scale
-    value, slope, bend = barrier((distance - rounding) * steepness, header.least_distance)
-    slope *= steepness
-    curl = slope * curvature
-    bend = bend * steepness * steepness - curl
-    hxx, hxy, hyy = bend * nx * nx + curl, bend * nx * ny, bend * ny * ny + curl
+    value, gx, gy, hxx, hxy, hyy = barrier_term(distance - rounding, nx, ny, curvature, header)
     dx, dy = ry, -rx  # a rotation of the robot moves the point backwards in its frame
     total[0] += value
-    total[1] -= slope * nx
-    total[2] -= slope * ny
-    total[3] += slope * (nx * dx + ny * dy)
+    total[1] -= gx
+    total[2] -= gy
+    total[3] += gx * dx + gy * dy
     total[4] += hxx
     total[5] += hxy
-    total[6] += slope * ny - hxx * dx - hxy * dy
+    total[6] += gy - hxx * dx - hxy * dy
     total[7] += hyy
-    total[8] -= slope * nx + hxy * dx + hyy * dy
-    total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - slope * (nx * rx + ny * ry)
+    total[8] -= gx + hxy * dx + hyy * dy
+    total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - (gx * rx + gy * ry)
 
 
 @kernel(NOTHING(float64, float64, float64, float64, ROW, CONSTANT, VECTOR))

@@ -67,6 +67,7 @@ def test_the_clearance_is_the_distance_of_the_closest_point_of_the_outline():
 
 
 def test_an_overlap_is_the_smallest_translation_that_separates():
+    checked = 0
     for pose in poses(3000, seed=1):
         clearance, nearest = footprint_clearance(*pose, SCENARIO.outline, SCENARIO.field)
         if nearest in (1, 3, 4) and -0.05 < clearance < -1e-4:
@@ -74,7 +75,9 @@ def test_an_overlap_is_the_smallest_translation_that_separates():
             for factor, is_free in ((0.97, False), (1.03, True)):
                 shift = -clearance * factor * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
                 moved = footprint_clearances(pose + shift, SCENARIO.outline, SCENARIO.field)
-                assert (moved > 0).any() == is_free or not is_free
+                assert (moved > 0).any() == is_free
+                checked += 1
+    assert checked > 40
 
 
 @pytest.mark.parametrize("others", [0, 20], ids=["no grid", "grid"])

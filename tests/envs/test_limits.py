@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from helpers import scenario_fields
+from helpers import info_of_plan, scenario_fields
 from scipy.integrate import cumulative_trapezoid
 
 from leapnav.envs import DifferentialDrive, DynamicUnicycle, NavigateEnv, Scenario, ScenarioError, Unicycle
 from leapnav.experts import ExpertPolicy, find_optimum
-from leapnav.experts.acting.policy import plan_actions
 from leapnav.training.policies.baselines import GoToGoal
 
 FORWARD = {"model": "unicycle", "speed": [0.25, 0.5], "turn_rate": [-0.5, 1.0]}
@@ -70,6 +69,9 @@ def test_symmetries_need_symmetric_limits():
         (Unicycle(speed=(0.25, 0.5)), True, False),
         (Unicycle(turn_rate=(-0.5, 1.0)), False, True),
         (DifferentialDrive(wheel_speed=(0.0, 1.0)), True, False),
+        (DynamicUnicycle(max_speed=1.0, max_turn_rate=1.0), True, True),
+        (DynamicUnicycle(speed=(-0.1, 0.5)), True, False),
+        (DynamicUnicycle(turn_rate=(-0.5, 1.0)), False, True),
     ):
         assert robot.has_symmetric_limits(type(robot).mirror) == mirrored
         assert robot.has_symmetric_limits(type(robot).reversal) == reversible
@@ -128,11 +130,7 @@ def test_optima_respect_the_limits_of_states():
     assert (controls >= low - 1e-9).all() and (controls <= high + 1e-9).all()
     without = task({"model": "dynamic_unicycle"}, horizon=None, cost={"time_weight": 1.0})
     assert optimum.cost > find_optimum(without).cost
-    env = NavigateEnv(scenario=scenario)
-    env.reset()
-    info = {}
-    for action in plan_actions(optimum, scenario, env.control_period):
-        info = env.step(action)[-1]
+    info = info_of_plan(optimum, scenario)
     assert info["is_success"] and info["cost"] == pytest.approx(optimum.cost, rel=5e-3)
 
 

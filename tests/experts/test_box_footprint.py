@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from helpers import info_of_plan
 
-from leapnav.envs import Box, Capsule, Cost, NavigateEnv, Obstacle, Polygon, Scenario, Unicycle, sample_scenario
+from leapnav.envs import Box, Capsule, Cost, Obstacle, Polygon, Scenario, Unicycle, sample_scenario
 from leapnav.envs.robots.footprints import corners_of
 from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.experts import OptimalControlProblem, find_optimum, minimum_time, solve
-from leapnav.experts.acting.policy import plan_actions
 
 BOX = Box(length=0.5, width=0.25)
 
@@ -79,11 +79,7 @@ def test_fresh_scenarios_with_a_rectangle(obstacles):
 def test_the_environment_charges_the_cost_of_the_optimum():
     scenario = sample_scenario("polygons", 60_003, robot=Unicycle(footprint=BOX))
     optimum = find_optimum(scenario)
-    env = NavigateEnv(scenario=scenario)
-    env.reset()
-    info = {}
-    for action in plan_actions(optimum, scenario, env.control_period):
-        info = env.step(action)[-1]
+    info = info_of_plan(optimum, scenario)
     assert info["is_success"] and info["cost"] == pytest.approx(optimum.cost, rel=5e-3)
 
 
