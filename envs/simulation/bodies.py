@@ -266,9 +266,8 @@ def resolve_overlap(x, y, to_x, to_y, heading, outline, field):
         here = max(footprint_clearance(x, y, heading, outline, field)[0], MAX_OVERLAP)
         while fraction < 1.0:
             following = min(fraction + here / step, 1.0)
-            here = footprint_clearance(x + following * (to_x - x), y + following * (to_y - y), heading, outline, field)[
-                0
-            ]
+            new_x, new_y = x + following * (to_x - x), y + following * (to_y - y)
+            here = footprint_clearance(new_x, new_y, heading, outline, field)[0]
             if here < MAX_OVERLAP:
                 break
             fraction = following

@@ -8,7 +8,6 @@ the repository https://github.com/quimortiz/dynobench (MIT licence), in the dire
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,10 +20,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 from leapnav.envs.worlds.yaml_files import Number, Pair, YamlRecord, as_record, read_yaml
 
-KINEMATIC, DYNAMIC = (
-    "unicycle1",
-    "unicycle2",
-)  # the dynamics that leapnav has: commanded by velocities, or by accelerations
+KINEMATIC, DYNAMIC = "unicycle1", "unicycle2"  # the dynamics that leapnav has: velocities or accelerations as controls
 STATE_WEIGHT = 1e-6  # of the squared velocities of a robot with accelerations as controls, whose cost is the time
 # Scale (m) of the barrier. With 0.1 m, the minimum time of one of five problems was 3 % longer, another local minimum.
 PROXIMITY_SCALE = 0.02
@@ -91,8 +87,11 @@ class _BoxModel(YamlRecord):
     max_vel: Number
     min_angular_vel: Number
     max_angular_vel: Number
-    max_acc_abs: Number | None = None
-    max_angular_acc: Number | None = None
+
+
+class _DynamicModel(_BoxModel):
+    max_acc_abs: Number
+    max_angular_acc: Number
 
 
 class _Box(YamlRecord):
@@ -108,13 +107,23 @@ class _Environment(YamlRecord):
 
 
 class _Poses(YamlRecord):
-    start: tuple[Number, ...]
-    goal: tuple[Number, ...]
+    start: tuple[Number, Number, Number]
+    goal: tuple[Number, Number, Number]
+
+
+class _States(YamlRecord):
+    start: tuple[Number, Number, Number, Number, Number]
+    goal: tuple[Number, Number, Number, Number, Number]
 
 
 class _Problem(YamlRecord):
     environment: _Environment
     robots: tuple[_Poses]
+
+
+class _DynamicProblem(YamlRecord):
+    environment: _Environment
+    robots: tuple[_States]
 
 
 class _Solution(YamlRecord):
@@ -133,12 +142,14 @@ def _problem(root: Path, path: Path, content: Any) -> DynobenchProblem:
     elif model.shape != "box":
         reason = f"shape {model.shape!r}"
     else:
-        box = as_record(_BoxModel, given, place)
-        scenario = _scenario(f"{path.parent.name}-{path.stem}", as_record(_Problem, content, path), box)
+        is_dynamic = model.dynamics == DYNAMIC
+        box = as_record(_DynamicModel if is_dynamic else _BoxModel, given, place)
+        problem = as_record(_DynamicProblem if is_dynamic else _Problem, content, path)
+        scenario = _scenario(f"{path.parent.name}-{path.stem}", problem, box)
     return DynobenchProblem(scenario, reason, _durations(path.with_suffix(""), model.dt))
 
 
-def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
+def _scenario(name: str, problem: _Problem | _DynamicProblem, model: _BoxModel) -> Scenario:
     obstacles = []
     for box in problem.environment.obstacles:
         (x, y), (width, height) = box.center, box.size
@@ -149,11 +160,8 @@ def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
     speed, turn_rate = (model.min_vel, model.max_vel), (model.min_angular_vel, model.max_angular_vel)
     footprint, (further, rest) = Box(length=length, width=width), (poses.start[3:], poses.goal[3:])
     motion: dict[str, Any] = {}
-    if model.max_acc_abs is None or model.max_angular_acc is None:
-        robot: RobotModel = Unicycle(footprint=footprint, speed=speed, turn_rate=turn_rate)
-        weights = 1.0 / magnitude(speed) ** 2, 1.0 / magnitude(turn_rate) ** 2
-    else:
-        robot = DynamicUnicycle(
+    if isinstance(model, _DynamicModel):
+        robot: RobotModel = DynamicUnicycle(
             footprint=footprint,
             speed=speed,
             turn_rate=turn_rate,
@@ -164,12 +172,15 @@ def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
         )
         weights = STATE_WEIGHT, STATE_WEIGHT
         motion = {"start_motion": further, "goal_motion": rest}
+    else:
+        robot = Unicycle(footprint=footprint, speed=speed, turn_rate=turn_rate)
+        weights = 1.0 / magnitude(speed) ** 2, 1.0 / magnitude(turn_rate) ** 2
     return Scenario(
         name=name,
         arena=(*problem.environment.min, *problem.environment.max),
         robot=robot,
-        start=_pose(poses.start),
-        goal=_pose(poses.goal),
+        start=poses.start[:3],
+        goal=poses.goal[:3],
         horizon=None,
         obstacles=tuple(obstacles),
         cost=Cost(
@@ -181,11 +192,6 @@ def _scenario(name: str, problem: _Problem, model: _BoxModel) -> Scenario:
         ),
         **motion,
     )
-
-
-def _pose(state: Sequence[float]) -> tuple[float, float, float]:
-    x, y, heading = state[:3]
-    return x, y, heading
 
 
 def _durations(folder: Path, dt: float) -> dict[str, float]:

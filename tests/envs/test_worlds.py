@@ -254,6 +254,7 @@ def test_the_table_of_dynobench(dynobench, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ("start: [0.5, 1.2, 0]", "start: [0.5, 1.2, 0, 0, 0]", "wall_0.yaml: robots"),
         ("size: [0.2, 0.4]", "size: 1", r"wall_0.yaml: environment.obstacles\[0\].size: expected a list, got 1"),
         ("type: box", "type: ball", r"obstacles\[0\].type: expected 'box', got 'ball'"),
         ("    goal: [1.7, 1.2, 0]", "    end: [0, 0, 0]", r"robots\[0\].goal: missing"),
