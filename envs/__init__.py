@@ -2,7 +2,17 @@
 
 from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.robots import Box, Car, DifferentialDrive, Disc, DynamicUnicycle, RobotModel, Unicycle
+from leapnav.envs.robots import (
+    Box,
+    Car,
+    DifferentialDrive,
+    Disc,
+    DynamicUnicycle,
+    RobotModel,
+    Trailer,
+    Unicycle,
+    UnicycleTrailer,
+)
 from leapnav.envs.scenarios.bank import BankError, ScenarioBank
 from leapnav.envs.scenarios.banks.checks import Reference
 from leapnav.envs.scenarios.cost import Cost
@@ -41,7 +51,9 @@ __all__ = [
     "ScenarioError",
     "ScenarioLayout",
     "Shape",
+    "Trailer",
     "Unicycle",
+    "UnicycleTrailer",
     "register_family",
     "sample_scenario",
 ]

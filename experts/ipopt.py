@@ -120,8 +120,9 @@ def _proximity(scenario: Scenario, q: Any, row: Sequence[float]) -> Any:
         row: of the outline.
 
     """
-    rear, front, half_width, radius = row
-    x, y, cos, sin = q[0, :], q[1, :], casadi.cos(q[2, :]), casadi.sin(q[2, :])
+    rear, front, half_width, radius, joint = row
+    axis = q[2, :] + (q[int(joint), :] if joint else 0.0)
+    x, y, cos, sin = q[0, :], q[1, :], casadi.cos(axis), casadi.sin(axis)
     is_disc = rear == front
     corners = [(a, b) for a in {rear, front} for b in {half_width, -half_width}]
     points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in corners]

@@ -16,7 +16,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from leapnav.envs import shapes
-from leapnav.envs.robots.footprints import corners_of
+from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import clearance
@@ -49,8 +49,8 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
         else:
             axes.add_patch(Polygon(part.outline(), facecolor=OBSTACLE, edgecolor=EDGE))
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
-    for pose, color in ((scenario.start, START), (scenario.goal, GOAL)):
-        draw_robot(axes, pose, scenario.outline, color)
+    for state, color in ((scenario.start_state, START), (scenario.goal_state, GOAL)):
+        draw_robot(axes, state, scenario.outline, color)
     margin = 0.02 * (x_max - x_min)
     axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - margin, y_max + margin), aspect="equal")
     axes.set_xticks([])
@@ -59,18 +59,22 @@ def draw_scenario(axes: Axes, scenario: Scenario) -> None:
         spine.set_visible(False)
 
 
-def draw_robot(axes: Axes, pose: Any, outline: np.ndarray, color: str, **style: Any) -> None:
-    """Draw the outline (K, 4) of a robot, and a line along its heading unless that is None."""
-    x, y, heading = pose[:3]
-    cos, sin = (1.0, 0.0) if heading is None else (np.cos(heading), np.sin(heading))
+def draw_robot(axes: Axes, state: Sequence[float | None], outline: np.ndarray, color: str, **style: Any) -> None:
+    """Draw the outline (K, 5) of a robot, and a line along its heading unless that is None."""
+    q, heading = [value or 0.0 for value in state], state[2]
+    x, y = q[:2]
     lines = {"fill": False, "edgecolor": color, "linewidth": 1.4, **style}
     for row in outline.tolist():
-        rear, front, _, radius = row
+        (rear, front, _, radius, joint), axis = row, axis_of(row, q)
+        cos, sin = math.cos(axis), math.sin(axis)
         if front > rear:
-            axes.add_patch(Polygon(corners_of(row, (x, y, heading or 0.0)), **lines))
+            axes.add_patch(Polygon(corners_of(row, q), **lines))
         else:
             axes.add_patch(Circle((x + rear * cos, y + rear * sin), radius, **lines))
+        if joint:  # the drawbar
+            axes.plot([x, x + front * cos], [y, y + front * sin], color=color, **{"linewidth": 1.4, **style})
     if heading is not None:
+        cos, sin = math.cos(heading), math.sin(heading)
         reach = float((outline[:, 1] + 0.6 * outline[:, 2] + 1.6 * outline[:, 3]).max())
         axes.plot([x, x + reach * cos], [y, y + reach * sin], color=color, **{"linewidth": 1.8, **style})
 
@@ -227,12 +231,12 @@ def _draw_plane(axes: Axes, extremal: Extremal, scenario: Scenario | None, sweep
     _draw_sweeps(axes, extremal.problem, sweeps, lambda _, states: (states[:, ix], states[:, iy]))
     axes.plot(states[:, ix], states[:, iy], color=OPTIMUM, linewidth=1.8, zorder=3)
     drawn = extremal.evaluate(np.linspace(0.0, extremal.horizon, N_ROBOTS + 2))[0]
-    poses = [(q[ix], q[iy], None if heading is None else q[heading]) for q in drawn]
     if scenario is not None:
         draw_scenario(axes, scenario)
-        for pose in poses[1:-1]:
-            draw_robot(axes, pose, scenario.outline, OPTIMUM, alpha=0.3, zorder=3)
+        for state in drawn[1:-1].tolist():
+            draw_robot(axes, state, scenario.outline, OPTIMUM, alpha=0.3, zorder=3)
         return
+    poses = [(q[ix], q[iy], None if heading is None else q[heading]) for q in drawn]
     low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
     center, reach = (low + high) / 2, 0.6 * float((high - low).max()) or 1.0
     if extremal.problem.field is not None:

@@ -34,6 +34,7 @@ from leapnav.commands.train import (
 )
 from leapnav.commands.watch import Watch
 from leapnav.commands.worlds import Worlds
+from leapnav.commands.worlds.benchmark import Benchmark
 from leapnav.outputs import FAILED, json_on_stdout
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
@@ -44,6 +45,7 @@ COMMANDS = {
     "proof": CheckProof,
     "bank": Bank,
     "worlds": Worlds,
+    "benchmark": Benchmark,
     "rollout": Rollout,
     "dataset": CheckDataset,
     "train": TrainCommand,  # `parse` replaces it by a class with default configurations

@@ -14,6 +14,7 @@ from leapnav.envs import (
     DynamicUnicycle,
     NavigateEnv,
     ScenarioBank,
+    Trailer,
     Unicycle,
     sample_scenario,
 )
@@ -47,7 +48,7 @@ def draw_families() -> None:
 
 def draw_robots() -> None:
     """Draw three scenarios with the optima of each robot."""
-    for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle):
+    for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer):
         figure = Figure(figsize=(9.6, 3.3), layout="constrained")
         for axes, (family, seed) in zip(figure.subplots(1, 3), ROBOT_SCENARIOS, strict=True):
             scenario = sample_scenario(family, seed, model())

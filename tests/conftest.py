@@ -13,7 +13,7 @@ from leapnav.envs.scenarios.families import REGISTERED
 from leapnav.envs.shapes.base import KINDS
 
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
-sys.path.append(str(Path(__file__).parent.parent / "examples"))  # for the robot of `trailer_robot.py`
+sys.path.append(str(Path(__file__).parent.parent / "examples"))  # for the robot of `wagon_robot.py`
 
 # The default profile repeats the same examples; HYPOTHESIS_PROFILE=long generates many new ones.
 settings.register_profile("default", max_examples=40, deadline=None, derandomize=True)

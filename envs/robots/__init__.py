@@ -5,6 +5,7 @@ from leapnav.envs.robots.car import Car
 from leapnav.envs.robots.differential_drive import DifferentialDrive
 from leapnav.envs.robots.dynamic_unicycle import DynamicUnicycle
 from leapnav.envs.robots.footprints import Box, Disc
+from leapnav.envs.robots.trailer import Trailer, UnicycleTrailer
 from leapnav.envs.robots.unicycle import Unicycle
 
 __all__ = [
@@ -16,6 +17,8 @@ __all__ = [
     "Dynamics",
     "RobotModel",
     "Symmetry",
+    "Trailer",
     "Unicycle",
+    "UnicycleTrailer",
     "register",
 ]

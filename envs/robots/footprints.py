@@ -55,17 +55,24 @@ def _read(value: Any, _: Any) -> tuple[Disc, ...] | Box:
 Footprint = Annotated[tuple[Disc, ...] | Box, WrapValidator(_read)]
 
 
-def outline_of(footprint: Sequence[Disc] | Box) -> np.ndarray:
-    """Return an outline (K, 4): rear, front, half width and radius (m) of discs and rectangles, read-only.
+def outline_of(footprint: Sequence[Disc] | Box, ahead: float = 0.0, joint: int = 0) -> np.ndarray:
+    """Return an outline (K, 5): rear, front, half width, radius (m) and joint of discs and rectangles, read-only.
 
-    A row is the rectangle from `rear` to `front` along the robot's axis, enlarged by the radius; of a disc, the
-    rectangle is its centre, and of a `Box` the radius is 0.
+    A row is the rectangle from `rear` to `front` along an axis through (x, y), enlarged by the radius; of a disc, the
+    rectangle is its centre, and of a `Box` the radius is 0. The axis has the robot's heading plus the state whose index
+    is the joint, such as the hitch angle of a trailer, or the robot's heading if the joint is 0.
+
+    Args:
+        footprint: discs or a rectangle.
+        ahead: distance (m) of its reference point ahead of (x, y) along the axis.
+        joint: see above.
+
     """
     if isinstance(footprint, Box):
-        middle, half = footprint.offset, footprint.length / 2
-        rows = [(middle - half, middle + half, footprint.width / 2, 0.0)]
+        middle, half = ahead + footprint.offset, footprint.length / 2
+        rows = [(middle - half, middle + half, footprint.width / 2, 0.0, joint)]
     else:
-        rows = [(disc.offset, disc.offset, 0.0, disc.radius) for disc in footprint]
+        rows = [(ahead + disc.offset, ahead + disc.offset, 0.0, disc.radius, joint) for disc in footprint]
     outline = np.array(rows, dtype=float)
     outline.flags.writeable = False
     return outline
@@ -73,7 +80,7 @@ def outline_of(footprint: Sequence[Disc] | Box) -> np.ndarray:
 
 def sizes_of(outline: np.ndarray) -> tuple[float, float]:
     """Return radius and extent (m) of an outline, see `leapnav.envs.shapes.field.HEADER`."""
-    rear, front, half_width, radius = outline.T
+    rear, front, half_width, radius = outline.T[:4]
     return float((half_width + radius).max()), float((np.hypot((front - rear) / 2, half_width) + radius).max())
 
 
@@ -87,14 +94,19 @@ def arm_of(outline: np.ndarray) -> float:
 
 def enclosed_radius(outline: np.ndarray) -> float:
     """Return the radius (m) of the largest disc around the reference point in an outline; negative outside of it."""
-    rear, front, half_width, radius = outline.T
+    rear, front, half_width, radius = outline[outline[:, 4] == 0].T[:4]
     return float((np.minimum(half_width, np.minimum(front, -rear)) + radius).max())
 
 
-def corners_of(row: Sequence[float], pose: Sequence[float]) -> np.ndarray:
-    """Return the corners (4, 2) (m) of a rectangle of an outline at a pose, counter-clockwise."""
-    rear, front, half_width, _ = row
-    x, y, heading = pose[:3]
+def axis_of(row: Sequence[float], state: Sequence[float]) -> float:
+    """Return the angle (rad) of the axis of a row of an outline at a state of the robot."""
+    return state[2] + (state[int(row[4])] if row[4] else 0.0)
+
+
+def corners_of(row: Sequence[float], state: Sequence[float]) -> np.ndarray:
+    """Return the corners (4, 2) (m) of a rectangle of an outline at a state, counter-clockwise."""
+    rear, front, half_width = row[:3]
+    x, y, heading = *state[:2], axis_of(row, state)
     cos, sin = math.cos(heading), math.sin(heading)
     ahead = np.array([rear, front, front, rear])
     left = np.array([-half_width, -half_width, half_width, half_width])

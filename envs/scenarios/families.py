@@ -301,7 +301,8 @@ def _sample_task(
         cost.proximity_scale,
         grid=False,
     )
-    if footprint_clearances(poses, outline, field).min() < MIN_POSE_CLEARANCE:
+    states = np.pad(poses, ((0, 0), (0, body.sizes()[0] - 3)))
+    if footprint_clearances(states, outline, field).min() < MIN_POSE_CLEARANCE:
         return None
     length = _shortest_path(layout.arena, field, poses[0, :2], poses[1, :2])
     if length is None:

@@ -31,6 +31,7 @@ from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.records import Finite, Frozen, Positive
 from leapnav.envs.utils.validation import as_vector, check_positive
 
+N_HEADINGS = 73  # at which the clearance of a robot with a free heading is evaluated
 TIME_LIMIT_FACTOR = 3.0  # time limit of an episode, as a multiple of the duration of the optimum
 
 
@@ -128,16 +129,16 @@ class Scenario(Frozen):
     def _check_poses_are_free(self) -> Self:
         names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
         faults = []
-        for end, pose in (("start", self.start), ("goal", self.goal)):
-            x, y, heading = pose
-            distance, nearest = footprint_clearance(x, y, heading or 0.0, self.outline, self.field)
-            if heading is None and self.robot.footprint is not None:  # some heading must be free
-                headings = np.linspace(-np.pi, np.pi, 73).tolist()
-                found = [footprint_clearance(x, y, angle, self.outline, self.field) for angle in headings]
-                distance, nearest = max(found)
+        for end, given in (("start", self.start_state), ("goal", self.goal_state)):
+            state = np.array([value or 0.0 for value in given])
+            distance, nearest = footprint_clearance(state, self.outline, self.field)
+            if given[2] is None and not self.robot.is_one_disc:  # some heading must be free
+                states = np.tile(state, (N_HEADINGS, 1))
+                states[:, 2] = np.linspace(-np.pi, np.pi, N_HEADINGS)
+                distance, nearest = max(footprint_clearance(state, self.outline, self.field) for state in states)
             if not distance > 0:
                 faults.append(
-                    f"{end}: ({pose[0]:g}, {pose[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
+                    f"{end}: ({state[0]:g}, {state[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
                 )
         if faults:
             raise ValueError("; ".join(faults))
@@ -152,7 +153,7 @@ class Scenario(Frozen):
 
     @cached_property
     def outline(self) -> np.ndarray:
-        """The robot's footprint (K, 4), see `leapnav.envs.robots.footprints.outline_of` (read-only)."""
+        """The robot's footprint (K, 5), see `leapnav.envs.robots.footprints.outline_of` (read-only)."""
         return self.robot.outline()
 
     @property

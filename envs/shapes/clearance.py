@@ -11,7 +11,7 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.shapes.distance import part_geometry, wall_distance
 from leapnav.envs.shapes.field import header_of, parts_in
-from leapnav.envs.shapes.rectangle import ROW, separation, wall_separation
+from leapnav.envs.shapes.rectangle import ROW, row_axis, separation, wall_separation
 
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
@@ -60,23 +60,24 @@ def _rectangle_clearance(x, y, cos, sin, row, field):
     return best, nearest
 
 
-@kernel(tuple_of(float64, int64)(float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
-def footprint_clearance(x, y, heading, outline, field):
+@kernel(tuple_of(float64, int64)(CONSTANT, CONSTANT_MATRIX, CONSTANT))
+def footprint_clearance(q, outline, field):
     """Signed distance (m) from the robot's outline to the nearest obstacle or wall, and the index of that obstacle.
 
     Args:
-        x, y, heading: pose (m, rad).
-        outline (K, 4): see `leapnav.envs.robots.footprints.outline_of`; rows of zeros are unused.
+        q: state of the robot, or its pose (m, rad) if the outline has no joint.
+        outline (K, 5): see `leapnav.envs.robots.footprints.outline_of`; rows of zeros are unused.
         field: packed obstacle field.
 
     """
+    x, y = q[0], q[1]
     if len(outline) == 1 and outline[0, 0] == 0.0 and outline[0, 1] == 0.0:
         distance, nearest = obstacle_distance(x, y, field)
         return distance - outline[0, 3], nearest
-    cos, sin = math.cos(heading), math.sin(heading)
     best, found = np.inf, -1
     for k in range(len(outline)):
-        a = outline[k, 0]
+        a, axis = outline[k, 0], row_axis(q, outline[k, 4])
+        cos, sin = math.cos(axis), math.sin(axis)
         if outline[k, 1] > a:
             row = (a, outline[k, 1], outline[k, 2], outline[k, 3])
             distance, nearest = _rectangle_clearance(x, y, cos, sin, row, field)
@@ -91,32 +92,30 @@ def footprint_clearance(x, y, heading, outline, field):
 
 
 @kernel(VECTOR(MATRIX, CONSTANT_MATRIX, CONSTANT))
-def footprint_clearances(poses, outline, field):
-    """Clearance (m) of the robot's outline at many poses, shape (N, >= 3) -> (N,)."""
-    result = np.empty(len(poses))
-    for i in range(len(poses)):
-        result[i] = footprint_clearance(poses[i, 0], poses[i, 1], poses[i, 2], outline, field)[0]
+def footprint_clearances(states, outline, field):
+    """Clearance (m) of the robot's outline at many states, shape (N, n) -> (N,), see `footprint_clearance`."""
+    result = np.empty(len(states))
+    for i in range(len(states)):
+        result[i] = footprint_clearance(states[i], outline, field)[0]
     return result
 
 
 @kernel(float64(MATRIX, CONSTANT_MATRIX, CONSTANT))
-def path_clearance(poses, outline, field):
-    """Smallest clearance (m) of the robot's outline along a path of poses (N, >= 3), N >= 2, also between them.
+def path_clearance(states, outline, field):
+    """Smallest clearance (m) of the robot's outline along a path of states (N, n), N >= 2, also between them.
 
-    In the middle between two poses, the chord of a circle of the radius of the smallest disc in the outline, such as
+    In the middle between two states, the chord of a circle of the radius of the smallest disc in the outline, such as
     around a vertex of an obstacle, is closer to its centre than the arc, by the sagitta that is added.
     """
     radius = np.inf
     for k in range(len(outline)):
         radius = min(radius, outline[k, 2] + outline[k, 3])
-    best = footprint_clearance(poses[0, 0], poses[0, 1], poses[0, 2], outline, field)[0]
-    for i in range(1, len(poses)):
-        x, y, heading = poses[i, 0], poses[i, 1], poses[i, 2]
-        last_x, last_y, last = poses[i - 1, 0], poses[i - 1, 1], poses[i - 1, 2]
-        best = min(best, footprint_clearance(x, y, heading, outline, field)[0])
-        sagitta = ((x - last_x) ** 2 + (y - last_y) ** 2) / (8.0 * radius)
-        x, y, heading = 0.5 * (x + last_x), 0.5 * (y + last_y), 0.5 * (heading + last)
-        best = min(best, footprint_clearance(x, y, heading, outline, field)[0] + sagitta)
+    best = footprint_clearance(states[0], outline, field)[0]
+    for i in range(1, len(states)):
+        best = min(best, footprint_clearance(states[i], outline, field)[0])
+        middle = 0.5 * (states[i] + states[i - 1])
+        step = math.hypot(states[i, 0] - states[i - 1, 0], states[i, 1] - states[i - 1, 1])
+        best = min(best, footprint_clearance(middle, outline, field)[0] + step * step / (8.0 * radius))
     return best
 
 

@@ -16,10 +16,9 @@ from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR
 from leapnav.envs.shapes.barrier import barrier
 from leapnav.envs.shapes.distance import HASH_FACTOR, barrier_term, closest_feature, part_geometry, wall_distance
 from leapnav.envs.shapes.field import CUTOFF, header_of, parts_in, parts_near
-from leapnav.envs.shapes.rectangle import add_rectangle, rectangle_features
+from leapnav.envs.shapes.rectangle import OUTLINE_ENTRIES, add_rectangle, rectangle_features, row_axis
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
-OUTLINE_ENTRIES = 4  # in a row of an outline, see `leapnav.envs.shapes.rectangle`
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
@@ -90,14 +89,15 @@ def proximity_value(x, y, radius, field):
     return proximity_values(x, y, x, y, x, y, radius, field)[1]
 
 
-@kernel(tuple_of(*[float64] * 10)(float64, float64, float64, CONSTANT, int64, CONSTANT))
-def footprint_proximity(x, y, heading, data, first, field):
-    """Proximity cost of a footprint: the sum over the rows of its outline.
+@kernel(tuple_of(*[float64] * 10)(float64, float64, float64, int64, CONSTANT, int64, CONSTANT))
+def footprint_proximity(x, y, heading, joint, data, first, field):
+    """Proximity cost of a footprint: the sum over the rows of its outline with a joint.
 
     Args:
-        x, y, heading: pose (m, rad).
-        data: rows of an outline, see `leapnav.envs.shapes.rectangle`, from the index `first` to the end. A disc has the
-            half width 0, and its rear and its front are its centre.
+        x, y, heading: position (m), and angle of the axis of these rows (rad).
+        joint: see `leapnav.envs.shapes.rectangle`; other rows are skipped.
+        data: rows of an outline, from the index `first` to the end. A disc has the half width 0, and its rear and its
+            front are its centre.
         first: see `data`.
         field: packed obstacle field.
 
@@ -108,6 +108,8 @@ def footprint_proximity(x, y, heading, data, first, field):
     cos, sin = math.cos(heading), math.sin(heading)
     value = gx = gy = gh = hxx = hxy = hxh = hyy = hyh = hhh = 0.0
     for k in range(first, len(data), OUTLINE_ENTRIES):
+        if data[k + 4] != joint:
+            continue
         a = data[k]
         if data[k + 1] > a:
             total, row = np.zeros(10), (a, data[k + 1], data[k + 2], data[k + 3])
@@ -138,18 +140,23 @@ def footprint_proximity(x, y, heading, data, first, field):
     return value, gx, gy, gh, hxx, hxy, hxh, hyy, hyh, hhh
 
 
-@kernel(float64(float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
-def footprint_value(x, y, heading, outline, field):
-    """Proximity cost of the outline (K, 4) of a robot at a pose (m, rad), without derivatives."""
-    cos, sin = math.cos(heading), math.sin(heading)
-    value, weight = 0.0, header_of(field).weight
+@kernel(float64(CONSTANT, CONSTANT_MATRIX, CONSTANT))
+def footprint_value(q, outline, field):
+    """Proximity cost of the outline (K, 5) of a robot at a state q, without derivatives."""
+    x, y, value, weight = q[0], q[1], 0.0, header_of(field).weight
     for k in range(len(outline)):
         a = outline[k, 0]
+        if a == 0.0 and outline[k, 1] == 0.0:
+            if outline[k, 3] > 0.0:  # otherwise unused
+                value += proximity_value(x, y, outline[k, 3], field)
+            continue
+        axis = row_axis(q, outline[k, 4])
+        cos, sin = math.cos(axis), math.sin(axis)
         if outline[k, 1] > a:
             total = np.zeros(10)
             add_rectangle(x, y, cos, sin, (a, outline[k, 1], outline[k, 2], outline[k, 3]), field, total)
             value += weight * total[0]
-        elif outline[k, 3] > 0.0:  # otherwise unused
+        else:
             value += proximity_value(x + a * cos, y + a * sin, outline[k, 3], field)
     return value
 
@@ -171,12 +178,14 @@ def disc_features(x, y, radius, field):
     return number
 
 
-@kernel(int64(float64, float64, float64, CONSTANT, int64, CONSTANT))
-def footprint_features(x, y, heading, data, first, field):
+@kernel(int64(float64, float64, float64, int64, CONSTANT, int64, CONSTANT))
+def footprint_features(x, y, heading, joint, data, first, field):
     """Number of the closest features of a footprint, see `disc_features` and `footprint_proximity`."""
     cos, sin = math.cos(heading), math.sin(heading)
     number = 0
     for k in range(first, len(data), OUTLINE_ENTRIES):
+        if data[k + 4] != joint:
+            continue
         a = data[k]
         if data[k + 1] > a:
             features = rectangle_features(x, y, cos, sin, (a, data[k + 1], data[k + 2], data[k + 3]), field)
@@ -187,10 +196,9 @@ def footprint_features(x, y, heading, data, first, field):
 
 
 @kernel(VECTOR(MATRIX, CONSTANT_MATRIX, CONSTANT))
-def footprint_proximities(poses, outline, field):
-    """Proximity cost of the outline (K, 4) of a robot at many poses, shape (N, >= 3) -> (N,)."""
-    result = np.zeros(len(poses))
-    data = outline.ravel()
-    for i in range(len(poses)):
-        result[i] = footprint_proximity(poses[i, 0], poses[i, 1], poses[i, 2], data, 0, field)[0]
+def footprint_proximities(states, outline, field):
+    """Proximity cost of the outline (K, 5) of a robot at many states, shape (N, n) -> (N,), to 2e-9 of the weight."""
+    result = np.zeros(len(states))
+    for i in range(len(states)):
+        result[i] = footprint_value(states[i], outline, field)
     return result

@@ -1,7 +1,8 @@
 """Exact distances between a rectangular footprint and the parts of a packed field, and their proximity cost (kernels).
 
-A row of an outline is (rear, front, half_width, radius) (m): the rectangle from `rear` to `front` along the heading and
-up to `half_width` to both sides, enlarged by a radius. Two convex shapes that move continuously meet first at a vertex
+A row of an outline is (rear, front, half_width, radius, joint) (m): the rectangle from `rear` to `front` along an axis
+and up to `half_width` to both sides, enlarged by a radius. The axis has the robot's heading plus the state whose index
+is the joint; with the joint 0, it has the heading. Two convex shapes that move continuously meet first at a vertex
 of one of them. The proximity cost therefore sums the barrier over the distances of the rectangle's corners from the
 walls and from each polygon, and of the vertices of each polygon, or the centre of each disc, from the rectangle.
 """
@@ -25,7 +26,14 @@ from leapnav.envs.shapes.distance import (
 )
 from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, PART_TYPE, edges_of, header_of, parts_in, parts_near
 
-ROW = tuple_of(*[float64] * 4)  # of an outline
+OUTLINE_ENTRIES = 5  # in a row of an outline
+ROW = tuple_of(*[float64] * 4)  # of an outline, without the joint
+
+
+@kernel(float64(CONSTANT, float64), inline="always")
+def row_axis(q, joint):
+    """Angle (rad) of the axis of a row of an outline with a joint, at a state q of the robot."""
+    return q[2] + (q[int(joint)] if joint > 0.0 else 0.0)
 
 
 @kernel(tuple_of(*[float64] * 4)(float64, float64, float64, float64, float64), inline="always")

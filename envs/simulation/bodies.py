@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import pymunk
 import pymunk.batch
-from numba import float64, types
+from numba import float64
 from pymunk.constraints import Constraint, GearJoint, PivotJoint
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX
-from leapnav.envs.robots.footprints import corners_of
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR
+from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.settings import Motor
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import FieldPart, field_parts, read_header, replace_parts
@@ -32,6 +32,7 @@ WALL_THICKNESS = 1.0  # m, outside the arena
 CONTACT_MARGIN = 1e-3  # m by which the rim is enlarged, so that a robot sliding along an obstacle stays in contact
 MAX_OVERLAP = 1e-6  # m, of a robot in contact with an obstacle
 GROUND_FRICTION = 0.5  # of obstacles with a mass; wood, cardboard and plastics on a floor have 0.3 to 0.6
+DIFFERENCE = 1e-6  # m, of finite differences of the clearance
 MAX_CORRECTED_STEP = 0.5  # robot radii: after a longer step the robot may be on the other side of an obstacle
 
 _KINEMATICS = (
@@ -91,7 +92,7 @@ class ContactWorld:
 
     Args:
         field: the packed field of the scenario.
-        outline (K, 4): footprint of the robot, see `leapnav.envs.robots.footprints.outline_of`.
+        outline (K, 5): footprint of the robot, see `leapnav.envs.robots.footprints.outline_of`.
         motor: mass, moment of inertia and friction of the robot.
         masses: mass (kg) of each obstacle; None: it does not move.
 
@@ -106,7 +107,7 @@ class ContactWorld:
         self.field, self._outline, self._motor = field, outline, motor
         # For the proximity cost: Chipmunk does not resolve the position of a robot in contact more finely.
         self._smaller = outline - CONTACT_MARGIN * np.where(
-            outline[:, 1:2] > outline[:, :1], (-1, 1, 1, 0), (0, 0, 0, 1)
+            outline[:, 1:2] > outline[:, :1], (-1, 1, 1, 0, 0), (0, 0, 0, 1, 0)
         )
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
@@ -143,7 +144,7 @@ class ContactWorld:
 
     def simulate(
         self,
-        row: np.ndarray,
+        state: np.ndarray,
         velocity: np.ndarray,
         steer: VelocityFunction,
         duration: float,
@@ -152,7 +153,7 @@ class ContactWorld:
         """Simulate a period with contacts.
 
         Args:
-            row: x, y (m) and angle (rad); overwritten.
+            state (n,): state of the robot, whose pose is overwritten. The angles of its joints do not change.
             velocity: velocity (2) (m/s) and angular velocity (rad/s); overwritten.
             steer: see `VelocityFunction`.
             duration: length of the period (s).
@@ -171,29 +172,28 @@ class ContactWorld:
 
         # A new body in each period: the memory of bodies and contacts must not carry over to the next period.
         body = pymunk.Body(self._motor.mass, self._motor.moment)
-        outline = [self._shape(body, row) for row in self._outline.tolist()]
-        x, y, angle = row[:3].tolist()
+        outline = [self._shape(body, row, state) for row in self._outline.tolist()]
+        x, y, angle = state[:3].tolist()
         body.position, body.angle = (x, y), angle
         body.velocity, body.angular_velocity = (velocity[0], velocity[1]), velocity[2]
         body.velocity_func = apply
         self._space.add(body, *outline)
         step = duration / substeps
         lowest, speed_integral, turn_integral = math.inf, 0.0, 0.0
-        phi = self._proximity(x, y, angle)
+        phi = footprint_value(state, self._smaller, self.field)
         phi_sum = phi / 2  # trapezoidal rule
         for _ in range(substeps):
             self._space.step(step)
-            to_x, to_y, to_angle = _pose(body)
+            before = state.copy()
+            state[:3] = _pose(body)
             self._move_obstacles()
-            to_x, to_y, depth = resolve_overlap(x, y, to_x, to_y, to_angle, self._outline, self.field)
-            body.position = to_x, to_y
-            lowest = min(lowest, depth)
-            speed_integral += ((to_x - x) ** 2 + (to_y - y) ** 2) / step
-            turn_integral += (to_angle - angle) ** 2 / step
-            x, y, angle = to_x, to_y, to_angle
-            phi = self._proximity(x, y, angle)
+            lowest = min(lowest, resolve_overlap(before, state, self._outline, self.field))
+            body.position = float(state[0]), float(state[1])
+            moved = (state[:3] - before[:3]).tolist()
+            speed_integral += (moved[0] ** 2 + moved[1] ** 2) / step
+            turn_integral += moved[2] ** 2 / step
+            phi = footprint_value(state, self._smaller, self.field)
             phi_sum += phi
-        row[:3] = x, y, angle
         velocity[:] = *body.velocity, body.angular_velocity
         self._space.remove(body, *outline)
         return lowest, speed_integral, turn_integral, (phi_sum - phi / 2) * step
@@ -211,20 +211,18 @@ class ContactWorld:
 
         self.field = replace_parts(self.field, [moved(part) for part in self._parts])
 
-    def _shape(self, body: pymunk.Body, row: Sequence[float]) -> pymunk.Shape:
+    def _shape(self, body: pymunk.Body, row: Sequence[float], state: np.ndarray) -> pymunk.Shape:
         """Return a disc or a rectangle of the footprint, enlarged by the margin."""
-        rear, front, _, radius = row
+        rear, front, _, radius, _ = row
+        relative = np.array([0.0, 0.0, 0.0, *state[3:]])
         if front > rear:
-            corners = [(x, y) for x, y in corners_of(row, (0.0, 0.0, 0.0)).tolist()]
+            corners = [(x, y) for x, y in corners_of(row, relative.tolist()).tolist()]
             shape: pymunk.Shape = pymunk.Poly(body, corners, radius=radius + CONTACT_MARGIN)
         else:
-            shape = pymunk.Circle(body, radius + CONTACT_MARGIN, (rear, 0.0))
+            axis = axis_of(row, relative.tolist())
+            shape = pymunk.Circle(body, radius + CONTACT_MARGIN, (rear * math.cos(axis), rear * math.sin(axis)))
         shape.friction = self._motor.friction
         return shape
-
-    def _proximity(self, x: float, y: float, heading: float) -> float:
-        """Return the proximity cost at a pose, with clearances larger by CONTACT_MARGIN."""
-        return footprint_value(x, y, heading, self._smaller, self.field)
 
 
 def _ground_friction(static: pymunk.Body, body: pymunk.Body) -> tuple[Constraint, ...]:
@@ -243,49 +241,61 @@ def _pose(body: pymunk.Body) -> tuple[float, float, float]:
     return x, y, body.angle
 
 
-@kernel(types.UniTuple(float64, 3)(float64, float64, float64, float64, float64, CONSTANT_MATRIX, CONSTANT))
-def resolve_overlap(x, y, to_x, to_y, heading, outline, field):
-    """Move a robot out of an obstacle that it overlaps after a step of Chipmunk from (x, y) to (to_x, to_y).
+@kernel(float64(CONSTANT, VECTOR, CONSTANT_MATRIX, CONSTANT))
+def resolve_overlap(before, state, outline, field):
+    """Move a robot out of an obstacle that it overlaps after a step of Chipmunk.
 
     Chipmunk detects a contact only after bodies overlap, by up to the length of a step. After a short step, the robot
     is moved to the nearest free position. After a long step, that might be on the other side of the obstacle, so the
     robot is moved back to the first contact of the step.
 
+    Args:
+        before (n,): state before the step.
+        state (n,): state after the step; its position is overwritten.
+        outline (K, 5): footprint of the robot.
+        field: packed obstacle field.
+
     Returns:
-        x, y (m), and the clearance (m) at (to_x, to_y).
+        The clearance (m) after the step.
 
     """
+    x, y, to_x, to_y = before[0], before[1], state[0], state[1]
     step = math.hypot(to_x - x, to_y - y)
-    before = footprint_clearance(to_x, to_y, heading, outline, field)[0]
+    found = footprint_clearance(state, outline, field)[0]
     smallest = np.inf
     for k in range(len(outline)):
         smallest = min(smallest, outline[k, 2] + outline[k, 3])
     if step > MAX_CORRECTED_STEP * smallest:
         # Steps of at most the clearance, so that the first contact is not missed.
         fraction = 0.0
-        here = max(footprint_clearance(x, y, heading, outline, field)[0], MAX_OVERLAP)
+        state[0], state[1] = x, y
+        here = max(footprint_clearance(state, outline, field)[0], MAX_OVERLAP)
         while fraction < 1.0:
             following = min(fraction + here / step, 1.0)
-            new_x, new_y = x + following * (to_x - x), y + following * (to_y - y)
-            here = footprint_clearance(new_x, new_y, heading, outline, field)[0]
+            state[0], state[1] = x + following * (to_x - x), y + following * (to_y - y)
+            here = footprint_clearance(state, outline, field)[0]
             if here < MAX_OVERLAP:
                 break
             fraction = following
-        return x + fraction * (to_x - x), y + fraction * (to_y - y), before
-    depth = before
-    new_x, new_y = to_x, to_y
-    h = 1e-6
+        state[0], state[1] = x + fraction * (to_x - x), y + fraction * (to_y - y)
+        return found
+    depth = found
     for _ in range(50):
         if depth >= -MAX_OVERLAP:
-            return new_x, new_y, before
-        nx = footprint_clearance(new_x + h, new_y, heading, outline, field)[0]
-        nx -= footprint_clearance(new_x - h, new_y, heading, outline, field)[0]
-        ny = footprint_clearance(new_x, new_y + h, heading, outline, field)[0]
-        ny -= footprint_clearance(new_x, new_y - h, heading, outline, field)[0]
+            return found
+        new_x, new_y = state[0], state[1]
+        state[0] = new_x + DIFFERENCE
+        nx = footprint_clearance(state, outline, field)[0]
+        state[0] = new_x - DIFFERENCE
+        nx -= footprint_clearance(state, outline, field)[0]
+        state[0], state[1] = new_x, new_y + DIFFERENCE
+        ny = footprint_clearance(state, outline, field)[0]
+        state[1] = new_y - DIFFERENCE
+        ny -= footprint_clearance(state, outline, field)[0]
         size = math.hypot(nx, ny)
         if size == 0.0:
             break
-        new_x -= depth * nx / size
-        new_y -= depth * ny / size
-        depth = footprint_clearance(new_x, new_y, heading, outline, field)[0]
-    return x, y, before
+        state[0], state[1] = new_x - depth * nx / size, new_y - depth * ny / size
+        depth = footprint_clearance(state, outline, field)[0]
+    state[0], state[1] = x, y
+    return found

@@ -20,6 +20,7 @@ from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.shapes.field import header_of
 from leapnav.envs.shapes.proximity import footprint_value, proximity_values
+from leapnav.envs.shapes.rectangle import row_axis
 
 ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
@@ -70,7 +71,7 @@ class Path(NamedTuple):
         q (n,): state at the start.
         u (m,): held controls.
         parameters: parameters of the model.
-        outline (K, 4): footprint, see `leapnav.envs.robots.footprints.outline_of`.
+        outline (K, 5): footprint, see `leapnav.envs.robots.footprints.outline_of`.
         field: packed obstacle field.
         duration: s.
         samples (5 or more, n): working memory: the states at the nodes of a panel, and two other states. Further rows
@@ -122,7 +123,7 @@ def state_after(path, fraction, new):
 @kernel(float64(PATH, VECTOR), inline="always")
 def clearance_at(path, q):
     """Return the clearance (m) at a state of the path."""
-    return footprint_clearance(q[0], q[1], q[2], path.outline, path.field)[0]
+    return footprint_clearance(q, path.outline, path.field)[0]
 
 
 @kernel(float64(PATH, VECTOR), inline="always")
@@ -131,13 +132,13 @@ def _speed_after(path, q):
     new, time = path.samples[4], SHORT * path.duration
     path.motion.advance(q, path.u, time, path.parameters, new)
     speed = math.sqrt((new[0] - q[0]) ** 2 + (new[1] - q[1]) ** 2) / time
-    turn_rate, arm = abs(new[2] - q[2]) / time, 0.0
+    sweep = 0.0  # largest distance (m) by which a rotation moves a disc or a corner
     for k in range(len(path.outline)):
-        reach = max(abs(path.outline[k, 0]), abs(path.outline[k, 1]))
+        reach, joint = max(abs(path.outline[k, 0]), abs(path.outline[k, 1])), path.outline[k, 4]
         if path.outline[k, 2] > 0.0:  # the corners of a rectangle
             reach = math.hypot(reach, path.outline[k, 2])
-        arm = max(arm, reach)
-    return speed + arm * turn_rate
+        sweep = max(sweep, reach * abs(row_axis(new, joint) - row_axis(q, joint)))
+    return speed + sweep / time
 
 
 @kernel(float64(PATH, VECTOR), inline="always")
@@ -211,6 +212,15 @@ def first_contact(path, before, total, new):
     return min(lowest, 0.0), fraction, c0
 
 
+@kernel(types.boolean(MATRIX), inline="always")
+def _has_rectangle(outline):
+    """Return whether a row of an outline is a rectangle."""
+    found = False
+    for k in range(len(outline)):
+        found = found or outline[k, 1] > outline[k, 0]
+    return found
+
+
 @kernel(types.UniTuple(float64, 2)(PATH, float64, float64), inline="always")
 def _panel_costs(path, start, width):
     """Return the integrals of the proximity cost and of the state cost over a panel of a path (Gauss's rule).
@@ -222,10 +232,9 @@ def _panel_costs(path, start, width):
         state_after(path, start + NODES[k] * width, samples[k])
         state_cost += NODE_WEIGHTS[k] * path.motion.state_cost(samples[k], path.parameters)
     first, second, third = samples[0], samples[1], samples[2]
-    if outline[0, 1] > outline[0, 0]:  # a rectangle, which is alone
+    if _has_rectangle(outline):
         for k in range(3):
-            phi = footprint_value(samples[k, 0], samples[k, 1], samples[k, 2], outline, path.field)
-            proximity += NODE_WEIGHTS[k] * phi
+            proximity += NODE_WEIGHTS[k] * footprint_value(samples[k], outline, path.field)
         return proximity * width, state_cost * width
     for d in range(len(outline)):
         a, radius = outline[d, 0], outline[d, 3]
@@ -233,9 +242,11 @@ def _panel_costs(path, start, width):
             continue
         x0, y0, x1, y1, x2, y2 = first[0], first[1], second[0], second[1], third[0], third[1]
         if a != 0.0:
-            x0, y0 = x0 + a * math.cos(first[2]), y0 + a * math.sin(first[2])
-            x1, y1 = x1 + a * math.cos(second[2]), y1 + a * math.sin(second[2])
-            x2, y2 = x2 + a * math.cos(third[2]), y2 + a * math.sin(third[2])
+            joint = outline[d, 4]
+            h0, h1, h2 = row_axis(first, joint), row_axis(second, joint), row_axis(third, joint)
+            x0, y0 = x0 + a * math.cos(h0), y0 + a * math.sin(h0)
+            x1, y1 = x1 + a * math.cos(h1), y1 + a * math.sin(h1)
+            x2, y2 = x2 + a * math.cos(h2), y2 + a * math.sin(h2)
         three = proximity_values(x0, y0, x1, y1, x2, y2, radius, path.field)
         proximity += NODE_WEIGHTS[0] * three[0] + NODE_WEIGHTS[1] * three[1] + NODE_WEIGHTS[2] * three[2]
     return proximity * width, state_cost * width

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pygame
 
-from leapnav.envs.robots.footprints import corners_of
+from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
@@ -33,7 +33,7 @@ class Scene:
     Attributes:
         scenario: the scenario of the episode.
         field: the packed obstacle field, in which obstacles may have moved.
-        pose: x, y (m) and heading (rad).
+        state: state (n,) of the robot; the first three entries are x, y (m) and the heading (rad).
         trail: the poses of the episode so far.
         optimum (N, 3): the reference path, or None.
         ranges: lidar ranges (m), counter-clockwise from straight ahead; empty without a lidar.
@@ -47,7 +47,7 @@ class Scene:
 
     scenario: Scenario
     field: np.ndarray
-    pose: tuple[float, float, float]
+    state: tuple[float, ...]
     trail: Sequence[tuple[float, float, float]] = ()
     optimum: np.ndarray | None = None
     ranges: Sequence[float] = ()
@@ -73,7 +73,7 @@ def make_scene(
     return Scene(
         scenario=get_scenario(choice, bank),
         field=simulator.fields[robot],
-        pose=tuple(simulator.states[robot, :3].tolist()),
+        state=tuple(simulator.states[robot].tolist()),
         trail=trail,
         optimum=optimum,
         ranges=simulator.ranges(robot).tolist(),
@@ -105,7 +105,7 @@ def draw_scene(scene: Scene) -> np.ndarray:
     pygame.draw.rect(canvas, FLOOR, frame)
     beams = _lidar_ends(to_pixels, scene)
     for end, _ in beams:
-        pygame.draw.line(canvas, RAY, to_pixels(*scene.pose[:2]), end, max(1, line // 2))
+        pygame.draw.line(canvas, RAY, to_pixels(*scene.state[:2]), end, max(1, line // 2))
     for vertices, rounding, _ in field_parts(scene.field):
         if len(vertices) == 1:
             center, radius = to_pixels(*vertices[0].tolist()), rounding * scale
@@ -127,12 +127,12 @@ def draw_scene(scene: Scene) -> np.ndarray:
     if scene.optimum is not None:
         _draw_path(canvas, OPTIMUM, [to_pixels(x, y) for x, y in scene.optimum[:, :2].tolist()], 2 * line)
     goal = scenario.goal
-    at_goal = goal[0], goal[1], goal[2] or 0.0
+    at_goal = [value or 0.0 for value in scenario.goal_state]
     _draw_outline(canvas, GOAL, to_pixels, at_goal, scenario.outline, scale, 2 * line)
     if goal[2] is not None:
-        _draw_arrow(canvas, GOAL, to_pixels, at_goal, _smallest_radius(scenario.outline), 2 * line)
+        _draw_arrow(canvas, GOAL, to_pixels, at_goal[:3], _smallest_radius(scenario.outline), 2 * line)
     _draw_path(canvas, POLICY, [to_pixels(x, y) for x, y, _ in scene.trail], 2 * line)
-    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.pose, scenario.outline, scale)
+    _draw_robot(canvas, FAILURE if scene.collided else POLICY, to_pixels, scene.state, scenario.outline, scale)
     small = pygame.transform.smoothscale(canvas, (width // SUPERSAMPLING, height // SUPERSAMPLING))
     whole = pygame.Surface((small.get_width(), small.get_height() + STATUS_HEIGHT))
     whole.fill(WHITE)
@@ -143,7 +143,7 @@ def draw_scene(scene: Scene) -> np.ndarray:
 
 def _lidar_ends(to_pixels: ToPixels, scene: Scene) -> list[tuple[tuple[float, float], bool]]:
     """Return the end of each beam on the canvas (pixels), and whether it has hit an obstacle or a wall."""
-    x, y, heading = scene.pose
+    x, y, heading = scene.state[:3]
     angles = [heading + 2 * math.pi * k / len(scene.ranges) for k in range(len(scene.ranges))]
     return [
         (to_pixels(x + reach * math.cos(angle), y + reach * math.sin(angle)), reach < scene.lidar_range)
@@ -162,7 +162,7 @@ def _draw_arrow(
     canvas: pygame.Surface,
     color: str,
     to_pixels: ToPixels,
-    pose: tuple[float, float, float],
+    pose: Sequence[float],
     length: float,
     line: int,
 ) -> None:
@@ -178,27 +178,31 @@ def _draw_arrow(
 
 def _smallest_radius(outline: np.ndarray) -> float:
     """Return the radius (m) of the smallest disc in an outline, the unit of the symbols of a robot."""
-    return float(outline[:, 2:].sum(axis=1).min())
+    return float(outline[:, 2:4].sum(axis=1).min())
 
 
 def _draw_outline(
     canvas: pygame.Surface,
     color: str,
     to_pixels: ToPixels,
-    pose: tuple[float, float, float],
+    state: Sequence[float],
     outline: np.ndarray,
     scale: float,
     line: int = 0,
 ) -> None:
-    """Draw the outline (K, 4) of a robot at a pose, filled unless `line` is its width in pixels."""
-    x, y, heading = pose
+    """Draw the outline (K, 5) of a robot at a state, filled unless `line` is its width in pixels."""
+    x, y = state[:2]
     for row in outline.tolist():
-        rear, front, _, radius = row
+        (rear, front, _, radius, joint), axis = row, axis_of(row, state)
+        if joint:  # the drawbar
+            middle, width = (rear + front) / 2, line or max(1, round(radius or row[2] * scale / 4))
+            end = x + middle * math.cos(axis), y + middle * math.sin(axis)
+            pygame.draw.line(canvas, color, to_pixels(x, y), to_pixels(*end), width)
         if front > rear:
-            corners = [to_pixels(*corner) for corner in corners_of(row, pose).tolist()]
+            corners = [to_pixels(*corner) for corner in corners_of(row, state).tolist()]
             pygame.draw.polygon(canvas, color, corners, line)
         else:
-            centre = to_pixels(x + rear * math.cos(heading), y + rear * math.sin(heading))
+            centre = to_pixels(x + rear * math.cos(axis), y + rear * math.sin(axis))
             pygame.draw.circle(canvas, color, centre, radius * scale, line)
 
 
@@ -206,18 +210,18 @@ def _draw_robot(
     canvas: pygame.Surface,
     color: str,
     to_pixels: ToPixels,
-    pose: tuple[float, float, float],
+    state: Sequence[float],
     robot: np.ndarray,
     scale: float,
 ) -> None:
-    x, y, heading = pose
+    x, y, heading = state[:3]
     cos, sin = math.cos(heading), math.sin(heading)
     radius = _smallest_radius(robot)
 
     def outline(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         return [to_pixels(x + radius * (a * cos - b * sin), y + radius * (a * sin + b * cos)) for a, b in corners]
 
-    _draw_outline(canvas, color, to_pixels, pose, robot, scale)
+    _draw_outline(canvas, color, to_pixels, state, robot, scale)
     for side in (-0.75, 0.75):  # wheels
         wheel = [(a, side + b) for a, b in ((-0.4, -0.12), (0.4, -0.12), (0.4, 0.12), (-0.4, 0.12))]
         pygame.draw.polygon(canvas, WHEEL, outline(wheel))

@@ -16,7 +16,8 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.shapes.clearance import clearances, footprint_clearance, footprint_clearances
-from leapnav.envs.shapes.proximity import OUTLINE_ENTRIES, footprint_value
+from leapnav.envs.shapes.proximity import footprint_value
+from leapnav.envs.shapes.rectangle import OUTLINE_ENTRIES
 from leapnav.envs.simulation import stepping
 from leapnav.envs.simulation.bodies import ContactWorld, MotorBodies, VelocityFunction, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
@@ -264,7 +265,7 @@ class BatchSimulator:
         """Simulate the rest of a period after a contact."""
         sim, episode, state, model = self._simulation, self.episodes[i], self.states[i], self.settings.model
         controls = sim.controls[i]
-        outline = sim.outlines[i][sim.outlines[i, :, 2:].any(axis=1)]
+        outline = sim.outlines[i][sim.outlines[i, :, 2:4].any(axis=1)]
         outline.flags.writeable = False
         if i not in self._contacts:
             self._contacts[i] = ContactWorld(self.fields[i], outline, self.settings.motor, self._masses[i])
@@ -277,7 +278,7 @@ class BatchSimulator:
         else:
             velocity = np.array(steer(0.0, 0.0, float(pose[2]), 0.0))
         world = self._contacts[i]
-        lowest, squared_speed, squared_turn_rate, proximity = world.simulate(pose, velocity, steer, duration, substeps)
+        lowest, squared_speed, squared_turn_rate, proximity = world.simulate(state, velocity, steer, duration, substeps)
         if world.field is not self.fields[i]:  # obstacles have moved; the next world begins with them at rest
             self.fields[i] = world.field
             del self._contacts[i]
@@ -297,7 +298,7 @@ class BatchSimulator:
             ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
             episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
-        episode["pose_clearance"] = footprint_clearance(*pose.tolist(), outline, self.fields[i])[0]
+        episode["pose_clearance"] = footprint_clearance(state, outline, self.fields[i])[0]
         episode["clearance"] = min(episode["clearance"], lowest)
 
     def _velocity_function(self, i: int, step: float) -> VelocityFunction:

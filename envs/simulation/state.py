@@ -141,7 +141,7 @@ class Simulation(NamedTuple):
         middles, halves (count, m): middles and half widths of the intervals of the controls.
         weights (count, m): weights of the squared controls.
         parameters (count, p): parameters of the robots' model.
-        outlines (count, K, 4): footprints, see `leapnav.envs.robots.footprints.outline_of`; unused rows are zero.
+        outlines (count, K, 5): footprints, see `leapnav.envs.robots.footprints.outline_of`; unused rows are zero.
         fields (count, 2): the places of the packed obstacle fields, see `field_of`.
         guides (count, N_GUIDE_POINTS, 3): points (m) of the reference path, and the path length (m) from
             each to the goal.

@@ -23,7 +23,7 @@ GRAVITY = 9.81  # m/s^2
 
 @kernel(MATRIX(SIMULATION, int64), inline="always")
 def outline_of(sim, i):
-    """Return the outline (K, 4) of robot i, a view."""
+    """Return the outline (K, 5) of robot i, a view."""
     rows, entries = sim.outlines.shape[1], sim.outlines.shape[2]
     return matrix_of(sim.outlines, rows * entries * i, rows, entries)
 
@@ -75,7 +75,7 @@ def start_episodes(robots, packed):
         episode, state = sim.episodes[i], row_of(sim.states, i)
         # A remainder of less than 1e-6 periods is a rounding error of the horizon, not another period.
         episode.last_step = max(1, math.ceil(episode.horizon / settings.control_period - 1e-6))
-        clearance, _ = footprint_clearance(state[0], state[1], state[2], outline_of(sim, i), field_of(sim.fields, i))
+        clearance, _ = footprint_clearance(state, outline_of(sim, i), field_of(sim.fields, i))
         episode.pose_clearance = episode.clearance = clearance
         if settings.shaped:
             episode.potential = potential(i, sim)

@@ -209,8 +209,7 @@ def recovery(
     n = scenario.robot.sizes()[0]
     perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
     state = extremal.evaluate(time)[0] + perturbation
-    x, y, heading = state[:3].tolist()
-    if footprint_clearance(x, y, heading, scenario.outline, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
+    if footprint_clearance(state, scenario.outline, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
     rest = scenario.from_state(state, time).model_copy(update={"name": name})
     times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])

@@ -10,7 +10,7 @@ The functions raise FloatingPointError where the sensitivities diverge, so that 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
@@ -30,7 +30,10 @@ from leapnav.experts.problem.frames import (
 MAX_DIP = 0.3
 # ... and if the parabola through it and its neighbours has its minimum below this fraction of it.
 MAX_PARABOLA_MINIMUM = 0.7
-ZERO_SINGULAR_VALUE = 1e-5  # of an orthonormal frame; smaller values count as zero
+# The smallest singular value of an orthonormal frame counts as zero below the first number, if it is also below this
+# fraction of its values at the neighbouring steps. A steep barrier or a small control weight make all values small: in
+# one extremal they were 4e-6 to 1e-5 over 0.5 s, without a zero.
+ZERO_SINGULAR_VALUE, ZERO_FRACTION = 1e-5, 0.1
 DIVERGENCE = "the sensitivities diverge along the extremal"
 
 
@@ -124,13 +127,14 @@ def _first_rank_loss(
     """Return the first time, in the order of `times`, at which the upper block of the frame loses rank, or None."""
     for i in _dips(times, determinants, check_parabola):
         low, high = sorted((float(times[i - 1]), float(times[i + 1])))
-        found = minimize_scalar(
+        found: Any = minimize_scalar(
             lambda t: _smallest_singular_value(frame(t)),
             bounds=(low, high),
             method="bounded",
             options={"xatol": 1e-9 * (high - low)},
         )
-        if found.fun < ZERO_SINGULAR_VALUE:
+        around = max(_smallest_singular_value(frame(t)) for t in (low, high))
+        if found.fun < min(ZERO_SINGULAR_VALUE, ZERO_FRACTION * around):
             return float(found.x)
     return None
 

@@ -23,14 +23,15 @@ from leapnav.experts.numerics.flow import (
 )
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.generated_flow import (
-    PHI,
     Obstacles,
+    ObstacleTerm,
+    add_terms,
     call_costs,
     check_obstacles,
     declare,
     import_costs,
     limit_symbols,
-    obstacle_states,
+    obstacle_terms,
 )
 from leapnav.experts.problem.system import ControlAffineSystem
 
@@ -90,8 +91,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
         **{f"B[{i}, {j}]": slopes[i][n + j] for i in range(n) for j in range(m)},
         **{f"W[{a}, {b}]": curvature[min(a, b), max(a, b)] for a in range(n + m) for b in range(n + m)},
     }
-    at = obstacle_states(system, obstacles)
-    costs = _costs(sp.sympify(state_cost).xreplace(rename), q, at, limited)
+    terms = obstacle_terms(system, obstacles)
+    costs = _costs(sp.sympify(state_cost).xreplace(rename), q, terms, limited)
     unpack_q, unpack_u, unpack_lam = (
         "    " + "; ".join(f"{symbol} = {name}[{i}]" for i, symbol in enumerate(symbols))
         for name, symbols in (("q", q), ("u", u), ("lam", lam))
@@ -121,25 +122,19 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             "",
             "@kernel(STATE_COST_SIGNATURE)",
             "def state_cost(q, data, field, gradient, hessian):",
-            *(unpack_q, *unpack_parameters, *call_costs(at, limited, 3 * m + k), *_body(costs)),
+            *(unpack_q, *unpack_parameters, *call_costs(terms, limited, 3 * m + k), *_body(costs)),
             "    return value",
             "",
         ]
     )
 
 
-def _costs(cost: Any, q: Sequence[sp.Symbol], at: Sequence[int], limited: Sequence[int]) -> dict[str, Any]:
+def _costs(cost: Any, q: Sequence[sp.Symbol], terms: Sequence[ObstacleTerm], limited: Sequence[int]) -> dict[str, Any]:
     """Return the expressions of the state cost, its gradient and its Hessian, by target."""
     n = len(q)
-    phi = [sp.Symbol(name, real=True) for name in PHI[len(at)]]
     value, gradient = cost, [sp.diff(cost, s) for s in q]
     hessian = {(i, j): sp.diff(gradient[i], q[j]) for i, j in combinations_with_replacement(range(n), 2)}
-    if at:
-        value = value + phi[0]
-        for i in range(len(at)):
-            gradient[at[i]] += phi[1 + i]
-        for i, pair in enumerate(combinations_with_replacement(at, 2)):
-            hessian[min(pair), max(pair)] += phi[1 + len(at) + i]
+    value = value + add_terms(terms, gradient, hessian)
     for i, (limit, first, second) in zip(limited, limit_symbols(limited), strict=True):
         value, gradient[i], hessian[i, i] = value + limit, gradient[i] + first, hessian[i, i] + second
     return {

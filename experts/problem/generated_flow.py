@@ -9,8 +9,8 @@ a Python module with common subexpressions removed, and compiled into the user's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations_with_replacement
-from typing import Any, Literal
+from itertools import combinations_with_replacement, product
+from typing import Any, NamedTuple
 
 import sympy as sp
 
@@ -21,9 +21,9 @@ from leapnav.experts.numerics.state_bounds import ENTRIES
 from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
 
-# What obstacles contribute: nothing, the proximity cost of one disc at the position with the radius of the field, or
-# that of a footprint.
-Obstacles = Literal["none", "disc", "footprint"]
+# What obstacles contribute: None for nothing, () for the proximity cost of one disc at the position with the radius of
+# the field, or the distinct joints of the outline of a footprint, see `leapnav.envs.shapes.rectangle`.
+Obstacles = tuple[int, ...] | None
 
 
 @computed_once(maxsize=64)
@@ -58,15 +58,15 @@ def compile_flow(
 
 def declare(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...]) -> str:
     """Return a text that identifies a system with its cost."""
-    places = system.position, system.heading, obstacles, *limited
+    places = system.position, system.heading, obstacles, limited
     return sp.srepr((system.state, system.parameters, system.drift, system.fields, state_cost, str(places)))
 
 
 def check_obstacles(system: ControlAffineSystem, obstacles: Obstacles) -> None:
     """Raise ValueError unless a system has the symbols that obstacles need."""
-    if obstacles != "none" and system.position is None:
+    if obstacles is not None and system.position is None:
         raise ValueError("position: expected two state symbols for a problem with obstacles, got None")
-    if obstacles == "footprint" and system.heading is None:
+    if obstacles and system.heading is None:
         raise ValueError("heading: expected a state symbol for a problem with a footprint, got None")
 
 
@@ -98,16 +98,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
                 p = switching[j]
                 entry += u[j] * sp.diff(p, z[a], z[b]) - slope[j] * sp.diff(p, z[a]) * sp.diff(p, z[b])
             hessian[a, b] = hessian[b, a] = entry
-    at = obstacle_states(system, obstacles)
-    phi = [sp.Symbol(name, real=True) for name in PHI[len(at)]]
-    if at:
-        value = value + phi[0]
-        for k in range(len(at)):
-            gradient[at[k]] += phi[1 + k]
-        for k, (row, column) in enumerate(combinations_with_replacement(at, 2)):
-            hessian[row, column] += phi[1 + len(at) + k]
-            if row != column:
-                hessian[column, row] += phi[1 + len(at) + k]
+    terms = obstacle_terms(system, obstacles)
+    value = value + add_terms(terms, gradient, hessian)
     for i, (limit, first, second) in zip(limited, limit_symbols(limited), strict=True):
         value, gradient[i], hessian[i, i] = value + limit, gradient[i] + first, hessian[i, i] + second
 
@@ -119,8 +111,8 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             if entry != 0:
                 jacobian[a, b] = entry
     first = 3 * m + len(parameters)
-    costs = call_costs(at, limited, first)
-    features = _call("features", at, first + ENTRIES * len(limited)) if at else "0"
+    costs = call_costs(terms, limited, first)
+    features = " + ".join(term.call("features", first + ENTRIES * len(limited)) for term in terms) or "0"
     unpack = [
         "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
         "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n)),
@@ -129,24 +121,66 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
     return _render(unpack, switching, value, rate, jacobian, costs, features, import_costs(limited))
 
 
-# Names of the value, gradient and Hessian (upper triangle, by rows) of the proximity cost, by the number of states on
-# which it depends.
-PHI = {
-    0: (),
-    2: ("phi", "phi_x", "phi_y", "phi_xx", "phi_xy", "phi_yy"),
-    3: (
-        *("phi", "phi_x", "phi_y", "phi_h"),
-        *("phi_xx", "phi_xy", "phi_xh", "phi_yy", "phi_yh", "phi_hh"),
-    ),
-}
+class ObstacleTerm(NamedTuple):
+    """A part of the proximity cost: that of one disc, or of the rows of an outline with the same joint.
+
+    Attributes:
+        joint: the joint; None for one disc at the position.
+        states: for x, y and, of an outline, the angle of the axis, the indices of the states whose sum it is.
+
+    """
+
+    joint: int | None
+    states: tuple[tuple[int, ...], ...]
+
+    def symbols(self) -> tuple[str, ...]:
+        """Return the names of the value, the gradient and the Hessian (upper triangle, by rows)."""
+        name, letters = f"phi{self.joint or ''}", "xyh"[: len(self.states)]
+        pairs = ["".join(pair) for pair in combinations_with_replacement(letters, 2)]
+        return (name, *(f"{name}_{letter}" for letter in (*letters, *pairs)))
+
+    def call(self, name: str, first: int) -> str:
+        """Return the call of a function of a disc or of a footprint, whose outline begins at an index of the data."""
+        states = ", ".join(" + ".join(f"q{i}" for i in sum_of) for sum_of in self.states)
+        if self.joint is None:
+            return f"disc_{name}({states}, header_of(field).radius, field)"
+        return f"footprint_{name}({states}, {self.joint}, data, {first}, field)"
 
 
-def obstacle_states(system: ControlAffineSystem, obstacles: Obstacles) -> list[int]:
-    """Return the indices of the states on which the proximity cost depends."""
-    if obstacles == "none" or system.position is None:
+def obstacle_terms(system: ControlAffineSystem, obstacles: Obstacles) -> list[ObstacleTerm]:
+    """Return the parts of the proximity cost."""
+    if obstacles is None or system.position is None:
         return []
-    heading = () if obstacles == "disc" else (system.heading,)
-    return [system.state.index(symbol) for symbol in (*system.position, *heading)]
+    position = tuple((system.state.index(symbol),) for symbol in system.position)
+    if not obstacles or system.heading is None:
+        return [ObstacleTerm(None, position)]
+    heading = system.state.index(system.heading)
+    return [ObstacleTerm(joint, (*position, (heading, joint) if joint else (heading,))) for joint in obstacles]
+
+
+def add_terms(
+    terms: Sequence[ObstacleTerm], gradient: list[Any], hessian: dict[tuple[int, int], Any]
+) -> sp.Expr | sp.Integer:
+    """Add the derivatives of the proximity cost to those entries of a gradient and a Hessian that exist.
+
+    Returns:
+        The value.
+
+    """
+    value = sp.Integer(0)
+    for term in terms:
+        phi = [sp.Symbol(name, real=True) for name in term.symbols()]
+        value, count = value + phi[0], len(term.states)
+        for states, slope in zip(term.states, phi[1:], strict=False):
+            for i in states:
+                gradient[i] += slope
+        pairs = combinations_with_replacement(range(count), 2)
+        for (a, b), curvature in zip(pairs, phi[1 + count :], strict=True):
+            for first, second in {(a, b), (b, a)}:
+                for entry in product(term.states[first], term.states[second]):
+                    if entry in hessian:
+                        hessian[entry] += curvature
+    return value
 
 
 def limit_symbols(limited: Sequence[int]) -> list[tuple[sp.Symbol, sp.Symbol, sp.Symbol]]:
@@ -154,11 +188,11 @@ def limit_symbols(limited: Sequence[int]) -> list[tuple[sp.Symbol, sp.Symbol, sp
     return [sp.symbols(f"limit{k} limit{k}_d limit{k}_dd", real=True) for k in range(len(limited))]
 
 
-def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[str]:
+def call_costs(terms: Sequence[ObstacleTerm], limited: Sequence[int], first: int) -> list[str]:
     """Return the lines that compute the costs of the limits of states and the proximity cost.
 
     Args:
-        at: indices of the states on which the proximity cost depends.
+        terms: parts of the proximity cost.
         limited: for each limit the index of the state.
         first: index of the limits in the data, after which the rows of an outline follow.
 
@@ -166,19 +200,8 @@ def call_costs(at: Sequence[int], limited: Sequence[int], first: int) -> list[st
     lines: list[str] = []
     for k, (i, symbols) in enumerate(zip(limited, limit_symbols(limited), strict=True)):
         lines.append(f"    {', '.join(map(str, symbols))} = limit_cost(q{i}, data, {first + ENTRIES * k})")
-    if at:
-        lines.append(f"    {', '.join(PHI[len(at)])} = {_call('proximity', at, first + ENTRIES * len(limited))}")
-    return lines
-
-
-def _call(name: str, at: Sequence[int], first: int) -> str:
-    """Return the call of a function of a disc or of a footprint, whose outline begins at an index of the data."""
-    states = ", ".join(f"q{i}" for i in at)
-    disc, footprint = (
-        f"disc_{name}({states}, header_of(field).radius, field)",
-        f"footprint_{name}({states}, data, {first}, field)",
-    )
-    return disc if len(at) == 2 else footprint
+    first += ENTRIES * len(limited)
+    return [*lines, *(f"    {', '.join(term.symbols())} = {term.call('proximity', first)}" for term in terms)]
 
 
 def import_costs(limited: Sequence[int]) -> list[str]:

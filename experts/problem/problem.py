@@ -83,8 +83,8 @@ class OptimalControlProblem:
         control_bounds: m pairs (minimum, maximum); None for unbounded controls.
         field: packed obstacle field (`Scenario.field`) whose proximity cost is added to Phi at the system's position.
         parameters: values of the system's parameters, in the order of their declaration.
-        footprint: outline of the robot, `leapnav.envs.Disc`s along its heading or a `Box`; None for one disc with the
-            radius of the field.
+        footprint: outline of the robot, `leapnav.envs.Disc`s along its heading, a `Box`, or the array of
+            `RobotModel.outline`; None for one disc with the radius of the field.
         time_weight: c >= 0, cost per second.
         barrier_weight: weight of the barrier that approximates hard limits: if the proximity weight of the field is
             smaller, this is used instead. `solve` and `find_optimum` reduce it, see `leapnav.experts.hard_limits`.
@@ -108,7 +108,7 @@ class OptimalControlProblem:
     control_bounds: Sequence[tuple[float, float]] | None = None
     field: np.ndarray | None = None
     parameters: Sequence[float] = ()
-    footprint: Sequence[Disc] | Box | None = None
+    footprint: Sequence[Disc] | Box | np.ndarray | None = None
     time_weight: float = 0.0
     barrier_weight: float = 0.0
     state_bounds: Sequence[tuple[float, float] | None] | None = None
@@ -168,9 +168,9 @@ class OptimalControlProblem:
             )
 
     def _check_footprint(self) -> None:
-        if self.footprint is None or isinstance(self.footprint, Box):
-            return
         discs: Any = self.footprint
+        if discs is None or isinstance(discs, Box) or (isinstance(discs, np.ndarray) and discs.shape[1:] == (5,)):
+            return
         if not isinstance(discs, (tuple, list)) or not discs or not all(isinstance(disc, Disc) for disc in discs):
             raise ValueError(f"footprint: expected discs or a box (Disc, Box), got {self.footprint!r}")
 
@@ -188,7 +188,7 @@ class OptimalControlProblem:
             control_bounds=[(low, high) for low, high in robot.control_bounds().tolist()],
             field=scenario.field,
             parameters=robot.parameters(cost),
-            footprint=robot.footprint,
+            footprint=scenario.outline if scenario.outline[:, 4].any() else robot.footprint,
             time_weight=cost.time_weight,
             state_bounds=robot.state_bounds(),
         )
@@ -292,15 +292,16 @@ class OptimalControlProblem:
     @property
     def _obstacles(self) -> Obstacles:
         if self.field is None:
-            return "none"
-        return "disc" if self.footprint is None else "footprint"
+            return None
+        return () if self.footprint is None else tuple(sorted({int(joint) for joint in self.outline[:, 4]}))
 
     @property
     def outline(self) -> np.ndarray:
-        """The robot's outline (K, 4), see `leapnav.envs.robots.footprints.outline_of`; (0, 4) without obstacles."""
+        """The robot's outline (K, 5), see `leapnav.envs.robots.footprints.outline_of`; (0, 5) without obstacles."""
         if self.field is None:
-            return outline_of(()).reshape(-1, 4)
-        return outline_of(self.footprint or (Disc(radius=float(read_header(self.field)["radius"])),))
+            return outline_of(()).reshape(-1, 5)
+        discs = (Disc(radius=float(read_header(self.field)["radius"])),) if self.footprint is None else self.footprint
+        return discs if isinstance(discs, np.ndarray) else outline_of(discs)
 
     @cached_property
     def compiled_dynamics(self) -> CompiledDynamics:
@@ -324,7 +325,7 @@ class OptimalControlProblem:
             self.control_bounds if self.control_bounds is not None else [(-np.inf, np.inf)] * m, dtype=float
         )
         goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
-        outline = () if self._obstacles != "footprint" else self.outline.ravel().tolist()
+        outline = self.outline.ravel().tolist() if self._obstacles else ()
         parameters = self.parameters if self.time_weight == 0.0 else (*self.parameters, self.time_weight)
         barriers = [number for limit in limits for number in (limit.bound, limit.slope, self.barrier_weight)]
         data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *outline])

@@ -10,7 +10,7 @@ from numba import float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import matrix_of, part_of
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, VECTOR, tuple_of
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW
 from leapnav.experts.numerics.integrator import (
@@ -148,6 +148,14 @@ def trace(flow, control, times, Z, accuracy, record):
     return rows + 1, defect, conjugate
 
 
+@kernel(NOTHING(float64, INTEGERS, VECTOR, MATRIX, VECTOR), inline="always")
+def _interpolate(s, places, start, terms, q):
+    """Write the pose, or the state if it has further entries, at a fraction of a step to q."""
+    for i in range(len(q)):
+        place = places[i] if i < 3 else i
+        q[i] = evaluate_interpolant(start[place], s, terms, place) if place >= 0 else 0.0
+
+
 @kernel(float64(CONSTANT, CONSTANT_MATRIX, INTEGERS, VECTOR, MATRIX, CUBE))
 def dense_clearance(field, outline, places, times, starts, terms):
     """Return the smallest clearance (m) along the interpolated path.
@@ -157,44 +165,38 @@ def dense_clearance(field, outline, places, times, starts, terms):
 
     Args:
         field: packed obstacle field.
-        outline (K, 4): of the robot, see `leapnav.envs.robots.footprints.outline_of`.
+        outline (K, 5): of the robot, see `leapnav.envs.robots.footprints.outline_of`.
         places (3,): indices of x, y and the heading in the state; the heading may be -1 for one disc without an offset.
         times, starts, terms: see `Extremal`.
 
     """
-    ix, iy, ih = places[0], places[1], places[2]
-    arm = 0.0
+    arm, last = 0.0, 2
     for k in range(len(outline)):
         arm = max(arm, math.hypot(max(abs(outline[k, 0]), abs(outline[k, 1])), outline[k, 2]))
-    smallest, _ = footprint_clearance(starts[0, ix], starts[0, iy], starts[0, ih], outline, field)
+        last = max(last, int(outline[k, 4]))
+    q, before = np.zeros(last + 1), np.zeros(last + 1)
+    _interpolate(0.0, places, starts[0], terms[0], q)
+    smallest, _ = footprint_clearance(q, outline, field)
     for k in range(len(times) - 1):
         # An upper bound of the speed: the largest mean speed over an eighth of the step, with a safety factor of 1.5.
         length = 0.0
-        x, y, heading = starts[k, ix], starts[k, iy], starts[k, ih]
+        _interpolate(0.0, places, starts[k], terms[k], before)
         for part in range(1, 9):
-            px = evaluate_interpolant(starts[k, ix], part / 8.0, terms[k], ix)
-            py = evaluate_interpolant(starts[k, iy], part / 8.0, terms[k], iy)
-            travelled = math.hypot(px - x, py - y)
-            if arm > 0.0:
-                turned = evaluate_interpolant(starts[k, ih], part / 8.0, terms[k], ih)
-                travelled += arm * abs(turned - heading)
-                heading = turned
+            _interpolate(part / 8.0, places, starts[k], terms[k], q)
+            travelled = math.hypot(q[0] - before[0], q[1] - before[1])
+            for i in range(2, len(q)):
+                travelled += arm * abs(q[i] - before[i])
             length = max(length, 8.0 * travelled)
-            x, y = px, py
+            before[:] = q
         length = 1.5 * length + 1e-12
         s = 0.0
         while s < 1.0:
-            heading = evaluate_interpolant(starts[k, ih], s, terms[k], ih) if arm > 0.0 else 0.0
-            value, _ = footprint_clearance(
-                evaluate_interpolant(starts[k, ix], s, terms[k], ix),
-                evaluate_interpolant(starts[k, iy], s, terms[k], iy),
-                heading,
-                outline,
-                field,
-            )
+            _interpolate(s, places, starts[k], terms[k], q)
+            value, _ = footprint_clearance(q, outline, field)
             smallest = min(smallest, value)
             # Advance by the distance to a smaller value, at least 0.1 to 5 mm. Over 5 mm the path deviates from a line
             # by about 0.01 mm; close to contact the steps are shorter.
             s += max(value - smallest, min(max(0.1 * smallest, 1e-4), 5e-3)) / length
-    value, _ = footprint_clearance(starts[-1, ix], starts[-1, iy], starts[-1, ih], outline, field)
+    _interpolate(0.0, places, starts[-1], terms[-1], q)
+    value, _ = footprint_clearance(q, outline, field)
     return min(smallest, value)

@@ -109,7 +109,9 @@ class Lattice:
         layers = []
         for heading in ANGLES if scenario.robot.footprint is not None else ANGLES[:1]:
             total = np.zeros(outside.shape)
-            for row in scenario.outline.tolist():
+            for *row, joint in scenario.outline.tolist():
+                if joint:  # the angle is not known
+                    continue
                 phi, clearance = sample_grid(field, tuple(row), float(heading), grid, band)
                 phi[clearance < depth] = np.inf
                 total += phi

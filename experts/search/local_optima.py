@@ -134,7 +134,7 @@ class LocalOptima:
         self.scenario, self.problem = scenario, softened(problem, energy, SEARCH_WEIGHT)
         self.verdicts: list[Verdict] = []
         self._relaxed_weight, self._budget = RELAXED_WEIGHT * energy, budget
-        self._radius = float(scenario.outline[:, 2:].sum(axis=1).min())  # of the smallest disc inside
+        self._radius = float(scenario.outline[:, 2:4].sum(axis=1).min())  # of the smallest disc inside
         has_corners = isinstance(scenario.robot.footprint, Box)
         self._scale = scenario.cost.proximity_scale * (CORNER_RESOLUTION if has_corners else 1.0) / sharpness
         self._lift = Lifting(scenario, self.problem, self._relaxed_weight)

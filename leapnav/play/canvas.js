@@ -138,8 +138,10 @@ export function drawScenario(scenario, selected = null) {
 }
 
 export const drawPoses = (scenario, selected = null) => {
-  drawRobot(scenario.start, play.colors.start, true, selected === "start");
-  drawRobot(scenario.goal, play.colors.goal, true, selected === "goal");
+  for (const name of ["start", "goal"]) {
+    const motion = scenario[`${name}_motion`] || [];
+    drawRobot([...[...scenario[name], null].slice(0, 3), ...motion], play.colors[name], true, selected === name);
+  }
 };
 
 export const alternativeColor = (i) => play.colors.alternatives[i % play.colors.alternatives.length];

@@ -29,9 +29,9 @@ def play_policy(scenario: Scenario, policy: str) -> dict[str, Any]:
         policy: name or directory of the policy, see `leapnav.training.scoring.policy_specs`.
 
     Returns:
-        A dictionary: `policy`, `states` (x, y (m), heading (rad)) at intervals of `period` (s), `time` (s) of the last
-        state, `success`, `missed` (what was not reached), `collision`, `stopped` (whether the episode ended early
-        without a collision), `cost`, and `regret` of a success, see the function `regret`.
+        A dictionary: `policy`, `states` (x, y (m), heading (rad), further states) at intervals of `period` (s), `time`
+        (s) of the last state, `success`, `missed` (what was not reached), `collision`, `stopped` (whether the episode
+        ended early without a collision), `cost`, and `regret` of a success, see the function `regret`.
 
     Raises:
         ValueError: the horizon is too long.
@@ -203,4 +203,5 @@ def regret(scenario: Scenario, state: Sequence[float] | np.ndarray, cost: float)
 
 
 def _pose(info: dict[str, Any]) -> list[float]:
-    return [float(value) for value in info["pose"]]
+    """Return x, y, heading and further states, of which the page draws the hitch angle, the last one of a trailer."""
+    return [float(value) for value in (*info["pose"], *info.get("motion", ()))]

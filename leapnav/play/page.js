@@ -115,11 +115,12 @@ function showSettings() {
 
 let shownFields = null; // the names of the robot's numbers that have inputs, as one text
 
-// A robot with a footprint has no radius; the footprint is not edited.
+// A robot with a footprint has no radius; footprints are not edited.
 function showRobotFields() {
   byId("model").value = modelOf(play.scenario);
   const hidden = (play.scenario.robot || {}).footprint ? ["model", "radius"] : ["model"];
-  const numbers = Object.keys(robotOf(play.scenario).fields).filter((field) => !hidden.includes(field));
+  const { fields } = robotOf(play.scenario);
+  const numbers = Object.keys(fields).filter((field) => typeof fields[field] === "number" && !hidden.includes(field));
   if (numbers.join() === shownFields) return;
   shownFields = numbers.join();
   byId("robot-fields").replaceChildren(...numbers.flatMap((field) => {

@@ -5,25 +5,35 @@ import { request, show, showError } from "./state.js";
 
 export const hasHeading = (pose) => pose[2] !== null && pose[2] !== undefined;
 
-// The rows of a robot's outline: rear, front, half width and radius (m) of its discs, or of its rectangle.
-function outlineOf({ footprint, radius }) {
+// The rows of an outline: rear, front, half width and radius (m) of its discs, or of its rectangle.
+function rowsOf(footprint, radius, ahead = 0) {
   const { box } = footprint || {};
   if (box) {
-    const middle = box.offset || 0;
+    const middle = ahead + (box.offset || 0);
     return [[middle - box.length / 2, middle + box.length / 2, box.width / 2, 0]];
   }
-  return (footprint || [{ offset: 0, radius }]).map((disc) => [disc.offset, disc.offset, 0, disc.radius]);
+  const discs = (footprint || [{ radius }]).map((disc) => [ahead + (disc.offset || 0), disc.radius]);
+  return discs.map(([at, size]) => [at, at, 0, size]);
 }
 
-// The discs or the rectangle of a robot at a pose, as obstacles. If its heading is free: the disc that is covered at any
-// heading, or a point.
-export function robotParts(robot, [x, y, heading]) {
-  const rows = outlineOf(robot);
-  if (!hasHeading([x, y, heading])) {
+const outlineOf = ({ footprint, radius }) => rowsOf(footprint, radius);
+
+// The discs or the rectangle of a robot at a state, as obstacles, and those of its trailer, whose hitch angle is the last
+// entry. If its heading is free: the disc that is covered at any heading, or a point.
+export function robotParts(robot, state) {
+  const [x, y, heading] = state, rows = outlineOf(robot);
+  if (!hasHeading(state)) {
     const covered = rows.map(([rear, front, halfWidth, radius]) => Math.min(halfWidth, front, -rear) + radius);
     return [{ circle: { center: [x, y], radius: Math.max(...covered, 0) } }];
   }
-  const c = Math.cos(heading), s = Math.sin(heading), place = ([a, b]) => [x + a * c - b * s, y + a * s + b * c];
+  const parts = placed(rows, x, y, heading);
+  if (!robot.trailer) return parts;
+  const hitch = state.length > 3 ? state[state.length - 1] : 0;
+  return [...parts, ...placed(rowsOf(robot.trailer, null, -robot.hitch_length), x, y, heading + hitch)];
+}
+
+function placed(rows, x, y, angle) {
+  const c = Math.cos(angle), s = Math.sin(angle), place = ([a, b]) => [x + a * c - b * s, y + a * s + b * c];
   return rows.map(([rear, front, w, radius]) => (w
     ? { polygon: { vertices: [[rear, -w], [front, -w], [front, w], [rear, w]].map(place) } }
     : { circle: { center: place([rear, 0]), radius } }));

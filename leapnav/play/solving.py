@@ -197,7 +197,7 @@ def _clearances(scenario: Scenario, values: np.ndarray) -> np.ndarray:
 
 
 def _summary(optimum: Optimum, points: int) -> dict[str, Any]:
-    states = optimum.interpolate(np.linspace(0.0, optimum.horizon, points))[:, :3]
+    states = optimum.interpolate(np.linspace(0.0, optimum.horizon, points))[:, : optimum.problem.system.n]
     certificate = optimum.certificate
     return {
         "cost": optimum.cost,

@@ -57,7 +57,7 @@ def outline_points(pose, spacing=2e-3):
 def test_the_clearance_is_the_distance_of_the_closest_point_of_the_outline():
     for pose in poses(400):
         distances = [obstacle_distance(*point, SCENARIO.field)[0] for point in outline_points(pose)]
-        clearance, nearest = footprint_clearance(*pose, SCENARIO.outline, SCENARIO.field)
+        clearance, nearest = footprint_clearance(pose, SCENARIO.outline, SCENARIO.field)
         if clearance > 0:
             assert -1e-12 < min(distances) - clearance < 1e-4  # the points are 2 mm apart
             x, y = outline_points(pose)[int(np.argmin(distances))]
@@ -69,7 +69,7 @@ def test_the_clearance_is_the_distance_of_the_closest_point_of_the_outline():
 def test_an_overlap_is_the_smallest_translation_that_separates():
     checked = 0
     for pose in poses(3000, seed=1):
-        clearance, nearest = footprint_clearance(*pose, SCENARIO.outline, SCENARIO.field)
+        clearance, nearest = footprint_clearance(pose, SCENARIO.outline, SCENARIO.field)
         if nearest in (1, 3, 4) and -0.05 < clearance < -1e-4:
             angles = np.linspace(0, 2 * np.pi, 721)
             for factor, is_free in ((0.97, False), (1.03, True)):
@@ -85,19 +85,19 @@ def test_derivatives_of_the_proximity_cost(others):
     scenario = scenario_with(others)
     data, checked = scenario.outline.ravel().copy(), 0
     for pose in poses(1500, seed=2):
-        clearance = footprint_clearance(*pose, scenario.outline, scenario.field)[0]
+        clearance = footprint_clearance(pose, scenario.outline, scenario.field)[0]
         step = 1e-4 * min(clearance, 0.1)
         around = [pose + step * sign * axis for axis in np.eye(3) for sign in (-1, 1)]
-        if clearance < 1e-3 or len({footprint_features(*q, data, 0, scenario.field) for q in around}) > 1:
+        if clearance < 1e-3 or len({footprint_features(*q, 0, data, 0, scenario.field) for q in around}) > 1:
             continue  # the second derivatives are discontinuous there
-        phi, *rest = footprint_proximity(*pose, data, 0, scenario.field)
+        phi, *rest = footprint_proximity(*pose, 0, data, 0, scenario.field)
         gradient, (xx, xy, xh, yy, yh, hh) = np.array(rest[:3]), rest[3:]
         hessian = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
-        values = np.array([footprint_proximity(*q, data, 0, scenario.field)[:4] for q in around])
+        values = np.array([footprint_proximity(*q, 0, data, 0, scenario.field)[:4] for q in around])
         differences = (values[1::2] - values[::2]) / (2 * step)
         assert gradient == pytest.approx(differences[:, 0], rel=1e-5, abs=1e-6 * max(1, np.abs(gradient).max()))
         assert hessian == pytest.approx(differences[:, 1:], rel=1e-5, abs=1e-6 * max(1, np.abs(hessian).max()))
-        assert footprint_value(*pose, scenario.outline, scenario.field) == phi
+        assert footprint_value(pose, scenario.outline, scenario.field) == phi
         assert footprint_proximities(pose[None], scenario.outline, scenario.field)[0] == phi
         checked += 1
     assert checked > 800
@@ -117,18 +117,18 @@ def test_a_corner_may_come_close_to_a_vertex():
     )
     for gap in (1e-2, 1e-3, 1e-4):  # along the diagonal, from the vertex (4, 4) to the corner
         pose = np.array([4 - 0.3 - gap * math.sqrt(0.5), 4 - 0.2 - gap * math.sqrt(0.5), 0.0])
-        assert footprint_clearance(*pose, task.outline, task.field)[0] == pytest.approx(gap)
+        assert footprint_clearance(pose, task.outline, task.field)[0] == pytest.approx(gap)
         data = task.outline.ravel().copy()
-        gradient = np.array(footprint_proximity(*pose, data, 0, task.field)[1:4])
-        value = lambda q, data=data: footprint_proximity(*q, data, 0, task.field)[0]  # noqa: E731
+        gradient = np.array(footprint_proximity(*pose, 0, data, 0, task.field)[1:4])
+        value = lambda q, data=data: footprint_proximity(*q, 0, data, 0, task.field)[0]  # noqa: E731
         assert gradient == pytest.approx(approx_fprime(pose, value, 1e-6 * gap), rel=1e-4)
 
 
 def test_the_features_change_where_the_second_derivatives_jump():
     data = SCENARIO.outline.ravel().copy()
     path = np.stack([np.linspace(4.0, 8.0, 6000), np.full(6000, 4.3), np.full(6000, 0.2)], axis=1)
-    numbers = [footprint_features(*q, data, 0, SCENARIO.field) for q in path]
-    hessians = np.array([footprint_proximity(*q, data, 0, SCENARIO.field)[4:] for q in path])
+    numbers = [footprint_features(*q, 0, data, 0, SCENARIO.field) for q in path]
+    hessians = np.array([footprint_proximity(*q, 0, data, 0, SCENARIO.field)[4:] for q in path])
     steps = np.abs(np.diff(hessians, axis=0)).max(axis=1)
     changes = [k for k, (a, b) in enumerate(pairwise(numbers)) if a != b]
     jumps = np.flatnonzero(steps[1:-1] > 3 * np.maximum(steps[:-2], steps[2:])) + 1
@@ -136,11 +136,11 @@ def test_the_features_change_where_the_second_derivatives_jump():
 
 
 def test_cost_and_clearance_on_a_grid_of_points():
-    row, heading, grid = tuple(SCENARIO.outline[0].tolist()), 0.7, PointGrid(2.5, 1.5, 0.5, 12, 12)
+    row, heading, grid = tuple(SCENARIO.outline[0, :4].tolist()), 0.7, PointGrid(2.5, 1.5, 0.5, 12, 12)
     phi, closest = sample_grid(SCENARIO.field, row, heading, grid, 1.0)
     for i, j in np.ndindex(12, 12):
         x, y = 2.5 + 0.5 * i, 1.5 + 0.5 * j
-        clearance, nearest = footprint_clearance(x, y, heading, SCENARIO.outline, SCENARIO.field)
+        clearance, nearest = footprint_clearance(np.array([x, y, heading]), SCENARIO.outline, SCENARIO.field)
         assert closest[i, j] == pytest.approx(min(clearance, 1.0), abs=1e-9)
         if clearance < 1.0 and nearest >= 0:
             assert phi[i, j] >= 1 / math.expm1((max(clearance, 0.0) + 0.5 * OFFSET) / 0.1) * (1 - 1e-9)
@@ -153,7 +153,7 @@ def test_the_clearance_of_a_path_that_crosses_a_thin_wall():
 
 def test_sizes():
     outline = Unicycle(footprint=Box(length=2.0, width=1.0, offset=0.5)).outline()
-    assert outline.tolist() == [[-0.5, 1.5, 0.5, 0.0]]
+    assert outline.tolist() == [[-0.5, 1.5, 0.5, 0.0, 0]]
     assert sizes_of(outline) == (0.5, pytest.approx(math.hypot(1.0, 0.5)))
     assert arm_of(outline) == pytest.approx(math.hypot(1.5, 0.5))
     assert enclosed_radius(outline) == 0.5

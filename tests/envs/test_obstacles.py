@@ -97,8 +97,8 @@ def test_the_number_of_the_closest_features_changes_where_the_hessian_jumps(othe
     assert set(np.argsort(steps)[-8:]) == set(changes)
     assert disc_features(15.0, 15.0, 0.25, field) == 0  # far away
     # A footprint changes with each of its discs.
-    data = np.array([0.0, 0.0, 0.0, 0.25, 0.3, 0.3, 0.0, 0.25])
-    whole = [footprint_features(x, y, 0.4, data, 0, field) for x, y in path]
+    data = np.array([0.0, 0.0, 0.0, 0.25, 0.0, 0.3, 0.3, 0.0, 0.25, 0.0])
+    whole = [footprint_features(x, y, 0.4, 0, data, 0, field) for x, y in path]
     dx, dy = 0.3 * math.cos(0.4), 0.3 * math.sin(0.4)
     parts = [(disc_features(x, y, 0.25, field), disc_features(x + dx, y + dy, 0.25, field)) for x, y in path]
     assert len(set(whole)) == len(set(parts)) > 8

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import info_of_plan
 from scipy.integrate import solve_ivp
-from trailer_robot import Trailer
+from wagon_robot import Wagon
 
 import leapnav.envs
 from leapnav.envs import (
@@ -20,7 +20,9 @@ from leapnav.envs import (
     NavigateVectorEnv,
     Scenario,
     ScenarioError,
+    Trailer,
     Unicycle,
+    UnicycleTrailer,
     sample_scenario,
 )
 from leapnav.envs.robots import register
@@ -31,7 +33,8 @@ from leapnav.experts import ExpertPolicy, OptimalControlProblem, find_optimum
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.problem.system import switching_functions, system_of
 
-ROBOTS = {model.name(): model for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer)}
+BUILT_IN = (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer, UnicycleTrailer)
+ROBOTS = {model.name(): model for model in (*BUILT_IN, Wagon)}
 BOX = [{"offset": offset, "radius": 0.16} for offset in (-0.2, 0.0, 0.2)]
 RECTANGLE = {"box": {"length": 0.7, "width": 0.32, "offset": 0.1}}
 each_robot = pytest.mark.parametrize("name", ROBOTS)
@@ -64,14 +67,14 @@ def rates_of(scenario):
     return lambda q, u: np.array(function(q, u, parameters), dtype=float)
 
 
-MODELS.pop("trailer", None)  # registered for the tests of this module only: other tests read the list of models
+MODELS.pop("wagon", None)  # registered for the tests of this module only: other tests read the list of models
 
 
 @pytest.fixture(scope="module", autouse=True)
-def trailer():
-    register(Trailer)
+def wagon():
+    register(Wagon)
     yield
-    del MODELS["trailer"]
+    del MODELS["wagon"]
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +91,7 @@ def test_the_simulated_motion_is_that_of_the_declared_dynamics(name):
     scenario, rng = task(name), np.random.default_rng(0)
     rates, limits = rates_of(scenario), scenario.robot.action_scale()[1]
     parameters = np.array(scenario.robot.parameters(scenario.cost))
-    for h in (0.05, 0.3) if name != "trailer" else (0.05,):
+    for h in (0.05, 0.3) if name != "wagon" else (0.05,):
         for _ in range(5):
             q = rng.uniform(-1.5, 1.5, len(scenario.start_state))
             u = rng.uniform(-1.0, 1.0, len(limits)) * limits
@@ -120,16 +123,20 @@ def test_an_optimum_is_certified_and_satisfies_the_minimum_principle_independent
     states, controls, costates = optimum.evaluate(times)
     assert np.abs(found.y.T - states).max() < 1e-5
     assert (np.abs(controls) <= limits * (1 + 1e-9)).all()
-    distance = np.hypot(states[:, 0] - 3.6, states[:, 1] - 3.9) - 0.7 - scenario.robot.radius
-    walls = np.minimum(states[:, :2], 8.0 - states[:, :2]).min(axis=1) - scenario.robot.radius
-    assert min(distance.min(), walls.min()) > 0
+    discs = [(states[:, :2], scenario.robot.radius)]
+    if "hitch_angle" in scenario.robot.state_names:
+        angle, (disc,) = states[:, 2] + states[:, -1], scenario.robot.trailer
+        axle = states[:, :2] - scenario.robot.hitch_length * np.column_stack([np.cos(angle), np.sin(angle)])
+        discs.append((axle, disc.radius))
     state_cost = ROBOTS[name].state_cost or (lambda q, parameters: 0.0)
     parameters = np.array(scenario.robot.parameters(scenario.cost))
     running = np.array([state_cost(np.ascontiguousarray(q), parameters) for q in states])
     running += 0.5 * controls**2 @ weights
-    sigma = scenario.cost.proximity_scale
-    gaps = np.concatenate([states[:, :2], 8.0 - states[:, :2]], axis=1) - scenario.robot.radius
-    running += (1 / np.expm1(gaps / sigma)).sum(axis=1) + 1 / np.expm1(distance / sigma)
+    for centres, radius in discs:
+        distance = np.hypot(*(centres - (3.6, 3.9)).T) - 0.7
+        gaps = np.column_stack([centres, 8.0 - centres, distance]) - radius
+        assert gaps.min() > 0
+        running += (1 / np.expm1(gaps / scenario.cost.proximity_scale)).sum(axis=1)
     assert np.trapezoid(running, times) == pytest.approx(optimum.cost, rel=1e-5)
     # Within the limits u = -p / r with the switching functions p, and at a limit p points outwards.
     columns = np.tile(parameters, (len(times), 1))
@@ -227,7 +234,7 @@ def test_observation_and_action_spaces_fit_the_robot(name):
 
 def test_the_goal_of_a_further_heading_holds_modulo_2_pi():
     for turns, reached in ((0, True), (1, True), (0.25, False)):
-        scenario = task("trailer", start=[2, 2, 0], goal=[2.05, 2, 0], goal_motion=[2 * math.pi * turns])
+        scenario = task("wagon", start=[2, 2, 0], goal=[2.05, 2, 0], goal_motion=[2 * math.pi * turns])
         env = NavigateEnv(scenario=scenario)
         env.reset(seed=0)
         assert env.at_goal is reached
@@ -258,7 +265,7 @@ def test_a_box_of_three_discs(name, width):
         y = states[:, 1] + offset * np.sin(states[:, 2])
         assert np.abs(y[inside] - 4.0).max() + 0.16 < width / 2
     assert optimum.certificate.clearance == pytest.approx(
-        min(footprint_clearance(*q[:3], scenario.outline, scenario.field)[0] for q in states), abs=1e-3
+        min(footprint_clearance(q, scenario.outline, scenario.field)[0] for q in states), abs=1e-3
     )
     info = info_of_plan(optimum, scenario)
     assert info["is_success"]
@@ -278,8 +285,8 @@ def test_a_collision_ends_where_the_outline_is_in_contact(name, footprint):
         info = {"collision": False}
         for _ in range(60):
             _, _, terminated, _, info = env.step(np.array(ahead, dtype=np.float32))
-            x, y, heading = env.pose
-            clearance = footprint_clearance(x, y, heading, scenario.outline, scenario.field)[0]
+            state = np.array([*env.pose, *info.get("motion", ())])
+            clearance = footprint_clearance(state, scenario.outline, scenario.field)[0]
             assert clearance > -2e-3
             if info["collision"] and terminate:
                 assert terminated
@@ -326,8 +333,8 @@ def test_errors_name_field_and_value(changes, message):
 def test_a_bank_of_another_robot(tmp_path):
     from leapnav.experts import build_bank
 
-    bank = build_bank("open", 3, tmp_path / "trailer.bank", robot="trailer", progress=False)
-    assert bank.robot == Trailer()
+    bank = build_bank("open", 3, tmp_path / "wagon.bank", robot="wagon", progress=False)
+    assert bank.robot == Wagon()
     reference = bank.reference(0)
     assert reference.states.shape[1:] == (4,)
     env = NavigateEnv(bank=bank)
@@ -345,13 +352,13 @@ def test_a_robot_of_one_s_own_is_demonstrated_and_cloned(tmp_path):
     from leapnav.experts.data.rollouts import check_dataset
     from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_policy
 
-    summary = rollout("open", 6, tmp_path / "data", robot="trailer", progress=False)
+    summary = rollout("open", 6, tmp_path / "data", robot="wagon", progress=False)
     assert summary.demonstrations == 6
     replay = check_dataset(tmp_path / "data", progress=False)
     assert max(replay.observation, replay.reward, replay.state) < 1e-9
     dataset = Dataset.of(tmp_path / "data")
-    assert dataset.settings.robot == "trailer"
-    env = NavigateEnv("open", split="fresh", robot="trailer")
+    assert dataset.settings.robot == "wagon"
+    env = NavigateEnv("open", split="fresh", robot="wagon")
     policy = make_policy(env.observation_space, env.action_space, 0, (32,))
     for loss in ("action", "hamiltonian"):
         losses = behaviour_clone(policy, dataset, CloningConfig(epochs=4, loss=loss), progress=False)
@@ -367,7 +374,7 @@ def test_a_name_is_registered_once():
 
 
 def test_a_user_s_robot_is_unknown_until_its_file_is_imported():
-    text = json.dumps(task("trailer").to_dict())
+    text = json.dumps(task("wagon").to_dict())
     code = "import sys; from leapnav.envs import Scenario; Scenario.from_json(sys.argv[1])"
     done = subprocess.run([sys.executable, "-c", code, text], capture_output=True, text=True, check=False)
     assert "robot.model: expected one of unicycle" in done.stderr.splitlines()[-1]

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from leapnav.cli import main
-from leapnav.envs import Box, Polygon, ScenarioBank, ScenarioError, Unicycle
-from leapnav.envs.scenarios.files import read_scenarios
+from leapnav.envs import Polygon, ScenarioBank, ScenarioError, Unicycle
 from leapnav.envs.worlds.barn import path_lengths, read_barn, read_cylinders
 from leapnav.envs.worlds.dynobench import read_dynobench
 from leapnav.envs.worlds.movingai import read_movingai_problems, read_scen
 from leapnav.envs.worlds.tpcap import convex_parts, read_tpcap
-from leapnav.experts import find_optimum, minimum_time
+from leapnav.experts import find_optimum
 from leapnav.training.scoring.barn import barn_score
 
 GEOMETRY = "<link name='link'><collision name='collision'><geometry>{}</geometry></collision></link>"
@@ -168,107 +167,6 @@ def test_invalid_files_are_named(call, error, message, tmp_path, monkeypatch):
         call()
 
 
-DYNO_MODEL = """dynamics: {dynamics}
-min_vel: {slowest}
-max_vel: 0.5
-min_angular_vel: -0.5
-max_angular_vel: 0.5
-size: [0.5, 0.25]
-shape: box
-dt: 0.1
-"""
-DYNO_PROBLEM = """name: test
-environment:
-  min: [0.0, 0.0]
-  max: [3.0, 2]
-  obstacles:
-    - type: box
-      center: [1.1, 0.9]
-      size: [0.2, 0.4]
-robots:
-  - type: {model}
-    start: {start}
-    goal: {goal} # x, y, theta
-"""
-DYNO_STATES = {"start": "[0.5, 1.2, 0]", "goal": "[1.7, 1.2, 0]"}
-
-
-@pytest.fixture
-def dynobench(tmp_path):
-    """A directory with the structure of dynobench: three problems, and one of a robot that leapnav does not have."""
-    folder = tmp_path / "dynobench"
-    (folder / "models").mkdir(parents=True)
-    for model, dynamics, slowest in (
-        ("unicycle1_v0", "unicycle1", -0.5),
-        ("unicycle1_v1", "unicycle1", 0.25),
-        ("unicycle2_v0", "unicycle2", -0.5),
-        ("car1_v0", "car_with_trailers", -0.1),
-    ):
-        text, states = DYNO_MODEL.format(dynamics=dynamics, slowest=slowest), DYNO_STATES
-        if model == "unicycle2_v0":
-            text += "max_acc_abs: 0.25\nmax_angular_acc: 0.25\n"
-            states = {name: state.replace("]", ", 0, 0]") for name, state in DYNO_STATES.items()}
-        (folder / "models" / f"{model}.yaml").write_text(text)
-        solutions = folder / "envs" / model / "wall_0"
-        solutions.mkdir(parents=True)
-        solutions.with_suffix(".yaml").write_text(DYNO_PROBLEM.format(model=model, **states))
-        for planner, feasible, states in (("idbastar_v0", 1, 41), ("rrt_to_v0", 0, 10)):
-            rows = "\n".join("  - [0, 0, 0]" for _ in range(states))
-            (solutions / f"{planner}_solution_v0.yaml").write_text(f"feasible: {feasible}\nstates:\n{rows}\n")
-    (folder / "envs" / "unicycle1_v0" / "constraints.yaml").write_text("constraints: []\n")
-    return folder
-
-
-def test_problems_of_dynobench_are_scenarios_with_the_durations_of_other_planners(dynobench):
-    problems = read_dynobench(dynobench)
-    models = ["car1_v0", "unicycle1_v0", "unicycle1_v1", "unicycle2_v0"]
-    assert sorted(problems) == [f"{model}-wall_0" for model in models]
-    assert all(problem.durations == {"idbastar_v0": 4.0} for problem in problems.values())  # the other is not feasible
-    robot = problems["unicycle1_v1-wall_0"].scenario.robot
-    assert robot.control_bounds().tolist() == [[0.25, 0.5], [-0.5, 0.5]]
-    assert "car_with_trailers" in problems["car1_v0-wall_0"].reason
-    dynamic = problems["unicycle2_v0-wall_0"].scenario
-    assert dynamic.robot.state_bounds() == (None, None, None, (-0.5, 0.5), (-0.5, 0.5))
-    assert dynamic.robot.control_bounds().tolist() == [[-0.25, 0.25]] * 2
-    assert dynamic.start_state == (0.5, 1.2, 0.0, 0.0, 0.0)
-    scenario = problems["unicycle1_v0-wall_0"].scenario
-    assert scenario.arena == (0, 0, 3, 2) and scenario.robot.control_bounds().tolist() == [[-0.5, 0.5]] * 2
-    assert scenario.robot.footprint == Box(length=0.5, width=0.25)
-    found = minimum_time(scenario, 0.2)
-    assert found.extremal.success
-    assert 1.2 / 0.5 < found.horizon < 4.0  # the distance at the largest speed
-
-
-def test_the_table_of_dynobench(dynobench, tmp_path, capsys):
-    out = tmp_path / "table.json"
-    assert main(["worlds", "benchmark", "dynobench", str(dynobench), "--tol", "0.2", "--json", str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert "car1_v0-wall_0: left out: dynamics 'car_with_trailers'" in printed and "idbastar_v0" in printed
-    row = json.loads(out.read_text())["unicycle1_v0-wall_0"]
-    assert row["idbastar_v0"] == 4.0 and 2.4 < row["leapnav"] < 4.0 and row["clearance"] > 0
-    assert main(["worlds", "import", "dynobench", str(dynobench), "--out", str(tmp_path / "scenarios")]) == 0
-    names = [name for name, problem in read_dynobench(dynobench).items() if problem.scenario is not None]
-    assert sorted(scenario.name for scenario in read_scenarios(tmp_path / "scenarios")) == sorted(names)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("start: [0.5, 1.2, 0]", "start: [0.5, 1.2, 0, 0, 0]", "wall_0.yaml: robots"),
-        ("size: [0.2, 0.4]", "size: 1", r"wall_0.yaml: environment.obstacles\[0\].size: expected a list, got 1"),
-        ("type: box", "type: ball", r"obstacles\[0\].type: expected 'box', got 'ball'"),
-        ("    goal: [1.7, 1.2, 0]", "    end: [0, 0, 0]", r"robots\[0\].goal: missing"),
-    ],
-)
-def test_an_invalid_problem_of_dynobench_is_named(old, new, message, dynobench):
-    path = dynobench / "envs" / "unicycle1_v0" / "wall_0.yaml"
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-    with pytest.raises(ValueError, match=message):
-        read_dynobench(dynobench)
-
-
 def test_a_directory_without_problems_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected the directories envs and models of dynobench"):
         read_dynobench(tmp_path)
@@ -294,7 +192,7 @@ def test_a_case_of_tpcap_is_a_car_that_parks(tmp_path):
     assert [second.name, first.name] == ["tpcap-2", "tpcap-10"]
     assert first.robot.model == "car" and first.horizon is None and first.start_state[2] == 0.0
     assert first.arena == pytest.approx((-14.0, -10.5, 8.0, 12.0))
-    assert first.outline.tolist() == [pytest.approx([-0.929, 3.76, 0.971, 0.0])]
+    assert first.outline.tolist() == [pytest.approx([-0.929, 3.76, 0.971, 0.0, 0])]
     assert len(second.obstacles) == 2  # since the polygon is not convex
     optimum = find_optimum(first)
     assert optimum.success and optimum.driving_modes[-1] == "backward"

@@ -123,7 +123,7 @@ def test_a_robot_that_cannot_stop_turns_as_tightly_as_it_can():
 def test_the_footprint_of_a_problem_is_checked():
     scenario = wall_with_gap(0.5, (1.5, 2.0, 0.0), (4.5, 2.0, 0.0))
     problem = OptimalControlProblem.from_scenario(scenario)
-    assert problem.footprint == BOX and problem.outline.tolist() == [[-0.25, 0.25, 0.125, 0.0]]
+    assert problem.footprint == BOX and problem.outline.tolist() == [[-0.25, 0.25, 0.125, 0.0, 0]]
     for footprint in ((), ((0.0, 0.2),), np.zeros((1, 2))):
         with pytest.raises(ValueError, match="footprint: expected discs or a box"):
             OptimalControlProblem(

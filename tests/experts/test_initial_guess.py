@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers import ROBOTS
-from trailer_robot import Trailer
+from wagon_robot import Wagon
 
 from leapnav.cli import main
 from leapnav.envs import Scenario
@@ -12,15 +12,15 @@ from leapnav.experts import OptimalControlProblem, Status, find_optimum, solve
 from leapnav.experts.search.initial_guess import initial_guess
 from leapnav.experts.solve import METHODS
 
-WITH_TRAILER = (*ROBOTS, Trailer.name())
+WITH_WAGON = (*ROBOTS, Wagon.name())
 
-MODELS.pop(Trailer.name(), None)  # registered for the tests of this module only: other tests read the list of models
+MODELS.pop(Wagon.name(), None)  # registered for the tests of this module only: other tests read the list of models
 
 
 @pytest.fixture(autouse=True)
-def _trailer(monkeypatch):
+def _wagon(monkeypatch):
     """Register the robot of an example for the tests of this module only."""
-    monkeypatch.setitem(MODELS, Trailer.name(), Trailer)
+    monkeypatch.setitem(MODELS, Wagon.name(), Wagon)
 
 
 def easy(model, horizon, **changes):
@@ -38,7 +38,7 @@ def easy(model, horizon, **changes):
 
 @pytest.mark.parametrize("horizon", [2.0, None])
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("robot", WITH_TRAILER)
+@pytest.mark.parametrize("robot", WITH_WAGON)
 def test_every_method_solves_an_easy_scenario_without_a_guess(robot, method, horizon):
     scenario = easy(robot, horizon)
     extremal = solve(scenario, method)
@@ -55,7 +55,7 @@ def test_a_free_final_motion_is_lifted(method):
 
 
 def test_the_command_solves_for_every_robot(tmp_path, capsys):
-    for robot in WITH_TRAILER:
+    for robot in WITH_WAGON:
         path = tmp_path / f"{robot}.json"
         path.write_text(easy(robot, 2.0).to_json())
         assert main(["solve", str(path), "--method", "all"]) == 0

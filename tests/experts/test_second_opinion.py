@@ -94,8 +94,8 @@ def test_the_proximity_cost_of_a_rectangle_in_the_transcription_is_that_of_the_k
     entries = [value, *(gradient[i] for i in range(3)), *(hessian[i, j] for i in range(3) for j in range(i, 3))]
     function, data = casadi.Function("proximity", [q], entries), small.outline.ravel().copy()
     for pose in np.random.default_rng(0).uniform((0, 0, -3), (10, 10, 3), (500, 3)):
-        if footprint_clearance(*pose, small.outline, small.field)[0] > 1e-3:
-            expected = np.array(footprint_proximity(*pose, data, 0, small.field))
+        if footprint_clearance(np.array(pose), small.outline, small.field)[0] > 1e-3:
+            expected = np.array(footprint_proximity(*pose, 0, data, 0, small.field))
             assert np.ravel(function(pose)) == pytest.approx(
                 expected, rel=1e-7, abs=1e-8 + 1e-7 * np.abs(expected).max()
             )

@@ -14,7 +14,7 @@ SCORE = r"success \d+\.\d %, collision \d+\.\d %, SOC \d\.\d+"
 # Arguments, and the last lines of the output.
 EXAMPLES = {
     "own_robot": ("--plot {out}", r"certified: .*: J = 3\.165478; maximum angle at the hitch: 66 degrees\nwrote .*\n"),
-    "trailer_robot": ("--plot {out}", r"certified: .*: J = \d+\.\d{6}\nwrote .*\n"),
+    "wagon_robot": ("--plot {out}", r"certified: .*: J = \d+\.\d{6}\nwrote .*\n"),
     "compare_methods": ("--plot {out}", r".*\n(.*SUCCESS.*4\.625635716.*\n){3}.*\n(.*: J = 4\.625635716)\nwrote .*\n"),
     "alternatives": ("--plot {out}", r"the gate: certified: .*\n(J = +\d.*(forward|backward)\n){4,}wrote .*\n"),
     "cleanrl_ppo": (

@@ -16,7 +16,7 @@ import numpy as np
 
 from leapnav.envs.robots.footprints import arm_of
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.shapes.proximity import footprint_value
 from leapnav.envs.utils.validation import is_integer
 
@@ -195,11 +195,12 @@ def _check_states(scenario: Scenario, states: np.ndarray, certified: float) -> N
     if not ((states[:, :2] >= (x_min, y_min)) & (states[:, :2] <= (x_max, y_max))).all():
         raise ValueError("states: expected positions in the arena")
     outline, field = scenario.outline, scenario.field
-    found = min(footprint_clearance(x, y, heading, outline, field)[0] for x, y, heading in states[:, :3].tolist())
+    found = float(footprint_clearances(states, outline, field).min())
     # Every point of the outline is always within half of this of its position at a stored point, and so are the points
     # of the certificate.
-    steps, arm = np.abs(np.diff(states[:, :3], axis=0)), arm_of(outline)
-    step = float((np.hypot(steps[:, 0], steps[:, 1]) + arm * steps[:, 2]).max())
+    steps, arm, joint = np.abs(np.diff(states, axis=0)), arm_of(outline), int(outline[:, 4].max())
+    turns = steps[:, 2] + (steps[:, joint] if joint else 0.0)
+    step = float((np.hypot(steps[:, 0], steps[:, 1]) + arm * turns).max())
     if not abs(found - certified) <= step + float(rounding[:, :3].max()):
         raise ValueError(f"states: expected a smallest clearance of {certified:.3g} m, got {found:.3g} m")
 
@@ -255,7 +256,6 @@ def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, int
     running = np.square(controls) @ np.array(robot.control_weight(scenario.cost)) / 2 + scenario.cost.time_weight
     state_cost = type(robot).state_cost
     for k, state in enumerate(states):
-        x, y, heading = state[:3].tolist()
-        running[k] += footprint_value(x, y, heading, scenario.outline, scenario.field)
+        running[k] += footprint_value(state, scenario.outline, scenario.field)
         running[k] += 0.0 if state_cost is None else state_cost(state, parameters)
     return float(np.trapezoid(running, dx=interval))

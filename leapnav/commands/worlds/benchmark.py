@@ -1,4 +1,4 @@
-"""`leapnav worlds benchmark`: policies and the expert in the worlds of other benchmarks."""
+"""`leapnav benchmark`: policies and the expert in the worlds of other benchmarks."""
 
 from __future__ import annotations
 
@@ -69,8 +69,9 @@ class BenchmarkBarn(TaskOptions):
 class BenchmarkDynobench:
     """Compare the minimum time of the problems of dynobench with the durations of its stored solutions.
 
-    The robot's box is exact, and the paths end at the goal, which the stored solutions reach within a tolerance. The
-    times are upper bounds of the minimum time. Problems whose robot differs from those of leapnav are left out.
+    The robot's boxes are exact, and the paths end at the goal, which the stored solutions reach within a tolerance. The
+    times are upper bounds of the minimum time. Each path is then divided into the time steps of dynobench, and checked
+    by its rules. Problems of robots without wheels, or with several robots, are left out.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -81,19 +82,21 @@ class BenchmarkDynobench:
     """JSON file of the table; "-" for standard output."""
 
     def run(self) -> int:
-        """Compute the minimum times and print the table; it fails if one is missing."""
+        """Compute the minimum times and print the table; it fails if one is missing or breaks a rule."""
         check_outputs(self.json)
         from leapnav.envs.worlds.dynobench import read_dynobench
+        from leapnav.envs.worlds.dynobench_rules import check_trajectory, discretise
         from leapnav.experts import SolveError, minimum_time
 
         problems = read_dynobench(self.folder)
         planners = sorted({planner for problem in problems.values() for planner in problem.durations})
         rows: dict[str, dict[str, float | None]] = {}
+        all_accepted = True
         for name, problem in problems.items():
             if problem.scenario is None:
                 print(f"{name}: left out: {problem.reason}")
                 continue
-            row: dict[str, float | None] = dict.fromkeys(("leapnav", "tolerance", "clearance", *planners))
+            row: dict[str, float | None] = dict.fromkeys(("leapnav", "steps", "tolerance", "clearance", *planners))
             try:
                 found = minimum_time(problem.scenario, self.tol)
             except SolveError as error:
@@ -102,10 +105,16 @@ class BenchmarkDynobench:
                 certificate = found.extremal.certificate
                 clearance = certificate.clearance if certificate is not None else None
                 row |= {"leapnav": found.horizon, "tolerance": found.tolerance, "clearance": clearance}
+                extremal = found.extremal
+                trajectory = discretise(problem, lambda times: extremal.evaluate(times)[0], found.horizon)  # noqa: B023
+                row["steps"] = problem.time_step * len(trajectory.actions)
+                for rule, size in check_trajectory(problem, trajectory).broken.items():
+                    print(f"{name}: not accepted by the rules of dynobench: {rule} {size:.3g}")
+                    all_accepted = False
             rows[name] = {**row, **problem.durations}
         _print_durations(rows)
         write_json(rows, self.json)
-        return 0 if all(row["leapnav"] is not None for row in rows.values()) else FAILED
+        return 0 if all_accepted and all(row["leapnav"] is not None for row in rows.values()) else FAILED
 
 
 @dataclass(frozen=True)
