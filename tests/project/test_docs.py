@@ -45,6 +45,7 @@ PRINTED = {
     "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
     "guides/obstacles.md": rf"True {NUMBER}\nTrue\n8 4 True\nrooms-3\n",
     "robots/own_robot.md": r"True 4\n",
+    "robots/trailer.md": rf"{NUMBER}\n",
     "guides/own_family.md": r"warehouse-0 \(0\.0, 0\.0, 12\.0, 10\.0\) 4\nTrue\n5 warehouse\n",
     "guides/own_shape.md": r"True 3\.14\n",
     "guides/robots.md": r"1\.7322 \[ 4\. +1\. +-?0\. +-0\.2402\] \[-0\.7902 -0\.2627 +0\.0862 +-?0\. *\]\n",

@@ -65,8 +65,8 @@ def test_a_system_is_compiled_once(monkeypatch):
         monkeypatch.setattr(module, "load", slowed(module.load, calls))
 
     def functions(_):
-        flow = generated_flow.compile_flow(system, sp.Integer(0), "none")
-        return *flow, generated_dynamics.compile_dynamics(system, sp.Integer(0), "none").step
+        flow = generated_flow.compile_flow(system, sp.Integer(0), None)
+        return *flow, generated_dynamics.compile_dynamics(system, sp.Integer(0), None).step
 
     found = in_threads(functions)
     assert all(one is other for pair in found for one, other in zip(pair, found[0], strict=True))
