@@ -111,13 +111,15 @@ def without_barrier(extremal: Extremal) -> Extremal:
     accumulated, terms = extremal.accumulated.copy(), extremal.terms.copy()
     accumulated[1:] -= np.cumsum(integrals)
     terms[:, 0, -1] -= integrals  # the linear terms of the interpolant
-    cost = extremal.cost - float(integrals.sum())
-    return replace(extremal, cost=cost, accumulated=accumulated, terms=terms, barrier=extremal.cost / cost - 1.0)
+    integral = float(integrals.sum())
+    cost = extremal.cost - integral
+    barrier = integral / abs(cost) if cost != 0.0 else math.inf
+    return replace(extremal, cost=cost, accumulated=accumulated, terms=terms, barrier=barrier)
 
 
 def expected_limit(extremal: Extremal) -> float:
     """Return the cost that is expected in the limit for an extremal whose cost excludes the barrier."""
-    return extremal.cost * (1.0 - (EXPECTED_REDUCTION - 1.0) * extremal.barrier)
+    return extremal.cost - (EXPECTED_REDUCTION - 1.0) * extremal.barrier * abs(extremal.cost)
 
 
 def follow_limit(extremal: Extremal, weight: float = 0.0, tolerance: float = BARRIER_TOLERANCE) -> Extremal:
@@ -184,7 +186,7 @@ class _Continuation:
     @property
     def lowest(self) -> float:
         """An estimate of the lowest cost that is possible in the limit."""
-        return self._limit.cost * (1.0 - (LARGEST_REDUCTION - 1.0) * self._limit.barrier)
+        return self._limit.cost - (LARGEST_REDUCTION - 1.0) * self._limit.barrier * abs(self._limit.cost)
 
     @property
     def _is_reached(self) -> bool:

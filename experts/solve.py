@@ -48,6 +48,8 @@ OPTIONS = {
 }
 # Without a guess, at most this number of initial paths is solved, until one costs more than the best by this fraction.
 MAX_INITIAL_PATHS, SIMILAR_COST = 4, 0.05
+# With hard limits, at most this number of first barrier weights is tried, each the last one times this factor.
+MAX_FIRST_WEIGHTS, FIRST_WEIGHT_FACTOR = 3, 0.1
 # If these fail, the horizon is halved at most this often, and then followed back with at least this fraction of the
 # logarithm of the change per step.
 MAX_HALVINGS, MIN_STEP = 12, 1 / 64
@@ -120,10 +122,11 @@ def solve(
         found = initial_guess(problem, ocp)
         extremal = failure(ocp, Status.NO_PATH) if found is None else solver(*found, options)
     elif ocp.has_hard_limits and ocp.barrier_weight == 0.0:
-        extremal = _without_guess(solver, ocp.with_barrier(first_barrier_weight(ocp)), options)
+        extremal = _to_limit(solver, ocp, options, barrier_tolerance)
     else:
         extremal = _without_guess(solver, ocp, options)
-    if extremal.success and extremal.problem.barrier_weight > ocp.barrier_weight:
+    is_followed = guess is None and not isinstance(problem, Scenario)  # by `_to_limit`, if there are hard limits
+    if extremal.success and extremal.problem.barrier_weight > ocp.barrier_weight and not is_followed:
         extremal = follow_limit(extremal, ocp.proximity_weight, barrier_tolerance)
     if raise_on_failure and not extremal.success:
         raise SolveError(extremal, problem.name if isinstance(problem, Scenario) else "")
@@ -172,6 +175,31 @@ def _without_guess(
         if lengthened is not None:
             return lengthened
     return (converged or failed)[0]
+
+
+def _to_limit(
+    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    problem: OptimalControlProblem,
+    options: SolverOptions,
+    tolerance: float,
+) -> Extremal:
+    """The extremal that is followed from a first barrier weight to the limit, without a guess.
+
+    A large weight can turn a saddle of the limit into a minimum, such as a straight beam between walls under a load
+    that makes it buckle. On the way to the limit it becomes a saddle again. Then a smaller first weight is tried.
+    """
+    weight, failed = first_barrier_weight(problem), []
+    for _ in range(MAX_FIRST_WEIGHTS):
+        extremal = _without_guess(solver, problem.with_barrier(weight), options)
+        if extremal.success:
+            extremal = follow_limit(extremal, problem.proximity_weight, tolerance)
+        if extremal.success:
+            return extremal
+        failed.append(extremal)
+        if extremal.status not in (Status.STALLED, Status.CONJUGATE_POINT):
+            break
+        weight *= FIRST_WEIGHT_FACTOR
+    return failed[0]
 
 
 def _has_converged(extremal: Extremal) -> bool:

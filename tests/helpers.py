@@ -1,6 +1,7 @@
 """Helpers of several tests: problems and scenarios with known costs, and the stored reference data."""
 
 import json
+import math
 import os
 import signal
 import threading
@@ -8,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -54,23 +56,45 @@ def published_problems() -> dict[str, tuple[OptimalControlProblem, float, str]]:
     return {entry["name"]: (_problem(entry), entry["cost"], entry["source"]) for entry in entries}
 
 
-def difficult_problems() -> list[tuple[str, OptimalControlProblem, float, str, bool]]:
-    """Return problems that single shooting cannot solve (data/difficult_problems.json).
+class KnownProblem(NamedTuple):
+    """A problem of data/known_problems.json with one of the methods that solve it from nothing.
 
-    Each entry is (name, problem, known cost, method, whether this takes more than 2 s).
+    Attributes:
+        name: name of the problem.
+        problem: the problem.
+        value: the known cost, or the minimum time (s) if the method is `minimum_time`.
+        method: a method of `solve`, or "minimum_time".
+        is_slow: whether this takes more than 2 s.
+
     """
-    found = []
-    for entry in json.loads((DATA / "difficult_problems.json").read_text()):
-        for key in ("methods", "slow"):
-            found += [
-                (entry["name"], _problem(entry), entry["cost"], method, key == "slow") for method in entry.get(key, ())
-            ]
-    return found
+
+    name: str
+    problem: OptimalControlProblem
+    value: float
+    method: str
+    is_slow: bool
+
+
+def known_problems() -> list[KnownProblem]:
+    """Return problems with known solutions, once for each method that solves them (data/known_problems.json).
+
+    Each entry has the source of the problem and a second method that confirmed the value. Its field `fails` has the
+    status of the methods that do not solve the problem.
+    """
+    return [
+        KnownProblem(
+            entry["name"], _problem(entry), entry["time" if "time" in entry else "cost"], method, key == "slow"
+        )
+        for entry in json.loads((DATA / "known_problems.json").read_text())
+        for key in ("methods", "slow")
+        for method in entry.get(key, ())
+    ]
 
 
 def _problem(entry: dict) -> OptimalControlProblem:
     symbols = tuple(sp.Symbol(name) for name in entry["state"])
     known = {str(s): s for s in symbols}
+    bounds = entry.get("state_bounds")
     system = ControlAffineSystem(
         state=symbols,
         drift=[sp.sympify(e, locals=known) for e in entry["drift"]],
@@ -84,7 +108,14 @@ def _problem(entry: dict) -> OptimalControlProblem:
         control_weight=entry["control_weight"],
         state_cost=sp.sympify(entry["state_cost"], locals=known),
         control_bounds=entry.get("control_bounds"),
+        time_weight=0.0 if entry["horizon"] is not None else 1.0,
+        state_bounds=None if bounds is None else [pair and _interval(*pair) for pair in bounds],
     )
+
+
+def _interval(low: float | None, high: float | None) -> tuple[float, float]:
+    """Return a pair of limits, of which JSON has null for an infinite one."""
+    return -math.inf if low is None else low, math.inf if high is None else high
 
 
 def scenario_fields(**changes: object) -> dict:

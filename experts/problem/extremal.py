@@ -183,7 +183,7 @@ class Extremal:
         certificate: evidence from re-integration; None without a path.
         n_nodes: number of nodes of the solver.
         n_evaluations: number of evaluations of the extremal flow by the solver.
-        barrier: integral of the barrier that approximates hard limits, as a fraction of `cost`, which excludes it; 0
+        barrier: integral of the barrier that approximates hard limits, as a fraction of |`cost`|, which excludes it; 0
             without hard limits. The cost of the optimum with the hard limits is lower by about this fraction.
 
     """

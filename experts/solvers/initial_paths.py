@@ -25,6 +25,7 @@ MAX_STARTS = 16  # initial controls per winding of the goal angles
 N_AGREEING = 6  # if this number of initial controls leads to one cost, the problem is assumed to have one minimum
 MAX_VIOLATION = 1e-2  # sum of the constraint violations of a path, relative to the largest state
 HARMONICS = 4  # of random initial controls
+REST = 1e-3  # fraction of the first random controls below which a path is at rest, such as a straight beam
 COST_TOLERANCE = 1e-4  # relative; paths whose costs agree to this are one local minimum, or its mirror image
 WINDINGS = (0, -1, 1)
 # First weight of a barrier, as a fraction of the cost per second; smaller costs per unit controls are rounding errors.
@@ -130,8 +131,9 @@ def local_minima(
     line = problem.straight_line(intervals + 1)
     rates = np.gradient(line.states, line.times, axis=0)
     along = np.nan_to_num(problem.follow(line.states, rates)[:intervals])
-    # Typical size of the controls, until a solution is known.
+    # Typical size of the controls, until a path is known that has any.
     size = np.full(m, np.linalg.norm(rates[0]) + n / problem.fixed_horizon)
+    smallest = REST * np.linalg.norm(size)
     phases = np.cos(np.outer(np.linspace(0.0, np.pi, intervals), np.arange(HARMONICS)))
     for index in range(starts):
         U = along.copy() if index == 0 else np.zeros_like(along)
@@ -140,7 +142,11 @@ def local_minima(
         path = _optimise(problem, _clip(problem, U))
         if path is None:
             continue
-        size = np.sqrt(np.mean(path.controls**2, axis=0) + 1e-12) + 0.3 * np.sqrt(np.mean(path.controls**2))
+        rms = np.sqrt(np.mean(path.controls**2, axis=0) + 1e-12)
+        if np.linalg.norm(rms) > smallest and state_margin(problem.state_limits, path.states) > 0:
+            size = rms + 0.3 * np.sqrt(np.mean(path.controls**2))
+        elif index > 1:
+            size *= 0.3  # at rest if the random controls were too small, but beyond the limits if they were too large
         found.append((path.cost, Trajectory(path.times, path.states, path.costates)))
         costs = np.array([entry[0] for entry in found])
         if len(found) == N_AGREEING and np.ptp(costs) <= COST_TOLERANCE * np.abs(costs).max():

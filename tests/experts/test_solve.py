@@ -4,7 +4,7 @@ import pickle
 import numpy as np
 import pytest
 import sympy as sp
-from helpers import best_known, difficult_problems, published_problems, scenario_fields, shooting_guess
+from helpers import best_known, known_problems, published_problems, scenario_fields, shooting_guess
 
 from leapnav.envs import Scenario
 from leapnav.experts import (
@@ -16,12 +16,22 @@ from leapnav.experts import (
     find_optimum,
     solve,
 )
+from leapnav.experts.hard_limits import BARRIER_TOLERANCE
+from leapnav.experts.minimum_time import minimum_time
 from leapnav.experts.problem.system import differential_drive, unicycle_with_inertia
 from leapnav.experts.solve import METHODS
 
 SCENARIOS = {s.name: (s, cost) for s, cost in best_known()}
 PROBLEMS = published_problems()
-
+# Only `minimum_time` solves problems without control cost.
+KNOWN, KNOWN_TIMES = (
+    [
+        pytest.param(entry, id=f"{entry.name}-{entry.method}", marks=pytest.mark.slow if entry.is_slow else ())
+        for entry in known_problems()
+        if (entry.method == "minimum_time") == is_time
+    ]
+    for is_time in (False, True)
+)
 
 x, v, y, z = sp.symbols("x v y z")
 DOUBLE_INTEGRATOR = ControlAffineSystem(state=(x, v), drift=(v, 0), fields=((0, 1),))
@@ -73,17 +83,22 @@ def test_published_problems_are_solved_without_a_polish(name, method):
     assert all(row.phase != "newton" for row in extremal.history)
 
 
-@pytest.mark.parametrize(
-    ("problem", "cost", "method"),
-    [
-        pytest.param(problem, cost, method, id=f"{name}-{method}", marks=pytest.mark.slow if slow else ())
-        for name, problem, cost, method, slow in difficult_problems()
-    ],
-)
-def test_difficult_problems_are_solved_from_nothing(problem, cost, method):
-    extremal = solve(problem, method=method)
+@pytest.mark.parametrize("entry", KNOWN)
+def test_known_problems_are_solved_from_nothing(entry):
+    extremal = solve(entry.problem, method=entry.method)
     assert extremal.success, (extremal.status, extremal.certificate)
-    assert extremal.cost == pytest.approx(cost, rel=1e-7)
+    if entry.problem.has_hard_limits:
+        # The path is feasible, so it costs at least as much; too much by at most the barrier, see docs/theory.md.
+        assert 0 <= (extremal.cost - entry.value) / abs(entry.value) <= extremal.barrier <= BARRIER_TOLERANCE
+    else:
+        assert extremal.cost == pytest.approx(entry.value, rel=1e-7)
+
+
+@pytest.mark.parametrize("entry", KNOWN_TIMES)
+def test_known_minimum_times_are_found(entry):
+    found = minimum_time(entry.problem)
+    assert found.extremal.success and found.extremal.barrier <= BARRIER_TOLERANCE
+    assert 0 <= found.horizon / entry.value - 1 <= 1e-5 + found.extremal.barrier
 
 
 @pytest.mark.parametrize("method", METHODS)
