@@ -18,6 +18,8 @@ N_i points of the i-th optimum, evenly spaced in time from 0 to its duration:
 | `controls` | (sum of N_i, n_u) float32 | for the unicycle speed (m/s), turn rate (rad/s) |
 | `costates` | (sum of N_i, n_q) float32 | lambda, the gradient of the cost-to-go |
 | `lower_bounds` | (n,) float64 | proved lower bounds of the cost, NaN where none is known; only after `leapnav bank prove` |
+| `shortest_lengths` | (n,) float64 | lengths (m) of the shortest paths, NaN where none is known; only after `leapnav bank shortest` |
+| `shortest_times` | (n,) float64 | minimum times (s), likewise |
 
 Attributes of the file: `format` ("leapnav-bank"), `version` (6), `family`, `seed`, `drawn` (number of scenarios drawn,
 of which n were admitted), `rejected` (JSON: the number of rejected scenarios by reason), `software` (the version of
@@ -74,8 +76,11 @@ TYPES = {
     "controls": "<f4",
     "costates": "<f4",
     "lower_bounds": "<f8",
+    "shortest_lengths": "<f8",
+    "shortest_times": "<f8",
 }
-LOWER_BOUNDS, GIVEN = "lower_bounds", "given"  # a dataset and an attribute that not all banks have
+ADDED = ("lower_bounds", "shortest_lengths", "shortest_times")  # datasets that not all banks have
+GIVEN = "given"  # an attribute that not all banks have
 _TABLES = ("certificates", "states", "controls", "costates")  # datasets with columns
 _CONTENTS = {"scenario_ends": ("scenarios",), "path_ends": ("states", "controls", "costates")}
 _DIVIDED = tuple(name for names in _CONTENTS.values() for name in names)  # datasets with several entries per scenario
@@ -104,6 +109,8 @@ class ScenarioBank(Sequence[Scenario]):
         certificates (n, 4): boundary residual, defect, drift of H, clearance (m).
         lower_bounds (n,): proved lower bounds of the cost, see `prove_bank` of
             `leapnav.experts.data.bank_bounds`; NaN where none is known.
+        shortest_lengths, shortest_times (n,): lengths (m) of the shortest paths, and minimum times (s), without contact
+            with obstacles, see `leapnav.experts.data.bank_shortest`; NaN where none is known.
         draws (n,): indices of the random draws that produced the scenarios.
         horizon: kind of the horizon of all scenarios, "fixed" or "free".
         obstacles: kind of the obstacles of all scenarios, "cost" or "hard", see `Cost.obstacles`.
@@ -128,6 +135,8 @@ class ScenarioBank(Sequence[Scenario]):
     second_costs: np.ndarray
     certificates: np.ndarray
     lower_bounds: np.ndarray
+    shortest_lengths: np.ndarray
+    shortest_times: np.ndarray
     draws: np.ndarray
     horizon: str
     obstacles: str
@@ -152,7 +161,7 @@ class ScenarioBank(Sequence[Scenario]):
                         f"{self.path}: version {attributes.get('version')} of the format; this leapnav reads "
                         f"{VERSION}; build the bank again with `leapnav bank build`"
                     )
-                locations = {name: _locate(file, name) for name in TYPES if name in file or name != LOWER_BOUNDS}
+                locations = {name: _locate(file, name) for name in TYPES if name in file or name not in ADDED}
             rejected, checksums = json.loads(attributes["rejected"]), json.loads(attributes.pop("checksums"))
             given = json.loads(attributes[GIVEN]) if GIVEN in attributes else None
             content = np.asarray(np.memmap(self.path, dtype="u1", mode="r"))
@@ -179,7 +188,9 @@ class ScenarioBank(Sequence[Scenario]):
         self.costs, self.second_costs = arrays["costs"], arrays["second_costs"]
         self.certificates, self.draws = arrays["certificates"], arrays["draws"]
         self.horizons = arrays["horizons"]
-        self.lower_bounds = arrays.get(LOWER_BOUNDS, np.full(len(self.costs), math.nan))
+        self.lower_bounds, self.shortest_lengths, self.shortest_times = (
+            arrays.get(name, np.full(len(self.costs), math.nan)) for name in ADDED
+        )
         self._scenarios: dict[int, Scenario] = {}
         self._checked: set[int] = set()  # scenarios whose optimum is checked
         self.horizon = self[0].horizon_kind if len(self) else "fixed"

@@ -17,7 +17,6 @@ from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.bank import (
     FORMAT,
     GIVEN,
-    LOWER_BOUNDS,
     TYPES,
     VERSION,
     attribute_bytes,
@@ -130,15 +129,15 @@ def write_bank(
             file.create_dataset(name, data=array)
 
 
-def write_lower_bounds(path: str | os.PathLike[str], lower_bounds: np.ndarray) -> None:
-    """Add lower bounds to a bank, or replace them, atomically.
+def add_datasets(path: str | os.PathLike[str], **arrays: np.ndarray) -> None:
+    """Add datasets of `ADDED` to a bank, or replace them, atomically.
 
     Args:
         path: the file of the bank, or a link to it.
-        lower_bounds (n,): see `ScenarioBank`.
+        arrays: a number (n,) for each scenario, by the name of the dataset, see `ScenarioBank`.
 
     Raises:
-        ValueError: the number of bounds is not that of the scenarios.
+        ValueError: the number of values is not that of the scenarios.
         OSError: the file cannot be written.
 
     """
@@ -152,11 +151,13 @@ def write_lower_bounds(path: str | os.PathLike[str], lower_bounds: np.ndarray) -
         with h5py.File(partial, "r+", alignment_threshold=1, alignment_interval=64) as file:
             costs: Any = file["costs"]
             count = len(costs)
-            if lower_bounds.shape != (count,):
-                raise ValueError(f"lower_bounds: expected the shape ({count},), got {lower_bounds.shape}")
-            array = lower_bounds.astype(TYPES[LOWER_BOUNDS])
-            if LOWER_BOUNDS in file:
-                del file[LOWER_BOUNDS]
-            file.create_dataset(LOWER_BOUNDS, data=array)
             checksums = json.loads(str(file.attrs["checksums"]))
-            file.attrs["checksums"] = json.dumps({**checksums, LOWER_BOUNDS: digest(array)})
+            for name, values in arrays.items():
+                if values.shape != (count,):
+                    raise ValueError(f"{name}: expected the shape ({count},), got {values.shape}")
+                array = values.astype(TYPES[name])
+                if name in file:
+                    del file[name]
+                file.create_dataset(name, data=array)
+                checksums[name] = digest(array)
+            file.attrs["checksums"] = json.dumps(checksums)

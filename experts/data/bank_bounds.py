@@ -13,7 +13,7 @@ import numpy as np
 
 import leapnav
 from leapnav.envs.scenarios.bank import BankError, ScenarioBank, digest
-from leapnav.envs.scenarios.bank_writing import write_lower_bounds
+from leapnav.envs.scenarios.bank_writing import add_datasets
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.bounds.lower_bound import lower_bound
@@ -92,7 +92,7 @@ def prove_bank(
         check_at_least("count", count, 1)
     check_at_least("workers", workers, 1)
     path = Path(path).resolve()
-    identity = _identity(ScenarioBank(path))
+    identity = bank_digest(ScenarioBank(path))
     if not os.access(path, os.W_OK):  # before hours of work
         raise PermissionError(f"{path}: cannot be written")
     settings = {"software": leapnav.__version__, "bank": identity, "gap": gap, "time_limit": time_limit}
@@ -101,7 +101,7 @@ def prove_bank(
         ResumableStore(path.with_name(f"{path.name}.bounds"), "bank-proof", settings, BankError) as store,
         process_pool(workers, pre_dispatch="2 * n_jobs") as pool,
     ):
-        bank = _open(path, identity)
+        bank = open_bank(path, identity)
         bank.verify_checksums()
         chosen = np.arange(len(bank) if count is None else min(count, len(bank)))
         for index in chosen.tolist():
@@ -118,17 +118,17 @@ def prove_bank(
                 found[index] = _result(bank, index, arrays)
                 advance(bar, True)
         if found:
-            bounds = _open(path, identity).lower_bounds.copy()
+            bounds = open_bank(path, identity).lower_bounds.copy()
             for index, bound in found.items():
                 bounds[index] = np.fmax(bounds[index], bound.value)
-            write_lower_bounds(path, bounds)
+            add_datasets(path, lower_bounds=bounds)
     discard(store.directory)
     return [found[index] for index in sorted(found)]
 
 
 def prove(index: int, path: Path, identity: str, gap: float, time_limit: float) -> Arrays:
     """Prove a lower bound for a scenario of a bank, as arrays of a shard; "fault" is empty if there is one."""
-    bank = _open(path, identity)
+    bank = open_bank(path, identity)
     scenario, reference = bank[index], bank.reference(index)
     try:
         bound = lower_bound(scenario, reference, gap, time_limit, threads=1)
@@ -143,7 +143,7 @@ def prove(index: int, path: Path, identity: str, gap: float, time_limit: float) 
     return {"fault": np.array(""), "numbers": np.array(numbers)}
 
 
-def _open(path: Path, identity: str) -> ScenarioBank:
+def open_bank(path: Path, identity: str) -> ScenarioBank:
     """Open the bank.
 
     Raises:
@@ -151,7 +151,7 @@ def _open(path: Path, identity: str) -> ScenarioBank:
 
     """
     bank = ScenarioBank(path)
-    if _identity(bank) != identity:
+    if bank_digest(bank) != identity:
         raise BankError(f"{path}: the file was replaced by a bank with other scenarios")
     return bank
 
@@ -165,6 +165,6 @@ def _result(bank: ScenarioBank, index: int, arrays: Arrays) -> BankBound:
     return BankBound(index, name, value, gap, seconds, check_seconds, resolution, duality_gap, "")
 
 
-def _identity(bank: ScenarioBank) -> str:
+def bank_digest(bank: ScenarioBank) -> str:
     """Return a checksum of the scenarios and their optimal costs."""
     return digest("".join(bank.checksums[name] for name in ("scenarios", "costs")).encode())

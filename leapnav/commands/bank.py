@@ -1,4 +1,4 @@
-"""`leapnav bank build|show|verify|card|prove`: scenario banks."""
+"""`leapnav bank build|show|verify|card|prove|shortest`: scenario banks."""
 
 from __future__ import annotations
 
@@ -214,8 +214,40 @@ class Prove:
 
 
 @dataclass(frozen=True)
+class Shortest:
+    """Find the shortest path and the minimum time of each scenario of a bank, and store them in the bank.
+
+    They are the denominators of SPL and SCT in `leapnav evaluate`. The same command resumes after an interruption.
+
+    Exit code 1: neither was found for a scenario, whose name is printed.
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Bank file."""
+    workers: int = os.cpu_count() or 1
+    """Number of processes."""
+    json: Path | None = None
+    """JSON file of the length (m) and the time (s) of all scenarios; "-" for standard output."""
+
+    resumption = RESUMPTION
+
+    def run(self) -> int:
+        """Search, and print the scenarios without a result."""
+        from leapnav.experts.data.bank_shortest import find_shortest
+
+        check_outputs(self.json)
+        results = find_shortest(self.file, workers=self.workers)
+        missing = [result.name for result in results if math.isnan(result.length) or math.isnan(result.time)]
+        for name in missing:
+            print(f"{name}: no shortest path or no minimum time was found")
+        print(f"wrote {self.file}; scenarios: {len(results)}")
+        write_json([asdict(result) for result in results], self.json)
+        return FAILED if missing else 0
+
+
+@dataclass(frozen=True)
 class Bank:
-    """Build and inspect scenario banks, files of scenarios with their certified optima, and prove lower bounds."""
+    """Build and inspect scenario banks, files of scenarios with their certified optima, and add bounds to them."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[Build, tyro.conf.subcommand("build")]
@@ -223,6 +255,7 @@ class Bank:
         | Annotated[Verify, tyro.conf.subcommand("verify")]
         | Annotated[Card, tyro.conf.subcommand("card")]
         | Annotated[Prove, tyro.conf.subcommand("prove")]
+        | Annotated[Shortest, tyro.conf.subcommand("shortest")]
     ]
 
 
@@ -281,6 +314,8 @@ def _print_summary(bank: ScenarioBank) -> None:
         "horizon (s)" if bank.horizon == "fixed" else "duration (s)": bank.horizons,
         "clearance (m)": bank.certificates[:, 3],
         "excess cost of the second best (%)": 100 * excess[np.isfinite(excess)],
+        "shortest length (m)": bank.shortest_lengths[np.isfinite(bank.shortest_lengths)],
+        "minimum time (s)": bank.shortest_times[np.isfinite(bank.shortest_times)],
     }
     rows = [
         (name, *(f"{value:.3g}" for value in np.percentile(values, [0, 50, 100])))

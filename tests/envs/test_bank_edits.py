@@ -14,7 +14,7 @@ from hypothesis import settings
 
 from leapnav.envs import BankError, NavigateEnv, Scenario, ScenarioBank
 from leapnav.envs.scenarios.bank import TYPES, attribute_bytes, digest
-from leapnav.envs.scenarios.bank_writing import BankEntry, write_bank, write_lower_bounds
+from leapnav.envs.scenarios.bank_writing import BankEntry, add_datasets, write_bank
 
 N_EDITS = max(150, settings.default.max_examples // 2)
 N_SCENARIOS = 3
@@ -37,7 +37,7 @@ def original(request, tmp_path_factory):
         )
     rejected = {"no certified optimum": 2}
     write_bank(path, entries, family=family, seed=1, drawn=N_SCENARIOS + 2, rejected=rejected, software="0")
-    write_lower_bounds(path, np.append(0.9 * shipped.costs[: N_SCENARIOS - 1], math.nan))
+    add_datasets(path, lower_bounds=np.append(0.9 * shipped.costs[: N_SCENARIOS - 1], math.nan))
     with h5py.File(path) as file:
         attributes = {name: value for name, value in file.attrs.items() if name != "checksums"}
         return {name: dataset[()] for name, dataset in file.items()}, attributes, ScenarioBank(path)

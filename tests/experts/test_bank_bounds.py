@@ -14,7 +14,7 @@ import pytest
 
 from leapnav.cli import main
 from leapnav.envs import BankError, NavigateEnv, NavigateVectorEnv, ScenarioBank
-from leapnav.envs.scenarios.bank_writing import write_lower_bounds
+from leapnav.envs.scenarios.bank_writing import add_datasets
 from leapnav.experts import build_bank
 from leapnav.experts.data import bank_bounds
 from leapnav.experts.data.bank_bounds import prove_bank
@@ -73,7 +73,7 @@ def test_proved_scenarios_are_skipped_and_better_bounds_replace_others(bank_file
     assert result.check_seconds > 0
     stored = ScenarioBank(bank_file).lower_bounds
     assert stored[0] == result.value
-    write_lower_bounds(bank_file, np.array([stored[0], math.nan, math.nan]))
+    add_datasets(bank_file, lower_bounds=np.array([stored[0], math.nan, math.nan]))
     prove(bank_file, gap=0.3)
     assert ScenarioBank(bank_file).lower_bounds[0] == stored[0]
 
@@ -140,7 +140,7 @@ def test_bounds_that_are_written_meanwhile_are_kept(bank_file: Path, monkeypatch
     original = bank_bounds.lower_bound
 
     def other(*arguments: Any, **options: Any) -> Any:
-        write_lower_bounds(bank_file, np.array([math.nan, 0.1, 0.1]))
+        add_datasets(bank_file, lower_bounds=np.array([math.nan, 0.1, 0.1]))
         return original(*arguments, **options)
 
     monkeypatch.setattr(bank_bounds, "lower_bound", other)
@@ -168,7 +168,7 @@ def test_finished_scenarios_are_stored_when_a_run_resumes_with_a_smaller_count(
 def test_a_link_stays_a_link_and_the_bounds_are_aligned(bank_file: Path, tmp_path: Path):
     link = tmp_path / "link.bank"
     link.symlink_to(bank_file)
-    write_lower_bounds(link, np.arange(COUNT, dtype=float))
+    add_datasets(link, lower_bounds=np.arange(COUNT, dtype=float))
     assert link.is_symlink()
     bank = ScenarioBank(bank_file)
     assert bank.lower_bounds.tolist() == [0.0, 1.0, 2.0]
@@ -202,7 +202,7 @@ def test_a_bank_of_another_robot_is_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="robot: lower bounds need a unicycle"):
         prove(path)
     with pytest.raises(ValueError, match=r"lower_bounds: expected the shape \(200,\), got \(3,\)"):
-        write_lower_bounds(path, np.zeros(3))
+        add_datasets(path, lower_bounds=np.zeros(3))
 
 
 def test_environments_report_the_bound(proved: Path):

@@ -21,6 +21,7 @@ class PlayedEpisode:
         costs (K + 1,): the cost J so far at these states.
         episode_return: the sum of the rewards.
         clearance: smallest clearance (m).
+        duration: time at the end (s).
         success, collision, truncated: the outcome.
 
     """
@@ -30,6 +31,7 @@ class PlayedEpisode:
     costs: np.ndarray
     episode_return: float
     clearance: float
+    duration: float
     success: bool
     collision: bool
     truncated: bool
@@ -72,6 +74,7 @@ def play_episodes(
                 costs=np.array([row[i] for row in costs]),
                 episode_return=float(returns[i]),
                 clearance=float(clearances[i]),
+                duration=float(last["time"][i]),
                 success=bool(last["is_success"][i]),
                 collision=bool(last["collision"][i]),
                 truncated=bool(truncated[i]),

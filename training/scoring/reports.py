@@ -31,8 +31,10 @@ COLUMNS = (
     ("success\n%", "success", 100, 1, 0),
     ("collision\n%", "collision", 100, 1, 0),
     ("SOC\n", "soc", 1, 3, 2),
-    ("SOC\nIQM", "soc_iqm", 1, 3, 2),
+    ("SPL\n", "spl", 1, 3, 2),
+    ("SCT\n", "sct", 1, 3, 2),
     ("regret\n%, median", "regret", 100, 2, 2),
+    ("SOC\nIQM", "soc_iqm", 1, 3, 2),
     ("clearance\nm, median", "clearance", 1, 2, 2),
 )
 NEGATIVE_REGRET = (
@@ -40,7 +42,7 @@ NEGATIVE_REGRET = (
     "violates the unicycle model, for which the optimum is computed; otherwise the search has missed a better path."
 )
 MARKDOWN_COLUMNS = ("success", "collision", "soc", "regret")  # attributes of `Score` in the tables of the documentation
-N_TERMINAL_COLUMNS = 5  # columns that fit into the 80 characters of a terminal; the other outputs have all
+N_TERMINAL_COLUMNS = 6  # columns that fit into the 80 characters of a terminal; the other outputs have all
 
 
 def print_scores(comparison: Comparison) -> None:

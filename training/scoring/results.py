@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from leapnav.envs.scenarios.bank import LOWER_BOUNDS, ScenarioBank, digest
+from leapnav.envs.scenarios.bank import ADDED, ScenarioBank, digest
 from leapnav.envs.settings import EnvironmentSettings
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ class Episode:
         costs (K + 1,): the cost J so far at these states.
         lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
         truncated: whether the time limit of a free horizon ended the episode, without a penalty for the missed goal.
+        duration: of the episode (s).
+        shortest_length: length (m) of the shortest path of the scenario without contact; NaN if it is not known.
+        shortest_time: minimum time (s) of the scenario without contact; NaN if it is not known.
 
     """
 
@@ -59,6 +62,35 @@ class Episode:
     costs: np.ndarray
     lower_bound: float = math.nan
     truncated: bool = False
+    duration: float = math.nan
+    shortest_length: float = math.nan
+    shortest_time: float = math.nan
+
+    @property
+    def length(self) -> float:
+        """Length (m) of the path of the robot's position."""
+        return float(np.hypot(*np.diff(self.states[:, :2], axis=0).T).sum())
+
+    @property
+    def spl(self) -> float:
+        """Success weighted by path length: S l / max(p, l), with the length p and the shortest length l.
+
+        P. Anderson et al., On evaluation of embodied navigation agents, 2018. NaN if the shortest length is not known.
+        """
+        return self._weighted(self.shortest_length, self.length)
+
+    @property
+    def sct(self) -> float:
+        """Success weighted by completion time: S T* / max(T, T*), with the duration T and the minimum time T*.
+
+        N. Yokoyama, S. Ha, D. Batra, Success weighted by completion time, 2021. NaN if the minimum time is not known.
+        """
+        return self._weighted(self.shortest_time, self.duration)
+
+    def _weighted(self, least: float, value: float) -> float:
+        if math.isnan(least):
+            return math.nan
+        return least / max(value, least) if self.success and least > 0.0 else float(self.success)
 
     @property
     def optimal_cost(self) -> float:
@@ -103,17 +135,18 @@ class Episode:
         return self.cost / self.reference_cost - 1.0, high
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes without the states and their costs, and SOC and regret."""
+        """Return the attributes without the states and their costs, and SOC, SPL, SCT, length and regret."""
         record = {name: value for name, value in vars(self).items() if name not in _UNLISTED}
-        return {**record, "return": self.episode_return, "soc": self.soc, "regret": self.regret}
+        derived = {name: getattr(self, name) for name in ("soc", "spl", "sct", "length", "regret")}
+        return {**record, "return": self.episode_return, **derived}
 
 
 def bank_identity(bank: ScenarioBank) -> str:
     """Return a digest of the scenarios and the optima of a bank, by which banks of one family are distinguished.
 
-    It depends neither on the path of the file nor on proved lower bounds, which can be added later.
+    It depends neither on the path of the file nor on datasets that can be added later.
     """
-    content = {name: value for name, value in bank.checksums.items() if name not in (LOWER_BOUNDS, "attributes")}
+    content = {name: value for name, value in bank.checksums.items() if name not in (*ADDED, "attributes")}
     return digest(json.dumps(content, sort_keys=True).encode())
 
 

@@ -65,6 +65,8 @@ class Score:
         episodes: number of episodes of each run.
         success, collision: success and collision rates.
         soc: mean success weighted by optimal cost.
+        spl, sct: mean success weighted by path length and by completion time, see `Episode`; NaN if not all scenarios
+            have the shortest length and the minimum time.
         soc_iqm: interquartile mean of the success weighted by optimal cost, over runs and scenarios.
         regret: median regret of the successful episodes.
         clearance: median over the episodes of the minimum clearance (m).
@@ -80,6 +82,8 @@ class Score:
     success: Interval
     collision: Interval
     soc: Interval
+    spl: Interval
+    sct: Interval
     soc_iqm: Interval
     regret: Interval
     clearance: Interval
@@ -94,7 +98,7 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
     The intervals refer to other scenarios of the same banks and, with several runs, to other seeds of the training:
 
     - With one run, those of rates are Wilson intervals, and the others are percentiles of a bootstrap that resamples
-      the scenarios within their banks. An SOC of 0 or 1 in all episodes has the interval of a rate.
+      the scenarios within their banks. An SOC, SPL or SCT of 0 or 1 in all episodes has the interval of a rate.
     - With several runs, they contain the variance between runs and that between scenarios, and use the t distribution;
       with two or three runs they are wide.
 
@@ -122,20 +126,29 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
     def interval(attribute: Callable[..., float], statistic: Statistic = _mean) -> Interval:
         return _interval(values_of(attribute), banks, statistic, rng)
 
-    soc = values_of(lambda e: e.soc)
+    def weighted(attribute: Callable[..., float]) -> Interval:
+        values = values_of(attribute)
+        if np.isnan(values).any():
+            return Interval(math.nan, math.nan, math.nan)
+        if set(values.flat) in ({0.0}, {1.0}):
+            return _rate(values, banks)
+        return _within_unit(_interval(values, banks, _mean, rng))
+
     return Score(
         policy=name,
         runs=len(evaluations),
         episodes=len(scenarios[0]),
         success=_rate(values_of(lambda e: e.success), banks),
         collision=_rate(values_of(lambda e: e.collision), banks),
-        soc=_rate(soc, banks) if set(soc.flat) in ({0.0}, {1.0}) else _within_unit(interval(lambda e: e.soc)),
+        soc=weighted(lambda e: e.soc),
         soc_iqm=_within_unit(interval(lambda e: e.soc, _interquartile_mean)),
         regret=interval(lambda e: e.regret if e.success else math.nan, _median),
         clearance=interval(lambda e: e.clearance, _median),
         mean_return=interval(lambda e: e.episode_return),
         milliseconds=float(np.mean([evaluation.milliseconds for evaluation in evaluations])),
         true_regret=_bracket(evaluations),
+        spl=weighted(lambda e: e.spl),
+        sct=weighted(lambda e: e.sct),
     )
 
 

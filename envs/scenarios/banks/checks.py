@@ -95,7 +95,7 @@ def check_values(arrays: Mapping[str, np.ndarray], drawn: int) -> None:
     """Check the numbers of each optimum, and their relations.
 
     Args:
-        arrays: the datasets by name; `lower_bounds` is optional.
+        arrays: the datasets by name; those of `ADDED` in `leapnav.envs.scenarios.bank` are optional.
         drawn: number of scenarios drawn.
 
     Raises:
@@ -112,6 +112,9 @@ def check_values(arrays: Mapping[str, np.ndarray], drawn: int) -> None:
     if (bounds := arrays.get("lower_bounds")) is not None:
         is_bound = np.isfinite(bounds) & (bounds <= costs * (1 + ROUNDING))
         _check("lower_bounds", "NaN or numbers of at most the cost", np.isnan(bounds) | is_bound, bounds)
+    for name in ("shortest_lengths", "shortest_times"):
+        if (values := arrays.get(name)) is not None:
+            _check(name, "NaN or finite numbers >= 0", np.isnan(values) | (np.isfinite(values) & (values >= 0)), values)
     certificates = arrays["certificates"]
     if certificates.shape[1] != 4:
         raise ValueError(f"certificates: expected 4 columns, got {certificates.shape[1]}")
