@@ -8,6 +8,7 @@ Optimal Control, 1975, sections 3.9 and 8.3).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -16,18 +17,28 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.shapes.clearance import path_clearance
 from leapnav.envs.utils.validation import check_positive
 from leapnav.experts.continuation import continuation
-from leapnav.experts.hard_limits import follow_limit, without_barrier
+from leapnav.experts.hard_limits import follow_limit, softened, without_barrier
+from leapnav.experts.numerics.state_bounds import state_margin
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
-from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
+from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
 from leapnav.experts.solve import Method, solve
 from leapnav.experts.solvers.initial_paths import initial_paths
+from leapnav.experts.solvers.piecewise import piecewise_paths
+from leapnav.experts.transcription.direct import DirectPath, mean_running_cost, optimise
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
+START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
 METHODS: tuple[Method, ...] = ("multiple_shooting", "collocation")  # in this order; the others fail where these do
+# Intervals of the transcription of a path of few pieces, its duration relative to that of the path, which leaves time
+# for smooth transitions, and segments of the following multiple shooting.
+INTERVALS, LENGTHENING, SEGMENTS, MIN_SEGMENTS = 64, 1.02, 32, 8
+MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
+SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
 
@@ -85,19 +96,33 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
         raise ValueError(f"control_bounds: expected finite numbers, got {ocp.control_bounds!r}")
     weights = list(_weights(tol, len(bounds)))
     problems = [_with_weight(ocp, bounds, weight) for weight in weights]
-    followed = [_follow(start, problems) for start in _first(problem, problems[0])]
-    ends = [end for end in followed if end.solved]
-    if not ends:
-        raise SolveError(followed[0].extremal, problem.name if isinstance(problem, Scenario) else "")
     has_state_cost = ocp.field is not None or ocp.state_cost != 0 or ocp.has_hard_limits
-    if has_state_cost:  # the durations alone do not rank the paths, and the control costs have different weights
-        best = min(ends, key=lambda end: _cost_without_controls(end.extremal))
-    else:
-        best = min(ends, key=lambda end: end.extremal.horizon)
+    # With a state cost the durations alone do not rank the paths, and the control costs have different weights.
+    cost = _cost_without_controls if has_state_cost else (lambda extremal: extremal.horizon)
+    starts = sorted(_starts(problem, problems), key=lambda start: _lowest_limit(start.extremal))
+    ends, failed = [], None
+    for start in starts[:MAX_PATHS]:
+        best_cost = min((cost(end.extremal) for end in ends), default=math.inf)
+        end = _follow(start, problems, best_cost)
+        if end.solved:
+            ends.append(end)
+        else:
+            failed = failed or end.extremal
+    if not ends:
+        assert failed is not None
+        raise SolveError(failed, problem.name if isinstance(problem, Scenario) else "")
+    best = min(ends, key=lambda end: cost(end.extremal))
     tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
     lower_bound = np.nan if has_state_cost else best.extremal.cost / (1.0 + tolerance)
     structure = switching_structure(best.extremal, bounds)
     return MinimumTime(best.extremal, best.extremal.horizon, tolerance, lower_bound, *structure)
+
+
+class _Start(NamedTuple):
+    """An extremal from which a continuation starts, and the number of problems that it need not solve any more."""
+
+    extremal: Extremal
+    solved: int
 
 
 class _End(NamedTuple):
@@ -129,37 +154,121 @@ def _with_weight(problem: OptimalControlProblem, bounds: np.ndarray, weight: flo
     return replace(problem, horizon=None, time_weight=1.0, control_weight=control_weight)
 
 
-def _first(given: OptimalControlProblem | Scenario, problem: OptimalControlProblem) -> Sequence[Extremal]:
-    """Return the extremals from which the continuations start, or a failure; those of a scenario have its weights."""
-    if not isinstance(given, Scenario):
-        starts = islice(initial_paths(problem), MAX_PATHS)
-        found = [solve(wound, "multiple_shooting", guess=path) for wound, path in starts]
-        return [extremal for extremal in found if extremal.success] or [solve(problem)]
-    free = given.model_copy(update={"horizon": None, "cost": given.cost.model_copy(update={"time_weight": 1.0})})
-    optimum = find_optimum(free)
-    return [optimum, *optimum.alternatives][:MAX_PATHS]
+def _starts(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalControlProblem]) -> list[_Start]:
+    """Return the distinct extremals from which the continuations start, or a failure."""
+    starts: list[_Start] = []
+
+    def add(extremal: Extremal, solved: int) -> None:
+        if extremal.success and not any(solved == s.solved and _is_same(extremal, s.extremal) for s in starts):
+            starts.append(_Start(extremal, solved))
+
+    if isinstance(given, Scenario):
+        free = given.model_copy(update={"horizon": None, "cost": given.cost.model_copy(update={"time_weight": 1.0})})
+        optimum = find_optimum(free)
+        for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]:
+            add(extremal, 0)
+        failed = optimum
+    else:
+        for wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
+            add(solve(wound, "multiple_shooting", guess=path), 1)
+        failed = None
+    for path in piecewise_paths(problems[0]):
+        direct = path.path(INTERVALS, LENGTHENING)
+        if not _is_free(problems[0], direct.states):
+            continue
+        for index in START_ORDER:
+            if index < len(problems):
+                extremal = _transcribed(problems[index].with_winding_of(direct.states), direct)
+                if extremal is not None:
+                    add(extremal, index + 1)
+                    break
+    return starts or [_Start(failed or solve(problems[0]), 0)]
 
 
-def _follow(start: Extremal, problems: Sequence[OptimalControlProblem]) -> _End:
-    """Solve the problems one after the other, up to the first that no method solves, with the winding of the start.
+def _is_same(extremal: Extremal, other: Extremal) -> bool:
+    """Return whether two extremals of the same control weights are one, or mirror images."""
+    return abs(extremal.cost - other.cost) <= SAME_COST * abs(other.cost)
 
-    With hard limits, all have the barrier weight of the start.
+
+def _is_free(problem: OptimalControlProblem, states: np.ndarray) -> bool:
+    """Return whether a path (N, n) is within the limits of the states and not in contact with an obstacle."""
+    if state_margin(problem.state_limits, states) <= 0:
+        return False
+    if problem.field is None or problem.system.position is None:
+        return True
+    at = [problem.system.state.index(symbol) for symbol in problem.system.position]
+    heading = problem.system.heading
+    headings = np.zeros(len(states)) if heading is None else states[:, problem.system.state.index(heading)]
+    poses = np.column_stack([states[:, at], headings])
+    return path_clearance(np.ascontiguousarray(poses), problem.outline, problem.field) > 0
+
+
+def _transcribed(problem: OptimalControlProblem, guess: DirectPath) -> Extremal | None:
+    """Return the extremal close to the local optimum of the discretised problem in the time of a guess."""
+    energy = mean_running_cost(problem, Trajectory(guess.times, guess.states))
+    fixed = softened(problem, energy).with_horizon(float(guess.times[-1]))
+    path = optimise(fixed, guess)
+    if not path.violation < MAX_VIOLATION:
+        return None
+    trajectory = Trajectory(path.times, path.states, path.costates)
+    extremal = solve(problem, "multiple_shooting", trajectory, segments=SEGMENTS)
+    return extremal if extremal.success else None
+
+
+def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: float) -> _End:
+    """Solve the remaining problems one after the other, up to the first that no method solves.
+
+    They have the winding of the start and, with hard limits, its barrier weight. The continuation ends early, without
+    a solved problem, if its limit costs more than `best`.
     """
-    if not start.success:
-        return _End(start, 0)
-    barrier = start.problem.barrier_weight
-    remaining = [replace(problem, goal=start.problem.goal, barrier_weight=barrier) for problem in problems]
-    extremal, failed = start, start
-    for method in METHODS:
-        # The problem of the guess is the first of the sequence, so that the step control applies to the second.
-        _, *found = continuation([extremal.problem, *remaining], method, guess=extremal)
-        solved = [one for one in found if one.success]
-        extremal, failed = (solved or [extremal])[-1], (found or [start])[-1]
-        remaining = remaining[len(solved) :]
-        if not remaining:
+    extremal, count = start
+    if not extremal.success:
+        return _End(extremal, 0)
+    barrier, failed = extremal.problem.barrier_weight, extremal
+    for problem in problems[count:]:
+        if _lowest_limit(extremal) > best:
+            return _End(extremal, 0)
+        found = _step(extremal, replace(problem, goal=extremal.problem.goal, barrier_weight=barrier))
+        if not found.success:
+            failed = found
             break
-    count = len(problems) - len(remaining)
+        extremal, count = found, count + 1
     return _End(_limit(extremal) if count else failed, count)
+
+
+def _lowest_limit(extremal: Extremal) -> float:
+    """Return a lower bound of the cost in the limit of small control weights; 0 with hard limits.
+
+    The derivative of the cost with respect to r is the control cost divided by r, which is at most m / 2 times the
+    cost. A barrier reduces the cost as its weight decreases, too.
+    """
+    problem = extremal.problem
+    if problem.has_hard_limits or problem.control_bounds is None:
+        return 0.0
+    largest = np.abs(np.array(problem.control_bounds)).max(axis=1) ** 2
+    return extremal.cost * math.exp(-0.5 * float(np.array(problem.control_weight) @ largest))
+
+
+def _step(extremal: Extremal, problem: OptimalControlProblem) -> Extremal:
+    """Solve a problem from the extremal of a similar one, and where Newton's method stalls, from a new transcription.
+
+    The last resort are intermediate problems, and collocation.
+    """
+    found = solve(problem, "multiple_shooting", extremal, segments=max(extremal.n_nodes - 1, MIN_SEGMENTS))
+    if found.success:
+        return found
+    times = np.linspace(0.0, extremal.horizon, 2 * INTERVALS + 1)
+    states = extremal.evaluate(times)[0]
+    controls = extremal.evaluate(0.5 * (times[1:] + times[:-1]))[1]
+    guess = DirectPath(times, states, controls, np.zeros_like(states), math.inf, math.inf, False)
+    again = _transcribed(problem, guess)
+    if again is not None:
+        return again
+    for method in METHODS:
+        *_, last = continuation([extremal.problem, problem], method, guess=extremal)
+        if last.success and last.problem.control_weight == problem.control_weight:
+            return last
+    return found
 
 
 def _limit(extremal: Extremal) -> Extremal:
