@@ -27,16 +27,18 @@ from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
 from leapnav.experts.solve import Method, solve
 from leapnav.experts.solvers.initial_paths import initial_paths
-from leapnav.experts.solvers.piecewise import piecewise_paths
+from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths
 from leapnav.experts.transcription.direct import DirectPath, mean_running_cost, optimise
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
 METHODS: tuple[Method, ...] = ("multiple_shooting", "collocation")  # in this order; the others fail where these do
-# Intervals of the transcription of a path of few pieces, its duration relative to that of the path, which leaves time
-# for smooth transitions, and segments of the following multiple shooting.
-INTERVALS, LENGTHENING, SEGMENTS, MIN_SEGMENTS = 64, 1.02, 32, 8
+# Intervals of the transcription of a path of few pieces, and segments of the following multiple shooting.
+INTERVALS, SEGMENTS, MIN_SEGMENTS = 64, 32, 8
+# Duration of the transcription relative to that of the path: more time makes smooth transitions possible, but a robot
+# that cannot slow down may not reach the goal in more time.
+LENGTHENINGS = (1.02, 1.005, 1.0)
 MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
 SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
@@ -96,7 +98,7 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
         raise ValueError(f"control_bounds: expected finite numbers, got {ocp.control_bounds!r}")
     weights = list(_weights(tol, len(bounds)))
     problems = [_with_weight(ocp, bounds, weight) for weight in weights]
-    has_state_cost = ocp.field is not None or ocp.state_cost != 0 or ocp.has_hard_limits
+    has_state_cost = _has_state_cost(ocp)
     # With a state cost the durations alone do not rank the paths, and the control costs have different weights.
     cost = _cost_without_controls if has_state_cost else (lambda extremal: extremal.horizon)
     starts = sorted(_starts(problem, problems), key=lambda start: _lowest_limit(start.extremal))
@@ -132,6 +134,11 @@ class _End(NamedTuple):
     solved: int
 
 
+def _has_state_cost(problem: OptimalControlProblem) -> bool:
+    """Return whether the cost of a problem contains more than the time and the controls."""
+    return problem.field is not None or problem.state_cost != 0 or problem.has_hard_limits
+
+
 def _cost_without_controls(extremal: Extremal) -> float:
     """Return the time plus the integral of the state cost and the proximity cost."""
     times = np.linspace(0.0, extremal.horizon, POINTS)
@@ -162,27 +169,35 @@ def _starts(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalC
         if extremal.success and not any(solved == s.solved and _is_same(extremal, s.extremal) for s in starts):
             starts.append(_Start(extremal, solved))
 
+    for path in piecewise_paths(problems[0]):
+        found = _first(path, problems)
+        if found is not None:
+            add(*found)
     if isinstance(given, Scenario):
         free = given.model_copy(update={"horizon": None, "cost": given.cost.model_copy(update={"time_weight": 1.0})})
         optimum = find_optimum(free)
         for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]:
             add(extremal, 0)
-        failed = optimum
-    else:
+        return starts or [_Start(optimum, 0)]
+    if not starts or _has_state_cost(problems[0]):
         for wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
             add(solve(wound, "multiple_shooting", guess=path), 1)
-        failed = None
-    for path in piecewise_paths(problems[0]):
-        direct = path.path(INTERVALS, LENGTHENING)
-        if not _is_free(problems[0], direct.states):
+    return starts or [_Start(solve(problems[0]), 0)]
+
+
+def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _Start | None:
+    """Return the first extremal close to a path of few pieces, and the number of problems before the next one."""
+    for index in START_ORDER:
+        if index >= len(problems):
             continue
-        for index in START_ORDER:
-            if index < len(problems):
-                extremal = _transcribed(problems[index].with_winding_of(direct.states), direct)
-                if extremal is not None:
-                    add(extremal, index + 1)
-                    break
-    return starts or [_Start(failed or solve(problems[0]), 0)]
+        for lengthening in LENGTHENINGS:
+            direct = path.path(INTERVALS, lengthening)
+            if not _is_free(problems[0], direct.states):
+                return None
+            extremal = _transcribed(problems[index].with_winding_of(direct.states), direct)
+            if extremal is not None:
+                return _Start(extremal, index + 1)
+    return None
 
 
 def _is_same(extremal: Extremal, other: Extremal) -> bool:

@@ -25,18 +25,19 @@ from leapnav.experts.transcription.direct import DirectPath
 from leapnav.experts.transcription.discrete_problem import roll_out
 
 PIECES = 5  # as many as an optimal path of Reeds and Shepp's car
-WORDS = 200  # random sequences per scale of the time
+WORDS = 100  # random sequences per scale of the time
 SUBSTEPS = 16  # of the midpoint rule per piece
 POINTS = 24  # of a path per piece
 # Scales of the time (s), powers of two, of which the smallest ones are skipped while the goal is out of reach; and the
 # number of scales after the first with a path.
-MIN_SCALE, MAX_SCALE, MORE_SCALES = -20, 24, 2
+MIN_SCALE, MAX_SCALE, MORE_SCALES = -20, 24, 1
 MAX_STEPS = 60
+FIRST_STEPS, MAX_FIRST_RESIDUAL, MAX_FIRST_TIME = 8, 0.1, 1.5
 # Residual relative to the scales of the states at which a path ends at the goal, and the decrease of the total time,
 # relative to it, at which its durations are optimal.
 MAX_RESIDUAL, MIN_DECREASE = 1e-4, 1e-5
 OUT_OF_REACH = 5.0  # distance of the goal in standard deviations of the ends of random sequences
-GENERATIONS, VARIATIONS, PARENTS = 3, 80, 8  # of the best sequences
+GENERATIONS, VARIATIONS, PARENTS = 4, 60, 8  # of the best sequences
 INSERTED = 0.1  # mean duration of an inserted piece, relative to the total time
 MAX_PATHS = 8
 PENALTY = 10.0  # of the residual, relative to the total time
@@ -140,11 +141,11 @@ def _correction(jacobian, residual, durations, shortening, change):
             return
 
 
-@kernel(tuple_of(float64, float64)(STEP_FUNCTION, CONSTANT, VECTOR, VECTOR, FLAGS, FLAGS, VECTOR, MATRIX, VECTOR))
-def shorten(step, data, start, goal, free, winds, scales, controls, durations):
+@kernel(tuple_of(float64, float64)(STEP_FUNCTION, CONSTANT, VECTOR, VECTOR, FLAGS, FLAGS, VECTOR, MATRIX, VECTOR, float64))
+def shorten(step, data, start, goal, free, winds, scales, controls, durations, limit):
     """Change the durations of the pieces in place, so that they end at the goal after a short time.
 
-    Returns the residual and the total time.
+    Gives up after the first steps if the time is above `limit`. Returns the residual and the total time.
     """
     n, count = len(start), len(durations)
     end, moved, residual, changed = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
@@ -190,7 +191,7 @@ def shorten(step, data, start, goal, free, winds, scales, controls, durations):
             factor = min(2.0 * factor, 0.4)
         if norm < 0.1 * MAX_RESIDUAL and abs(decrease) < MIN_DECREASE * total:
             break
-        if iteration == 12 and norm > 0.1:
+        if iteration == FIRST_STEPS and (norm > MAX_FIRST_RESIDUAL or durations.sum() > limit):
             break
     return norm, durations.sum()
 
@@ -270,9 +271,9 @@ class _Search:
         """Add the path of a sequence, if it ends at the goal."""
         arrays = self.problem.arrays
         step = self.problem.compiled_dynamics.step
-        residual, time = shorten(
-            step, arrays.data, arrays.start, arrays.goal, arrays.free, self._winds, self._scales, controls, durations
-        )
+        limit = MAX_FIRST_TIME * min((found[0] for found in self.found), default=math.inf)
+        ends = arrays.start, arrays.goal, arrays.free
+        residual, time = shorten(step, arrays.data, *ends, self._winds, self._scales, controls, durations, limit)
         if residual < MAX_RESIDUAL and time > 0.0:
             self.found.append((time, durations, controls))
 
