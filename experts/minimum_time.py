@@ -33,13 +33,13 @@ from leapnav.experts.transcription.direct import DirectPath, mean_running_cost, 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
-METHODS: tuple[Method, ...] = ("multiple_shooting", "collocation")  # in this order; the others fail where these do
 # Intervals of the transcription of a path of few pieces, and segments of the following multiple shooting.
 INTERVALS, SEGMENTS, MIN_SEGMENTS = 64, 32, 8
 # Duration of the transcription relative to that of the path: more time makes smooth transitions possible, but a robot
 # that cannot slow down may not reach the goal in more time.
 LENGTHENINGS = (1.02, 1.005, 1.0)
 MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
+UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
 SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
@@ -99,25 +99,14 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
     weights = list(_weights(tol, len(bounds)))
     problems = [_with_weight(ocp, bounds, weight) for weight in weights]
     has_state_cost = _has_state_cost(ocp)
-    # With a state cost the durations alone do not rank the paths, and the control costs have different weights.
-    cost = _cost_without_controls if has_state_cost else (lambda extremal: extremal.horizon)
-    starts = sorted(_starts(problem, problems), key=lambda start: _lowest_limit(start.extremal))
-    ends, failed = [], None
-    for start in starts[:MAX_PATHS]:
-        best_cost = min((cost(end.extremal) for end in ends), default=math.inf)
-        end = _follow(start, problems, best_cost)
-        if end.solved:
-            ends.append(end)
-        else:
-            failed = failed or end.extremal
-    if not ends:
-        assert failed is not None
-        raise SolveError(failed, problem.name if isinstance(problem, Scenario) else "")
-    best = min(ends, key=lambda end: cost(end.extremal))
+    ends = _ends(problem, problems, tol)
+    if not ends[0].solved:
+        raise SolveError(ends[0].limit, problem.name if isinstance(problem, Scenario) else "")
+    best = _finish(min(ends, key=_limit_cost), problems)
     tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
-    lower_bound = np.nan if has_state_cost else best.extremal.cost / (1.0 + tolerance)
-    structure = switching_structure(best.extremal, bounds)
-    return MinimumTime(best.extremal, best.extremal.horizon, tolerance, lower_bound, *structure)
+    extremal = best.limit
+    lower_bound = np.nan if has_state_cost else extremal.cost / (1.0 + tolerance)
+    return MinimumTime(extremal, extremal.horizon, tolerance, lower_bound, *switching_structure(extremal, bounds))
 
 
 class _Start(NamedTuple):
@@ -128,10 +117,63 @@ class _Start(NamedTuple):
 
 
 class _End(NamedTuple):
-    """The end of a continuation: the extremal of the last of the `solved` problems, or the failure of the first."""
+    """The end of a continuation.
+
+    Attributes:
+        extremal: the extremal of the last of the solved problems, or the failure of the first.
+        solved: their number.
+        limit: with hard limits, the extremal close to their limit; otherwise `extremal`.
+
+    """
 
     extremal: Extremal
     solved: int
+    limit: Extremal
+
+
+def _ends(
+    given: OptimalControlProblem | Scenario, problems: Sequence[OptimalControlProblem], tol: float
+) -> list[_End]:
+    """Return the ends of the continuations from several extremals; a failure if there is none."""
+    found: list[_End] = []
+    failed: Extremal | None = None
+
+    def follow(starts: Sequence[_Start]) -> None:
+        nonlocal failed
+        for start in sorted(starts, key=lambda start: _lowest_limit(start.extremal))[:MAX_PATHS]:
+            end = _follow(start, problems, min(map(_limit_cost, found), default=math.inf))
+            if end.solved:
+                found.append(end)
+            else:
+                failed = failed or end.extremal
+
+    if isinstance(given, Scenario):
+        optimum = find_optimum(_with_free_horizon(given))
+        follow([_Start(extremal, 0) for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]])
+        # The lattice is accurate for a robot that rotates in place.
+        if not found or not given.robot.lattice_moves(*UNIT_LATTICE).rotating:
+            best = min(map(_limit_cost, found), default=math.inf)
+            follow(_from_pieces(problems, best * (1.0 - tol)))
+    else:
+        follow(_starts(problems))
+    if not found:
+        failed = failed or solve(problems[0])
+        found.append(_End(failed, 0, failed))
+    return found
+
+
+def _with_free_horizon(scenario: Scenario) -> Scenario:
+    """Return the scenario with a free horizon and the time weight 1."""
+    return scenario.model_copy(update={"horizon": None, "cost": scenario.cost.model_copy(update={"time_weight": 1.0})})
+
+
+def _limit_cost(end: _End) -> float:
+    """Return the time, or with a state cost the time plus its integral.
+
+    Then the durations alone do not rank the paths, and the control costs have different weights.
+    """
+    extremal = end.limit
+    return _cost_without_controls(extremal) if _has_state_cost(extremal.problem) else extremal.horizon
 
 
 def _has_state_cost(problem: OptimalControlProblem) -> bool:
@@ -161,28 +203,35 @@ def _with_weight(problem: OptimalControlProblem, bounds: np.ndarray, weight: flo
     return replace(problem, horizon=None, time_weight=1.0, control_weight=control_weight)
 
 
-def _starts(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalControlProblem]) -> list[_Start]:
-    """Return the distinct extremals from which the continuations start, or a failure."""
-    starts: list[_Start] = []
-
-    def add(extremal: Extremal, solved: int) -> None:
-        if extremal.success and not any(solved == s.solved and _is_same(extremal, s.extremal) for s in starts):
-            starts.append(_Start(extremal, solved))
-
-    for path in piecewise_paths(problems[0]):
-        found = _first(path, problems)
-        if found is not None:
-            add(*found)
-    if isinstance(given, Scenario):
-        free = given.model_copy(update={"horizon": None, "cost": given.cost.model_copy(update={"time_weight": 1.0})})
-        optimum = find_optimum(free)
-        for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]:
-            add(extremal, 0)
-        return starts or [_Start(optimum, 0)]
+def _starts(problems: Sequence[OptimalControlProblem]) -> list[_Start]:
+    """Return the distinct extremals from which the continuations start."""
+    starts = _from_pieces(problems)
     if not starts or _has_state_cost(problems[0]):
         for wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
-            add(solve(wound, "multiple_shooting", guess=path), 1)
-    return starts or [_Start(solve(problems[0]), 0)]
+            _add(starts, _Start(solve(wound, "multiple_shooting", guess=path), 1))
+    return starts
+
+
+def _from_pieces(problems: Sequence[OptimalControlProblem], max_time: float = math.inf) -> list[_Start]:
+    """Return the distinct extremals close to paths of few pieces that take at most a given time (s)."""
+    starts: list[_Start] = []
+    for path in piecewise_paths(problems[0]):
+        found = _first(path, problems) if path.time < max_time else None
+        if found is not None:
+            _add(starts, found)
+    return starts
+
+
+def _add(starts: list[_Start], start: _Start) -> None:
+    """Add a start, unless it is a failure or an extremal that is known."""
+    extremal, solved = start
+    if extremal.success and not any(solved == one.solved and _is_same(extremal, one.extremal) for one in starts):
+        starts.append(start)
+
+
+def _is_same(extremal: Extremal, other: Extremal) -> bool:
+    """Return whether two extremals of the same control weights are one, or mirror images."""
+    return abs(extremal.cost - other.cost) <= SAME_COST * abs(other.cost)
 
 
 def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _Start | None:
@@ -198,11 +247,6 @@ def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _S
             if extremal is not None:
                 return _Start(extremal, index + 1)
     return None
-
-
-def _is_same(extremal: Extremal, other: Extremal) -> bool:
-    """Return whether two extremals of the same control weights are one, or mirror images."""
-    return abs(extremal.cost - other.cost) <= SAME_COST * abs(other.cost)
 
 
 def _is_free(problem: OptimalControlProblem, states: np.ndarray) -> bool:
@@ -238,17 +282,28 @@ def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: floa
     """
     extremal, count = start
     if not extremal.success:
-        return _End(extremal, 0)
+        return _End(extremal, 0, extremal)
     barrier, failed = extremal.problem.barrier_weight, extremal
     for problem in problems[count:]:
         if _lowest_limit(extremal) > best:
-            return _End(extremal, 0)
+            return _End(extremal, 0, extremal)
         found = _step(extremal, replace(problem, goal=extremal.problem.goal, barrier_weight=barrier))
         if not found.success:
             failed = found
             break
         extremal, count = found, count + 1
-    return _End(_limit(extremal) if count else failed, count)
+    return _End(extremal, count, _limit(extremal)) if count else _End(failed, 0, failed)
+
+
+def _finish(end: _End, problems: Sequence[OptimalControlProblem]) -> _End:
+    """Solve further problems by collocation, from the last one that multiple shooting has solved."""
+    extremal, count, _ = end
+    for problem in problems[count:]:
+        found = _continue(extremal, replace(problem, goal=extremal.problem.goal), "collocation")
+        if found is None:
+            break
+        extremal, count = found, count + 1
+    return _End(extremal, count, _limit(extremal)) if count > end.solved else end
 
 
 def _lowest_limit(extremal: Extremal) -> float:
@@ -267,9 +322,10 @@ def _lowest_limit(extremal: Extremal) -> float:
 def _step(extremal: Extremal, problem: OptimalControlProblem) -> Extremal:
     """Solve a problem from the extremal of a similar one, and where Newton's method stalls, from a new transcription.
 
-    The last resort are intermediate problems, and collocation.
+    The last resort are intermediate control weights and shorter segments.
     """
-    found = solve(problem, "multiple_shooting", extremal, segments=max(extremal.n_nodes - 1, MIN_SEGMENTS))
+    segments = max(extremal.n_nodes - 1, MIN_SEGMENTS)
+    found = solve(problem, "multiple_shooting", extremal, segments=segments)
     if found.success:
         return found
     times = np.linspace(0.0, extremal.horizon, 2 * INTERVALS + 1)
@@ -279,11 +335,13 @@ def _step(extremal: Extremal, problem: OptimalControlProblem) -> Extremal:
     again = _transcribed(problem, guess)
     if again is not None:
         return again
-    for method in METHODS:
-        *_, last = continuation([extremal.problem, problem], method, guess=extremal)
-        if last.success and last.problem.control_weight == problem.control_weight:
-            return last
-    return found
+    return _continue(extremal, problem, "multiple_shooting") or found
+
+
+def _continue(extremal: Extremal, problem: OptimalControlProblem, method: Method) -> Extremal | None:
+    """Solve a problem from the extremal of a similar one, by way of intermediate problems if necessary."""
+    *_, last = continuation([extremal.problem, problem], method, guess=extremal)
+    return last if last.success and last.problem.control_weight == problem.control_weight else None
 
 
 def _limit(extremal: Extremal) -> Extremal:

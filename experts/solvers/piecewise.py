@@ -14,7 +14,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64
+from numba import boolean, float64
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, FLAGS, MATRIX, NOTHING, VECTOR, tuple_of
@@ -141,7 +141,11 @@ def _correction(jacobian, residual, durations, shortening, change):
             return
 
 
-@kernel(tuple_of(float64, float64)(STEP_FUNCTION, CONSTANT, VECTOR, VECTOR, FLAGS, FLAGS, VECTOR, MATRIX, VECTOR, float64))
+@kernel(
+    tuple_of(float64, float64)(
+        STEP_FUNCTION, CONSTANT, VECTOR, VECTOR, FLAGS, FLAGS, VECTOR, MATRIX, VECTOR, float64
+    )
+)
 def shorten(step, data, start, goal, free, winds, scales, controls, durations, limit):
     """Change the durations of the pieces in place, so that they end at the goal after a short time.
 
