@@ -17,28 +17,22 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import path_clearance
 from leapnav.envs.utils.validation import check_positive
-from leapnav.experts.continuation import continuation
-from leapnav.experts.hard_limits import follow_limit, softened, without_barrier
-from leapnav.experts.numerics.state_bounds import state_margin
+from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit_of, next_extremal, transcribed
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
-from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
-from leapnav.experts.solve import Method, solve
+from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
+from leapnav.experts.solve import solve
 from leapnav.experts.solvers.initial_paths import initial_paths
 from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths
-from leapnav.experts.transcription.direct import DirectPath, mean_running_cost, optimise
+from leapnav.experts.structure import Piece, format_pieces, pieces_of
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
-# Intervals of the transcription of a path of few pieces, and segments of the following multiple shooting.
-INTERVALS, SEGMENTS, MIN_SEGMENTS = 64, 32, 8
 # Duration of the transcription relative to that of the path: more time makes smooth transitions possible, but a robot
 # that cannot slow down may not reach the goal in more time.
 LENGTHENINGS = (1.02, 1.005, 1.0)
-MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
 UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
 SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
@@ -58,6 +52,7 @@ class MinimumTime:
             or obstacles, for which no such bound is known.
         switching_times: (S,), times (s) at which a control changes between its lower bound, 0 and its upper bound.
         levels: (S + 1, m), the controls between these times: the bound that is closest, or 0.
+        pieces: straight lines, turns and contacts with obstacles; empty if the system has no position and heading.
 
     """
 
@@ -67,6 +62,17 @@ class MinimumTime:
     lower_bound: float
     switching_times: np.ndarray
     levels: np.ndarray
+    pieces: tuple[Piece, ...]
+
+    def __str__(self) -> str:
+        """Return the time, its bounds and the pieces as text; without pieces, the controls between switching times."""
+        lines = [f"time {self.horizon:.6g} s, at most {100 * self.tolerance:.2g} % above that of the limit"]
+        if self.pieces:
+            return "\n".join([*lines, format_pieces(self.pieces)])
+        times = np.concatenate([[0.0], self.switching_times, [self.horizon]])
+        for first, last, level in zip(times[:-1], times[1:], self.levels, strict=True):
+            lines.append(f"{first:10.4f} to {last:10.4f} s: controls {', '.join(f'{value:g}' for value in level)}")
+        return "\n".join(lines)
 
 
 def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -> MinimumTime:
@@ -106,7 +112,8 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
     tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
     extremal = best.limit
     lower_bound = np.nan if has_state_cost else extremal.cost / (1.0 + tolerance)
-    return MinimumTime(extremal, extremal.horizon, tolerance, lower_bound, *switching_structure(extremal, bounds))
+    structure = switching_structure(extremal, bounds)
+    return MinimumTime(extremal, extremal.horizon, tolerance, lower_bound, *structure, pieces_of(extremal))
 
 
 class _Start(NamedTuple):
@@ -241,37 +248,12 @@ def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _S
             continue
         for lengthening in LENGTHENINGS:
             direct = path.path(INTERVALS, lengthening)
-            if not _is_free(problems[0], direct.states):
+            if not is_free(problems[0], direct.states):
                 return None
-            extremal = _transcribed(problems[index].with_winding_of(direct.states), direct)
+            extremal = transcribed(problems[index].with_winding_of(direct.states), direct)
             if extremal is not None:
                 return _Start(extremal, index + 1)
     return None
-
-
-def _is_free(problem: OptimalControlProblem, states: np.ndarray) -> bool:
-    """Return whether a path (N, n) is within the limits of the states and not in contact with an obstacle."""
-    if state_margin(problem.state_limits, states) <= 0:
-        return False
-    if problem.field is None or problem.system.position is None:
-        return True
-    at = [problem.system.state.index(symbol) for symbol in problem.system.position]
-    heading = problem.system.heading
-    headings = np.zeros(len(states)) if heading is None else states[:, problem.system.state.index(heading)]
-    poses = np.column_stack([states[:, at], headings])
-    return path_clearance(np.ascontiguousarray(poses), problem.outline, problem.field) > 0
-
-
-def _transcribed(problem: OptimalControlProblem, guess: DirectPath) -> Extremal | None:
-    """Return the extremal close to the local optimum of the discretised problem in the time of a guess."""
-    energy = mean_running_cost(problem, Trajectory(guess.times, guess.states))
-    fixed = softened(problem, energy).with_horizon(float(guess.times[-1]))
-    path = optimise(fixed, guess)
-    if not path.violation < MAX_VIOLATION:
-        return None
-    trajectory = Trajectory(path.times, path.states, path.costates)
-    extremal = solve(problem, "multiple_shooting", trajectory, segments=SEGMENTS)
-    return extremal if extremal.success else None
 
 
 def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: float) -> _End:
@@ -287,23 +269,23 @@ def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: floa
     for problem in problems[count:]:
         if _lowest_limit(extremal) > best:
             return _End(extremal, 0, extremal)
-        found = _step(extremal, replace(problem, goal=extremal.problem.goal, barrier_weight=barrier))
+        found = next_extremal(extremal, replace(problem, goal=extremal.problem.goal, barrier_weight=barrier))
         if not found.success:
             failed = found
             break
         extremal, count = found, count + 1
-    return _End(extremal, count, _limit(extremal)) if count else _End(failed, 0, failed)
+    return _End(extremal, count, limit_of(extremal)) if count else _End(failed, 0, failed)
 
 
 def _finish(end: _End, problems: Sequence[OptimalControlProblem]) -> _End:
     """Solve further problems by collocation, from the last one that multiple shooting has solved."""
     extremal, count, _ = end
     for problem in problems[count:]:
-        found = _continue(extremal, replace(problem, goal=extremal.problem.goal), "collocation")
+        found = continued(extremal, replace(problem, goal=extremal.problem.goal), "collocation")
         if found is None:
             break
         extremal, count = found, count + 1
-    return _End(extremal, count, _limit(extremal)) if count > end.solved else end
+    return _End(extremal, count, limit_of(extremal)) if count > end.solved else end
 
 
 def _lowest_limit(extremal: Extremal) -> float:
@@ -317,37 +299,6 @@ def _lowest_limit(extremal: Extremal) -> float:
         return 0.0
     largest = np.abs(np.array(problem.control_bounds)).max(axis=1) ** 2
     return extremal.cost * math.exp(-0.5 * float(np.array(problem.control_weight) @ largest))
-
-
-def _step(extremal: Extremal, problem: OptimalControlProblem) -> Extremal:
-    """Solve a problem from the extremal of a similar one, and where Newton's method stalls, from a new transcription.
-
-    The last resort are intermediate control weights and shorter segments.
-    """
-    segments = max(extremal.n_nodes - 1, MIN_SEGMENTS)
-    found = solve(problem, "multiple_shooting", extremal, segments=segments)
-    if found.success:
-        return found
-    times = np.linspace(0.0, extremal.horizon, 2 * INTERVALS + 1)
-    states = extremal.evaluate(times)[0]
-    controls = extremal.evaluate(0.5 * (times[1:] + times[:-1]))[1]
-    guess = DirectPath(times, states, controls, np.zeros_like(states), math.inf, math.inf, False)
-    again = _transcribed(problem, guess)
-    if again is not None:
-        return again
-    return _continue(extremal, problem, "multiple_shooting") or found
-
-
-def _continue(extremal: Extremal, problem: OptimalControlProblem, method: Method) -> Extremal | None:
-    """Solve a problem from the extremal of a similar one, by way of intermediate problems if necessary."""
-    *_, last = continuation([extremal.problem, problem], method, guess=extremal)
-    return last if last.success and last.problem.control_weight == problem.control_weight else None
-
-
-def _limit(extremal: Extremal) -> Extremal:
-    """Return the extremal close to the limit of hard limits; with the barrier that it has if that is not reached."""
-    limit = follow_limit(extremal)
-    return limit if limit.success else without_barrier(extremal)
 
 
 def switching_structure(extremal: Extremal, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

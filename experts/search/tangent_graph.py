@@ -117,6 +117,11 @@ def _to_line(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.nda
     return np.hypot(*(points - starts - fractions[:, None] * along).T)
 
 
+def corner_count(scenario: Scenario) -> int:
+    """Return the number of corners of the obstacles; a disc is one."""
+    return sum(len(part.rounded_polygon()[0]) for obstacle in scenario.obstacles for part in obstacle.shape.parts())
+
+
 def shortest_plane_path(scenario: Scenario, radius: float) -> list[PlanePiece] | None:
     """Return the shortest path of the centre of a disc from start to goal; None if there is none.
 
@@ -128,10 +133,10 @@ def shortest_plane_path(scenario: Scenario, radius: float) -> list[PlanePiece] |
         ValueError: the obstacles have more than MAX_CORNERS corners.
 
     """
-    obstacles = _Obstacles(scenario, radius)
-    count = sum(map(len, obstacles.polygons))
+    count = corner_count(scenario)
     if count > MAX_CORNERS:
         raise ValueError(f"obstacles: expected at most {MAX_CORNERS} corners, got {count}")
+    obstacles = _Obstacles(scenario, radius)
     return _Graph(obstacles, np.array([scenario.start[:2], scenario.goal[:2]])).shortest()
 
 
