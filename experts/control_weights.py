@@ -20,8 +20,12 @@ from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solve import Method, solve
 from leapnav.experts.transcription.direct import DirectPath, mean_running_cost, optimise
 
-# Intervals of a transcription, and segments of the following multiple shooting.
-INTERVALS, SEGMENTS, MIN_SEGMENTS = 64, 32, 8
+# Segments of multiple shooting after a transcription and, at least, of a continuation; intervals of a transcription per
+# segment.
+SEGMENTS, MIN_SEGMENTS, INTERVALS_PER_SEGMENT = 32, 8, 2
+INTERVALS = INTERVALS_PER_SEGMENT * SEGMENTS
+# Newton steps of an attempt; without the limit, a divergent one takes up to 6 s.
+MAX_ITERATIONS = 20
 MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
 
 
@@ -38,15 +42,22 @@ def is_free(problem: OptimalControlProblem, states: np.ndarray) -> bool:
     return path_clearance(np.ascontiguousarray(poses), problem.outline, problem.field) > 0
 
 
-def transcribed(problem: OptimalControlProblem, guess: DirectPath) -> Extremal | None:
-    """Return the extremal close to the local optimum of the discretised problem in the time of a guess."""
+def transcribed(problem: OptimalControlProblem, guess: DirectPath, segments: int = SEGMENTS) -> Extremal | None:
+    """Return the extremal close to the local optimum of the discretised problem in the time of a guess.
+
+    Args:
+        problem: the problem, with a free horizon.
+        guess: the path from which the descent starts; its intervals are those of the discretisation.
+        segments: number of segments of multiple shooting.
+
+    """
     energy = mean_running_cost(problem, Trajectory(guess.times, guess.states))
     fixed = softened(problem, energy).with_horizon(float(guess.times[-1]))
     path = optimise(fixed, guess)
     if not path.violation < MAX_VIOLATION:
         return None
     trajectory = Trajectory(path.times, path.states, path.costates)
-    extremal = solve(problem, "multiple_shooting", trajectory, segments=SEGMENTS)
+    extremal = solve(problem, "multiple_shooting", trajectory, max_iterations=MAX_ITERATIONS, segments=segments)
     return extremal if extremal.success else None
 
 
@@ -56,14 +67,16 @@ def next_extremal(extremal: Extremal, problem: OptimalControlProblem) -> Extrema
     The last resort are intermediate control weights and shorter segments.
     """
     segments = max(extremal.n_nodes - 1, MIN_SEGMENTS)
-    found = solve(problem, "multiple_shooting", extremal, segments=segments)
+    found = solve(problem, "multiple_shooting", extremal, max_iterations=MAX_ITERATIONS, segments=segments)
     if found.success:
         return found
-    times = np.linspace(0.0, extremal.horizon, 2 * INTERVALS + 1)
+    # Longer segments than those of the last extremal are too sensitive.
+    segments = max(SEGMENTS, segments)
+    times = np.linspace(0.0, extremal.horizon, INTERVALS_PER_SEGMENT * segments + 1)
     states = extremal.evaluate(times)[0]
     controls = extremal.evaluate(0.5 * (times[1:] + times[:-1]))[1]
     guess = DirectPath(times, states, controls, np.zeros_like(states), math.inf, math.inf, False)
-    again = transcribed(problem, guess)
+    again = transcribed(problem, guess, segments)
     if again is not None:
         return again
     return continued(extremal, problem, "multiple_shooting") or found

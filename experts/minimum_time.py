@@ -34,6 +34,7 @@ MAX_PATHS = 4  # local optima that are followed
 # that cannot slow down may not reach the goal in more time.
 LENGTHENINGS = (1.02, 1.005, 1.0)
 UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
+FAR = 10.0  # proximity scales; the proximity cost of more distant obstacles is negligible
 SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
@@ -157,8 +158,8 @@ def _ends(
     if isinstance(given, Scenario):
         optimum = find_optimum(_with_free_horizon(given))
         follow([_Start(extremal, 0) for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]])
-        # The lattice is accurate for a robot that rotates in place.
-        if not found or not given.robot.lattice_moves(*UNIT_LATTICE).rotating:
+        # The lattice is accurate for a robot that rotates in place, and paths of few pieces ignore obstacles.
+        if not found or (not given.robot.lattice_moves(*UNIT_LATTICE).rotating and _is_far(optimum, given)):
             best = min(map(_limit_cost, found), default=math.inf)
             follow(_from_pieces(problems, best * (1.0 - tol)))
     else:
@@ -167,6 +168,12 @@ def _ends(
         failed = failed or solve(problems[0])
         found.append(_End(failed, 0, failed))
     return found
+
+
+def _is_far(extremal: Extremal, scenario: Scenario) -> bool:
+    """Return whether an extremal is far from all obstacles."""
+    clearance = None if extremal.certificate is None else extremal.certificate.clearance
+    return clearance is not None and clearance > FAR * scenario.cost.proximity_scale
 
 
 def _with_free_horizon(scenario: Scenario) -> Scenario:
