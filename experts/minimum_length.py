@@ -1,10 +1,10 @@
 """Minimum length: the shortest collision-free path of the robot's position, among hard obstacles.
 
 With the time weight v^2 / 2 and a weight of 1 for the square of the speed, the cost divided by v is at least the length
-of the path plus the cost of turning, and equal to it at the speed v. In the limit of small weights of turning it is the
-length. For a disc that rotates in place the limit is known: the shortest path of its centre among the obstacles that
-are enlarged by its radius, see `leapnav.experts.search.tangent_graph`. For any other robot the same path, of the largest
-disc around the reference point that its outline contains, is a lower bound.
+of the path plus the cost of turning, and equal to it at the speed v. In the limit of small weights of turning it is
+the length. For a disc that rotates in place the limit is known: the shortest path of its centre among the obstacles
+that are enlarged by its radius, see `leapnav.experts.search.tangent_graph`. For any other robot such a path is a lower
+bound: that of the largest disc around the reference point that the outline contains.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from leapnav.experts.structure import Piece, format_pieces, obstacle_name, piece
 FIRST_WEIGHT, LAST_WEIGHT, WEIGHT_FACTOR = 0.1, 1e-4, 0.25
 MAX_PATHS = 4  # local optima that are followed
 POINTS = 4001  # at which the length of a path is computed
-ARC_STEP = 0.02  # rad between the points of an arc
 UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
 FREE_LIMIT = 100.0  # largest speed (m/s) and turn rate (rad/s) of a robot of which only the path matters
 
@@ -69,8 +68,8 @@ class MinimumLength:
 def minimum_length(scenario: Scenario, tol: float = 1e-3) -> MinimumLength:
     """Find the shortest collision-free path of the robot's position.
 
-    The horizon, the cost weights and the limits of speed and turn rate are ignored, except for a robot that cannot stop:
-    its limits determine how tightly it turns. Obstacles cost nothing and must not be touched.
+    The horizon, the cost weights and the limits of speed and turn rate are ignored, except for a robot that cannot
+    stop: its limits determine how tightly it turns. Obstacles cost nothing and must not be touched.
 
     For a disc that rotates in place the path is exact, and touches the obstacles. For other robots the best local
     optima of a search are followed to small weights of turning, with the barrier of hard obstacles.
@@ -116,8 +115,7 @@ def _of_length(scenario: Scenario, rotates: bool) -> Scenario:
     robot = scenario.robot
     if rotates:
         # All robots that rotate in place have the same paths.
-        size = {"radius": robot.radius} if robot.footprint is None else {"footprint": robot.footprint}
-        robot = Unicycle(max_speed=FREE_LIMIT, max_turn_rate=FREE_LIMIT, **size)
+        robot = Unicycle(radius=robot.radius, footprint=robot.footprint, max_speed=FREE_LIMIT, max_turn_rate=FREE_LIMIT)
     elif robot.control_names[0] != "speed":
         raise ValueError(f"robot: expected one whose first control is its speed, got {robot.model!r}")
     speed = _speed(robot.control_bounds()[0].tolist())
@@ -183,41 +181,21 @@ def _length(extremal: Extremal) -> float:
     return float(np.hypot(*np.diff(states[:, :2], axis=0).T).sum())
 
 
-def _points(piece: PlanePiece) -> np.ndarray:
-    """Return positions (K, 2) along a piece."""
-    if piece.centre is None:
-        return np.stack([piece.start, piece.end])
-    arm = piece.start - piece.centre
-    radius = float(np.hypot(*arm))
-    turn = piece.side * piece.length / radius
-    angles = math.atan2(arm[1], arm[0]) + np.linspace(0.0, turn, max(int(abs(turn) / ARC_STEP), 1) + 1)
-    return piece.centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
 def _headings(scenario: Scenario, pieces: list[PlanePiece]) -> list[tuple[float, float]]:
     """Return the headings (rad) at both ends of each piece, without jumps between arcs and lines."""
     heading, found = scenario.start[2], []
     for piece in pieces:
-        first = (_points(piece)[1] - piece.start) if piece.centre is None else _ahead(piece)
-        heading += math.remainder(math.atan2(first[1], first[0]) - heading, 2 * math.pi)
-        turn = 0.0 if piece.centre is None else piece.side * piece.length / float(np.hypot(*(piece.start - piece.centre)))
-        found.append((heading, heading + turn))
-        heading += turn
+        heading += math.remainder(piece.heading - heading, 2 * math.pi)
+        found.append((heading, heading + piece.turn))
+        heading += piece.turn
     return found
-
-
-def _ahead(piece: PlanePiece) -> np.ndarray:
-    """Return the direction (2,) at the beginning of an arc."""
-    assert piece.centre is not None
-    arm = piece.start - piece.centre
-    return piece.side * np.array([-arm[1], arm[0]])
 
 
 def _poses(scenario: Scenario, pieces: list[PlanePiece]) -> np.ndarray:
     """Return poses (N, 3) along the path; the robot rotates in place at the start and at the goal."""
     rows = [np.array([scenario.start])]
     for piece, (first, last) in zip(pieces, _headings(scenario, pieces), strict=True):
-        points = _points(piece)
+        points = piece.points()
         rows.append(np.column_stack([points, np.linspace(first, last, len(points))]))
     x, y, heading = scenario.goal
     before = float(rows[-1][-1, 2])
@@ -231,7 +209,7 @@ def _exact_pieces(scenario: Scenario, pieces: list[PlanePiece]) -> tuple[Piece, 
     found = []
     poses = _poses(scenario, pieces)
     for piece, (first, last) in zip(pieces, _headings(scenario, pieces), strict=True):
-        points = _points(piece)
+        points = piece.points()
         if piece.obstacle is None:
             found.append(Piece("straight", math.nan, piece.length, 0.0, None, points))
         else:

@@ -139,9 +139,7 @@ class _End(NamedTuple):
     limit: Extremal
 
 
-def _ends(
-    given: OptimalControlProblem | Scenario, problems: Sequence[OptimalControlProblem], tol: float
-) -> list[_End]:
+def _ends(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalControlProblem], tol: float) -> list[_End]:
     """Return the ends of the continuations from several extremals; a failure if there is none."""
     found: list[_End] = []
     failed: Extremal | None = None

@@ -61,11 +61,9 @@ def _dubins_paths(word: str, goal: Pose) -> Iterator[tuple[Piece, ...]]:
     across, angle = abs(end - centre), float(np.angle(end - centre))
     if middle == 0.0:
         # Heading of the straight line: its offset from the line of centres is 0, or that of an inner tangent.
-        if first == last:
-            headings = [angle]
-        else:
-            headings = [] if across < 2.0 else [angle + first * math.asin(2.0 / across)]
-        for heading in headings:
+        if first != last and across < 2.0:
+            return
+        for heading in (angle if first == last else angle + first * math.asin(2.0 / across),):
             straight = across if first == last else math.sqrt(across**2 - 4.0)
             yield _pieces(word, (first * heading, straight, last * (goal[2] - heading)))
     elif across <= 4.0:
@@ -80,9 +78,7 @@ def _dubins_paths(word: str, goal: Pose) -> Iterator[tuple[Piece, ...]]:
 
 def _pieces(word: str, lengths: tuple[float, ...]) -> tuple[Piece, ...]:
     """Return a path whose turns are the smallest non-negative ones."""
-    turns = [
-        (kind, length if kind == "S" else _turn(length)) for kind, length in zip(word, lengths, strict=True)
-    ]
+    turns = [(kind, length if kind == "S" else _turn(length)) for kind, length in zip(word, lengths, strict=True)]
     return tuple(turns)
 
 
@@ -179,10 +175,32 @@ def _ccscc(x: float, y: float, phi: float) -> Iterator[tuple[Piece, ...]]:
         yield ("L", t), ("R", -math.pi / 2), ("S", u), ("L", -math.pi / 2), ("R", _wrap(t - phi))
 
 
-NAMES = ("C", "S", "CC", "C|C", "CS", "SC", "CSC", "C|CC", "CC|C", "C|C|C", "CC|CC", "C|CC|C",
-         "C|CS", "SC|C", "C|CSC", "CSC|C", "C|CSC|C")  # an optimum is in one of these families
+NAMES = (
+    "C",
+    "S",
+    "CC",
+    "C|C",
+    "CS",
+    "SC",
+    "CSC",
+    "C|CC",
+    "CC|C",
+    "C|C|C",
+    "CC|CC",
+    "C|CC|C",
+    "C|CS",
+    "SC|C",
+    "C|CSC",
+    "CSC|C",
+    "C|CSC|C",
+)  # an optimum is in one of these families
 FAMILIES: tuple[Callable[[float, float, float], Iterator[tuple[Piece, ...]]], ...] = (
-    _csc_same, _csc_other, _ccc, _cccc, _ccsc, _ccscc,
+    _csc_same,
+    _csc_other,
+    _ccc,
+    _cccc,
+    _ccsc,
+    _ccscc,
 )
 
 
@@ -230,8 +248,8 @@ def balkcom_mason(goal: Pose, half_track: float = 1.0, starts: int = 40, seed: i
     """Return the minimum time of a differential drive with wheel speeds of at most 1.
 
     Its time-optimal paths consist of at most three straight lines and rotations in place between them (D. J. Balkcom
-    and M. T. Mason, 2002), of which the time is the length plus half the track times the rotation. The two inner corners
-    of the polygon are found by minimisation from many starts.
+    and M. T. Mason, 2002), of which the time is the length plus half the track times the rotation. The two inner
+    corners of the polygon are found by minimisation from many starts.
     """
     x, y, phi = goal
     end = complex(x, y)

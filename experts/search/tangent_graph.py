@@ -9,6 +9,7 @@ International Journal of Robotics Research 11, 1992).
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 
 ANGLES = 720  # directions on each arc in which its distance from other obstacles is checked
 TOLERANCE = 1e-9  # m; lines and arcs may be this much closer to an obstacle than the radius
+ARC_STEP = 0.02  # rad between the points of an arc
 MAX_CORNERS = 400  # the number of tangents is quadratic in the number of corners, and each is checked
 
 
@@ -43,6 +45,28 @@ class PlanePiece:
     centre: np.ndarray | None = None
     side: int = 0
     obstacle: int | None = None
+
+    @property
+    def turn(self) -> float:
+        """The change of the direction (rad) along it."""
+        return 0.0 if self.centre is None else self.side * self.length / float(np.hypot(*(self.start - self.centre)))
+
+    @property
+    def heading(self) -> float:
+        """The direction (rad) at its beginning."""
+        if self.centre is None:
+            return math.atan2(*(self.end - self.start)[::-1])
+        x, y = self.start - self.centre
+        return math.atan2(self.side * x, -self.side * y)
+
+    def points(self) -> np.ndarray:
+        """Return positions (K, 2) (m) along it."""
+        if self.centre is None:
+            return np.stack([self.start, self.end])
+        x, y = self.start - self.centre
+        count = max(int(abs(self.turn) / ARC_STEP), 1) + 1
+        angles = math.atan2(y, x) + np.linspace(0.0, self.turn, count)
+        return self.centre + math.hypot(x, y) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 class _Obstacles:
@@ -202,7 +226,7 @@ class _Graph:
     ) -> list[PlanePiece]:
         """Return the pieces along nodes; arcs around one corner are one piece."""
         pieces: list[PlanePiece] = []
-        for a, b in zip(nodes[:-1], nodes[1:], strict=True):
+        for a, b in itertools.pairwise(nodes):
             if a // 2 == b // 2:
                 pieces.append(PlanePiece(points[a], points[b], float(np.hypot(*(points[b] - points[a])))))
                 continue

@@ -31,7 +31,7 @@ POINTS = 24  # of a path per piece
 # Scales of the time (s), powers of two, of which the smallest ones are skipped while the goal is out of reach; and the
 # number of scales after the first with a path.
 MIN_SCALE, MAX_SCALE, MORE_SCALES = -20, 24, 1
-MAX_STEPS = 60
+MAX_STEPS, MAX_HALVINGS = 60, 6
 FIRST_STEPS, MAX_FIRST_RESIDUAL, MAX_FIRST_TIME = 8, 0.1, 1.5
 # Residual relative to the scales of the states at which a path ends at the goal, and the decrease of the total time,
 # relative to it, at which its durations are optimal.
@@ -142,9 +142,7 @@ def _correction(jacobian, residual, durations, shortening, change):
 
 
 @kernel(
-    tuple_of(float64, float64)(
-        STEP_FUNCTION, CONSTANT, VECTOR, VECTOR, FLAGS, FLAGS, VECTOR, MATRIX, VECTOR, float64
-    )
+    tuple_of(float64, float64)(STEP_FUNCTION, CONSTANT, VECTOR, VECTOR, FLAGS, FLAGS, VECTOR, MATRIX, VECTOR, float64)
 )
 def shorten(step, data, start, goal, free, winds, scales, controls, durations, limit):
     """Change the durations of the pieces in place, so that they end at the goal after a short time.
@@ -171,8 +169,8 @@ def shorten(step, data, start, goal, free, winds, scales, controls, durations, l
         _correction(jacobian, residual, durations, factor * total / count, change)
         largest = np.abs(change).max()
         damping = min(1.0, 0.5 * total / largest) if largest > 0.0 else 1.0
-        better = False
-        for _ in range(6):
+        better, trial_norm = False, np.inf
+        for _ in range(MAX_HALVINGS):
             for k in range(count):
                 trial[k] = max(durations[k] + damping * change[k], 0.0)
             if _end(step, data, start, controls, trial, moved):
