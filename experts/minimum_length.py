@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from leapnav.envs.robots import Unicycle
+from leapnav.envs.robots import Disc, Unicycle
 from leapnav.envs.robots.footprints import enclosed_radius
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.scenario import Scenario
@@ -27,9 +27,9 @@ from leapnav.experts.problem.problem import as_problem
 from leapnav.experts.search.tangent_graph import MAX_CORNERS, PlanePiece, corner_count, shortest_plane_path
 from leapnav.experts.structure import Piece, format_pieces, obstacle_name, pieces_of
 
-# Weight of turning relative to that of the speed (m^2): the first and the last one, and the factor between two. At the
-# last one, discs in 8 scenarios of `clutter` were 0.07 to 0.19 % above the exact length.
-FIRST_WEIGHT, LAST_WEIGHT, WEIGHT_FACTOR = 0.1, 1e-4, 0.25
+# Weight of turning relative to that of the speed (m^2): the first and the smallest one, and the factor between two. At
+# 1e-4, discs in 8 scenarios of `clutter` were 0.07 to 0.19 % above the exact length.
+FIRST_WEIGHT, LAST_WEIGHT, WEIGHT_FACTOR = 0.1, 1e-6, 0.25
 MAX_PATHS = 4  # local optima that are followed
 POINTS = 4001  # at which the length of a path is computed
 UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
@@ -115,7 +115,8 @@ def _of_length(scenario: Scenario, rotates: bool) -> Scenario:
     robot = scenario.robot
     if rotates:
         # All robots that rotate in place have the same paths.
-        robot = Unicycle(radius=robot.radius, footprint=robot.footprint, max_speed=FREE_LIMIT, max_turn_rate=FREE_LIMIT)
+        footprint = (Disc(radius=robot.radius),) if robot.footprint is None else robot.footprint
+        robot = Unicycle(footprint=footprint, max_speed=FREE_LIMIT, max_turn_rate=FREE_LIMIT)
     elif robot.control_names[0] != "speed":
         raise ValueError(f"robot: expected one whose first control is its speed, got {robot.model!r}")
     speed = _speed(robot.control_bounds()[0].tolist())
@@ -165,13 +166,16 @@ def _follow(start: Extremal, scenario: Scenario, bound: float, tol: float) -> Ex
         # Only the directions in which the robot drives matter.
         limits = np.where(limits < 0.0, -np.inf, np.where(limits > 0.0, np.inf, 0.0))
     bounds = tuple((float(low), float(high)) for low, high in limits)
-    while weight > LAST_WEIGHT and not _length(extremal) <= bound * (1.0 + tol):
-        weight = max(WEIGHT_FACTOR * weight, LAST_WEIGHT)
+    length, decrease = _length(extremal), math.inf
+    # The excess is proportional to the square root of the weight, so about as large as the last decrease.
+    while weight > LAST_WEIGHT and not length <= bound * (1.0 + tol) and decrease > tol * length:
+        weight *= WEIGHT_FACTOR
         weights = (1.0, *[weight] * (extremal.problem.system.m - 1))
         found = next_extremal(extremal, replace(extremal.problem, control_weight=weights, control_bounds=bounds))
         if not found.success:
             break
-        extremal = found
+        decrease, extremal = length - _length(found), found
+        length -= decrease
     return limit_of(extremal)
 
 
