@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from leapnav.experts.acting.policy import ExpertPolicy, NoOptimumError
 from leapnav.experts.bounds.lower_bound import LowerBound, lower_bound
 from leapnav.experts.continuation import continuation
-from leapnav.experts.minimum_time import minimum_time
+from leapnav.experts.minimum_length import MinimumLength, minimum_length
+from leapnav.experts.minimum_time import MinimumTime, minimum_time
 from leapnav.experts.optimum import Optimum, find_optimum, find_reached_optimum, shortest_horizon
 from leapnav.experts.problem.certificate import certify, verify
 from leapnav.experts.problem.extremal import Certificate, Extremal, SolveError, Status
@@ -31,6 +32,8 @@ __all__ = [
     "ExpertPolicy",
     "Extremal",
     "LowerBound",
+    "MinimumLength",
+    "MinimumTime",
     "NoOptimumError",
     "OptimalControlProblem",
     "Optimum",
@@ -48,6 +51,7 @@ __all__ = [
     "find_reached_optimum",
     "load_demonstrations",
     "lower_bound",
+    "minimum_length",
     "minimum_time",
     "plot_extremal",
     "rollout",

@@ -8,6 +8,7 @@ Optimal Control, 1975, sections 3.9 and 8.3).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -17,17 +18,24 @@ import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import check_positive
-from leapnav.experts.continuation import continuation
-from leapnav.experts.hard_limits import follow_limit, without_barrier
+from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit_of, next_extremal, transcribed
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
-from leapnav.experts.solve import Method, solve
+from leapnav.experts.solve import solve
 from leapnav.experts.solvers.initial_paths import initial_paths
+from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths
+from leapnav.experts.structure import Piece, format_pieces, pieces_of
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
+START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
-METHODS: tuple[Method, ...] = ("multiple_shooting", "collocation")  # in this order; the others fail where these do
+# Duration of the transcription relative to that of the path: more time makes smooth transitions possible, but a robot
+# that cannot slow down may not reach the goal in more time.
+LENGTHENINGS = (1.02, 1.005, 1.0)
+UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
+FAR = 10.0  # proximity scales; the proximity cost of more distant obstacles is negligible
+SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
 
@@ -45,6 +53,7 @@ class MinimumTime:
             or obstacles, for which no such bound is known.
         switching_times: (S,), times (s) at which a control changes between its lower bound, 0 and its upper bound.
         levels: (S + 1, m), the controls between these times: the bound that is closest, or 0.
+        pieces: straight lines, turns and contacts with obstacles; empty if the system has no position and heading.
 
     """
 
@@ -54,6 +63,17 @@ class MinimumTime:
     lower_bound: float
     switching_times: np.ndarray
     levels: np.ndarray
+    pieces: tuple[Piece, ...]
+
+    def __str__(self) -> str:
+        """Return the time, its bounds and the pieces as text; without pieces, the controls between switching times."""
+        lines = [f"time {self.horizon:.6g} s, at most {100 * self.tolerance:.2g} % above that of the limit"]
+        if self.pieces:
+            return "\n".join([*lines, format_pieces(self.pieces)])
+        times = np.concatenate([[0.0], self.switching_times, [self.horizon]])
+        for first, last, level in zip(times[:-1], times[1:], self.levels, strict=True):
+            lines.append(f"{first:10.4f} to {last:10.4f} s: controls {', '.join(f'{value:g}' for value in level)}")
+        return "\n".join(lines)
 
 
 def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -> MinimumTime:
@@ -85,26 +105,92 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
         raise ValueError(f"control_bounds: expected finite numbers, got {ocp.control_bounds!r}")
     weights = list(_weights(tol, len(bounds)))
     problems = [_with_weight(ocp, bounds, weight) for weight in weights]
-    followed = [_follow(start, problems) for start in _first(problem, problems[0])]
-    ends = [end for end in followed if end.solved]
-    if not ends:
-        raise SolveError(followed[0].extremal, problem.name if isinstance(problem, Scenario) else "")
-    has_state_cost = ocp.field is not None or ocp.state_cost != 0 or ocp.has_hard_limits
-    if has_state_cost:  # the durations alone do not rank the paths, and the control costs have different weights
-        best = min(ends, key=lambda end: _cost_without_controls(end.extremal))
-    else:
-        best = min(ends, key=lambda end: end.extremal.horizon)
+    has_state_cost = _has_state_cost(ocp)
+    ends = _ends(problem, problems, tol)
+    if not ends[0].solved:
+        raise SolveError(ends[0].limit, problem.name if isinstance(problem, Scenario) else "")
+    best = _finish(min(ends, key=_limit_cost), problems)
     tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
-    lower_bound = np.nan if has_state_cost else best.extremal.cost / (1.0 + tolerance)
-    structure = switching_structure(best.extremal, bounds)
-    return MinimumTime(best.extremal, best.extremal.horizon, tolerance, lower_bound, *structure)
+    extremal = best.limit
+    lower_bound = np.nan if has_state_cost else extremal.cost / (1.0 + tolerance)
+    structure = switching_structure(extremal, bounds)
+    return MinimumTime(extremal, extremal.horizon, tolerance, lower_bound, *structure, pieces_of(extremal))
 
 
-class _End(NamedTuple):
-    """The end of a continuation: the extremal of the last of the `solved` problems, or the failure of the first."""
+class _Start(NamedTuple):
+    """An extremal from which a continuation starts, and the number of problems that it need not solve any more."""
 
     extremal: Extremal
     solved: int
+
+
+class _End(NamedTuple):
+    """The end of a continuation.
+
+    Attributes:
+        extremal: the extremal of the last of the solved problems, or the failure of the first.
+        solved: their number.
+        limit: with hard limits, the extremal close to their limit; otherwise `extremal`.
+
+    """
+
+    extremal: Extremal
+    solved: int
+    limit: Extremal
+
+
+def _ends(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalControlProblem], tol: float) -> list[_End]:
+    """Return the ends of the continuations from several extremals; a failure if there is none."""
+    found: list[_End] = []
+    failed: Extremal | None = None
+
+    def follow(starts: Sequence[_Start]) -> None:
+        nonlocal failed
+        for start in sorted(starts, key=lambda start: _lowest_limit(start.extremal))[:MAX_PATHS]:
+            end = _follow(start, problems, min(map(_limit_cost, found), default=math.inf))
+            if end.solved:
+                found.append(end)
+            else:
+                failed = failed or end.extremal
+
+    if isinstance(given, Scenario):
+        optimum = find_optimum(_with_free_horizon(given))
+        follow([_Start(extremal, 0) for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]])
+        # The lattice is accurate for a robot that rotates in place, and paths of few pieces ignore obstacles.
+        if not found or (not given.robot.lattice_moves(*UNIT_LATTICE).rotating and _is_far(optimum, given)):
+            best = min(map(_limit_cost, found), default=math.inf)
+            follow(_from_pieces(problems, best * (1.0 - tol)))
+    else:
+        follow(_starts(problems))
+    if not found:
+        failed = failed or solve(problems[0])
+        found.append(_End(failed, 0, failed))
+    return found
+
+
+def _is_far(extremal: Extremal, scenario: Scenario) -> bool:
+    """Return whether an extremal is far from all obstacles."""
+    clearance = None if extremal.certificate is None else extremal.certificate.clearance
+    return clearance is not None and clearance > FAR * scenario.cost.proximity_scale
+
+
+def _with_free_horizon(scenario: Scenario) -> Scenario:
+    """Return the scenario with a free horizon and the time weight 1."""
+    return scenario.model_copy(update={"horizon": None, "cost": scenario.cost.model_copy(update={"time_weight": 1.0})})
+
+
+def _limit_cost(end: _End) -> float:
+    """Return the time, or with a state cost the time plus its integral.
+
+    Then the durations alone do not rank the paths, and the control costs have different weights.
+    """
+    extremal = end.limit
+    return _cost_without_controls(extremal) if _has_state_cost(extremal.problem) else extremal.horizon
+
+
+def _has_state_cost(problem: OptimalControlProblem) -> bool:
+    """Return whether the cost of a problem contains more than the time and the controls."""
+    return problem.field is not None or problem.state_cost != 0 or problem.has_hard_limits
 
 
 def _cost_without_controls(extremal: Extremal) -> float:
@@ -129,43 +215,95 @@ def _with_weight(problem: OptimalControlProblem, bounds: np.ndarray, weight: flo
     return replace(problem, horizon=None, time_weight=1.0, control_weight=control_weight)
 
 
-def _first(given: OptimalControlProblem | Scenario, problem: OptimalControlProblem) -> Sequence[Extremal]:
-    """Return the extremals from which the continuations start, or a failure; those of a scenario have its weights."""
-    if not isinstance(given, Scenario):
-        starts = islice(initial_paths(problem), MAX_PATHS)
-        found = [solve(wound, "multiple_shooting", guess=path) for wound, path in starts]
-        return [extremal for extremal in found if extremal.success] or [solve(problem)]
-    free = given.model_copy(update={"horizon": None, "cost": given.cost.model_copy(update={"time_weight": 1.0})})
-    optimum = find_optimum(free)
-    return [optimum, *optimum.alternatives][:MAX_PATHS]
+def _starts(problems: Sequence[OptimalControlProblem]) -> list[_Start]:
+    """Return the distinct extremals from which the continuations start."""
+    starts = _from_pieces(problems)
+    if not starts or _has_state_cost(problems[0]):
+        for wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
+            _add(starts, _Start(solve(wound, "multiple_shooting", guess=path), 1))
+    return starts
 
 
-def _follow(start: Extremal, problems: Sequence[OptimalControlProblem]) -> _End:
-    """Solve the problems one after the other, up to the first that no method solves, with the winding of the start.
+def _from_pieces(problems: Sequence[OptimalControlProblem], max_time: float = math.inf) -> list[_Start]:
+    """Return the distinct extremals close to paths of few pieces that take at most a given time (s)."""
+    starts: list[_Start] = []
+    for path in piecewise_paths(problems[0]):
+        found = _first(path, problems) if path.time < max_time else None
+        if found is not None:
+            _add(starts, found)
+    return starts
 
-    With hard limits, all have the barrier weight of the start.
+
+def _add(starts: list[_Start], start: _Start) -> None:
+    """Add a start, unless it is a failure or an extremal that is known."""
+    extremal, solved = start
+    if extremal.success and not any(solved == one.solved and _is_same(extremal, one.extremal) for one in starts):
+        starts.append(start)
+
+
+def _is_same(extremal: Extremal, other: Extremal) -> bool:
+    """Return whether two extremals of the same control weights are one, or mirror images."""
+    return abs(extremal.cost - other.cost) <= SAME_COST * abs(other.cost)
+
+
+def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _Start | None:
+    """Return the first extremal close to a path of few pieces, and the number of problems before the next one."""
+    for index in START_ORDER:
+        if index >= len(problems):
+            continue
+        for lengthening in LENGTHENINGS:
+            direct = path.path(INTERVALS, lengthening)
+            if not is_free(problems[0], direct.states):
+                return None
+            extremal = transcribed(problems[index].with_winding_of(direct.states), direct)
+            if extremal is not None:
+                return _Start(extremal, index + 1)
+    return None
+
+
+def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: float) -> _End:
+    """Solve the remaining problems one after the other, up to the first that no method solves.
+
+    They have the winding of the start and, with hard limits, its barrier weight. The continuation ends early, without
+    a solved problem, if its limit costs more than `best`.
     """
-    if not start.success:
-        return _End(start, 0)
-    barrier = start.problem.barrier_weight
-    remaining = [replace(problem, goal=start.problem.goal, barrier_weight=barrier) for problem in problems]
-    extremal, failed = start, start
-    for method in METHODS:
-        # The problem of the guess is the first of the sequence, so that the step control applies to the second.
-        _, *found = continuation([extremal.problem, *remaining], method, guess=extremal)
-        solved = [one for one in found if one.success]
-        extremal, failed = (solved or [extremal])[-1], (found or [start])[-1]
-        remaining = remaining[len(solved) :]
-        if not remaining:
+    extremal, count = start
+    if not extremal.success:
+        return _End(extremal, 0, extremal)
+    barrier, failed = extremal.problem.barrier_weight, extremal
+    for problem in problems[count:]:
+        if _lowest_limit(extremal) > best:
+            return _End(extremal, 0, extremal)
+        found = next_extremal(extremal, replace(problem, goal=extremal.problem.goal, barrier_weight=barrier))
+        if not found.success:
+            failed = found
             break
-    count = len(problems) - len(remaining)
-    return _End(_limit(extremal) if count else failed, count)
+        extremal, count = found, count + 1
+    return _End(extremal, count, limit_of(extremal)) if count else _End(failed, 0, failed)
 
 
-def _limit(extremal: Extremal) -> Extremal:
-    """Return the extremal close to the limit of hard limits; with the barrier that it has if that is not reached."""
-    limit = follow_limit(extremal)
-    return limit if limit.success else without_barrier(extremal)
+def _finish(end: _End, problems: Sequence[OptimalControlProblem]) -> _End:
+    """Solve further problems by collocation, from the last one that multiple shooting has solved."""
+    extremal, count, _ = end
+    for problem in problems[count:]:
+        found = continued(extremal, replace(problem, goal=extremal.problem.goal), "collocation")
+        if found is None:
+            break
+        extremal, count = found, count + 1
+    return _End(extremal, count, limit_of(extremal)) if count > end.solved else end
+
+
+def _lowest_limit(extremal: Extremal) -> float:
+    """Return a lower bound of the cost in the limit of small control weights; 0 with hard limits.
+
+    The derivative of the cost with respect to r is the control cost divided by r, which is at most m / 2 times the
+    cost. A barrier reduces the cost as its weight decreases, too.
+    """
+    problem = extremal.problem
+    if problem.has_hard_limits or problem.control_bounds is None:
+        return 0.0
+    largest = np.abs(np.array(problem.control_bounds)).max(axis=1) ** 2
+    return extremal.cost * math.exp(-0.5 * float(np.array(problem.control_weight) @ largest))
 
 
 def switching_structure(extremal: Extremal, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,9 @@ from leapnav.experts.problem.extremal import Extremal, Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.problem.system import ControlAffineSystem
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
+from leapnav.experts.structure import Piece
 
+PIECES = {"straight": OPTIMUM, "turn": CURVES[1], "contact": EDGE}  # colors of the pieces of a path
 MAX_ALTERNATIVES = len(ALTERNATIVES)
 N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
 N_POINTS = 400  # points of a dense path
@@ -87,6 +89,29 @@ def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLik
 
     """
     plot_extremal(extremal, path, scenario)
+
+
+def plot_pieces(scenario: Scenario, pieces: Sequence[Piece], path: str | os.PathLike[str]) -> None:
+    """Write a plot of the pieces of a path to a file, with a color for each kind and the numbers of the pieces.
+
+    Args:
+        scenario: the scenario.
+        pieces: `MinimumTime.pieces` or `MinimumLength.pieces`.
+        path: file; its extension is the format.
+
+    """
+    figure = Figure(figsize=(6.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    draw_scenario(axes, scenario)
+    for number, piece in enumerate(pieces, start=1):
+        axes.plot(*piece.points.T, color=PIECES[piece.kind], linewidth=2.0)
+        axes.plot(*piece.points[0], "o", color=PIECES[piece.kind], markersize=3.0)
+        middle = piece.points[len(piece.points) // 2] if len(piece.points) > 2 else piece.points.mean(axis=0)
+        axes.annotate(str(number), middle, xytext=(4, 4), textcoords="offset points", fontsize=8)
+    kinds = sorted({piece.kind for piece in pieces})
+    handles = [axes.plot([], [], color=PIECES[kind], linewidth=2.0, label=kind)[0] for kind in kinds]
+    axes.legend(handles=handles, loc="upper right", fontsize=8)
+    figure.savefig(path, dpi=130)
 
 
 def plot_extremal(
