@@ -80,7 +80,8 @@ def pieces_of(extremal: Extremal) -> tuple[Piece, ...]:
     touched = np.full(POINTS, -2)
     if problem.field is not None and problem.barrier_weight > 0.0:
         is_close = problem.barrier_cost(states) > MIN_BARRIER * extremal.cost / extremal.horizon
-        rows = states if problem.outline[:, 4].any() else np.ascontiguousarray(poses)  # joints are those of a robot model
+        has_joints = problem.outline[:, 4].any()  # only the outline of a robot model has them
+        rows = states if has_joints else np.ascontiguousarray(poses)
         for k in np.flatnonzero(is_close):
             touched[k] = footprint_clearance(rows[k], problem.outline, problem.field)[1]
     labels = np.where(touched > -2, touched + 10, labels)

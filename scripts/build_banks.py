@@ -5,8 +5,10 @@ python scripts/build_banks.py --check    # builds all banks in a temporary direc
 
 The scenarios must be identical, and costs and paths must agree to the tolerances below: the last bits depend on the
 processor, and some banks are older than changes of the search. Differences of the second-best costs are counted only,
-because the search omits some of the expensive alternatives. Lower bounds, which `leapnav bank prove` adds, are not
-compared.
+because the search omits some of the expensive alternatives. Lower bounds, which `leapnav bank prove` adds, and shortest
+paths are not compared.
+
+python scripts/build_banks.py --shortest # adds shortest lengths and minimum times to test banks of the unicycle (hours)
 """
 
 import argparse
@@ -17,10 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from leapnav.envs import ScenarioBank
+from leapnav.envs import Scenario, ScenarioBank
 from leapnav.envs.scenarios.bank import collection_name
+from leapnav.envs.scenarios.bank_writing import add_datasets
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import build_bank
+from leapnav.experts.data.bank_shortest import find_shortest
 
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
 # Number of scenarios, and seed. Different seeds give independent scenarios, so no scenario is in both splits.
@@ -51,6 +55,26 @@ def build(directory: Path, workers: int) -> None:
             for split, (_, seed) in SPLITS.items():
                 path = directory / f"{collection_name(family, robot)}-{split}.bank"
                 build_bank(family, ROBOT_COUNT, path, robot=robot, seed=seed, workers=workers)
+
+
+def add_shortest(directory: Path, workers: int) -> None:
+    """Add the shortest lengths and minimum times to the test banks of the unicycle, once for each task."""
+    for family in (*ALL_FAMILIES, *LARGE_FAMILIES):
+        path = directory / f"{family}-test.bank"
+        if np.isnan(ScenarioBank(path).shortest_times).any():
+            find_shortest(path, workers=workers)
+        bank = ScenarioBank(path)
+        for name in (collection_name(family, horizon="free"), collection_name(family, obstacles="hard")):
+            other = directory / f"{name}-test.bank"
+            if other.exists() and [task(one) for one in ScenarioBank(other)] == [task(one) for one in bank]:
+                values = {name: getattr(bank, name) for name in ("shortest_lengths", "shortest_times")}
+                add_datasets(other, **values)
+
+
+def task(scenario: Scenario) -> tuple[object, ...]:
+    """Return what the shortest path depends on."""
+    scale = scenario.cost.proximity_scale
+    return scenario.arena, scenario.start, scenario.goal, scenario.obstacles, scenario.robot, scale
 
 
 def check(workers: int) -> int:
@@ -90,10 +114,14 @@ def compare(path: Path, built: Path) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="build in a temporary directory and compare")
+    parser.add_argument("--shortest", action="store_true", help="add shortest lengths and minimum times")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="number of processes")
     arguments = parser.parse_args()
     if arguments.check:
         return check(arguments.workers)
+    if arguments.shortest:
+        add_shortest(BANKS, arguments.workers)
+        return 0
     BANKS.mkdir(exist_ok=True)
     build(BANKS, arguments.workers)
     return 0

@@ -48,7 +48,12 @@ N_TERMINAL_COLUMNS = 6  # columns that fit into the 80 characters of a terminal;
 def print_scores(comparison: Comparison) -> None:
     """Print the table of the policies with 95 % intervals, and for several banks a table by bank."""
     scores = comparison.scores()
-    columns = COLUMNS[:N_TERMINAL_COLUMNS]
+    # SPL and SCT are unknown in a bank without shortest paths.
+    columns = [
+        column
+        for column in COLUMNS[:N_TERMINAL_COLUMNS]
+        if column[1] not in ("spl", "sct") or any(math.isfinite(getattr(row, column[1]).value) for row in scores)
+    ]
     rows = [
         (
             row_name(row),
