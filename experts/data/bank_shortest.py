@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -106,16 +107,11 @@ def shortest(scenario: Scenario) -> tuple[float, float]:
     cost = scenario.cost.model_copy(update={"proximity_weight": 0.0, "time_weight": 1.0})
     free = scenario.model_copy(update={"horizon": None, "time_limit": None, "cost": cost})
     length = time = math.nan
-    try:
+    with suppress(SolveError):
         fastest = minimum_time(free, TOLERANCE)
-    except SolveError:
-        pass
-    else:
         time = fastest.horizon
         steps = np.diff(fastest.extremal.evaluate(np.linspace(0.0, time, 2001))[0][:, :2], axis=0)
         length = float(np.hypot(*steps.T).sum())
-    try:
+    with suppress(SolveError):
         length = float(np.fmin(length, minimum_length(free).length))
-    except SolveError:
-        pass
     return length, time

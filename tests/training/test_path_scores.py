@@ -80,7 +80,7 @@ def test_evaluate_prints_spl_and_sct_beside_soc(bank_file, tmp_path, capsys):
     words = ["expert", "--bank", str(bank_file), "--workers", "1", "--json", str(out)]
     assert main(["evaluate", *words]) == 0
     printed = capsys.readouterr().out
-    header = next(line for line in printed.splitlines() if "SOC" in line)
+    header = next(line for line in printed.splitlines() if "SPL" in line)
     assert header.index("SOC") < header.index("SPL") < header.index("SCT")
     assert max(len(line) for line in printed.splitlines() if line.startswith(" expert ") or line == header) <= 80
     (row,) = json.loads(out.read_text())["banks"][0]["scores"]

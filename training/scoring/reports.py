@@ -31,10 +31,10 @@ COLUMNS = (
     ("success\n%", "success", 100, 1, 0),
     ("collision\n%", "collision", 100, 1, 0),
     ("SOC\n", "soc", 1, 3, 2),
+    ("SOC\nIQM", "soc_iqm", 1, 3, 2),
     ("SPL\n", "spl", 1, 3, 2),
     ("SCT\n", "sct", 1, 3, 2),
     ("regret\n%, median", "regret", 100, 2, 2),
-    ("SOC\nIQM", "soc_iqm", 1, 3, 2),
     ("clearance\nm, median", "clearance", 1, 2, 2),
 )
 NEGATIVE_REGRET = (
@@ -42,18 +42,15 @@ NEGATIVE_REGRET = (
     "violates the unicycle model, for which the optimum is computed; otherwise the search has missed a better path."
 )
 MARKDOWN_COLUMNS = ("success", "collision", "soc", "regret")  # attributes of `Score` in the tables of the documentation
-N_TERMINAL_COLUMNS = 6  # columns that fit into the 80 characters of a terminal; the other outputs have all
+# Columns that fit into the 80 characters of a terminal, and those of a second table; the other outputs have all.
+TERMINAL_COLUMNS = ("success", "collision", "soc", "soc_iqm", "regret")
+PATH_COLUMNS = ("soc", "spl", "sct")
 
 
 def print_scores(comparison: Comparison) -> None:
     """Print the table of the policies with 95 % intervals, and for several banks a table by bank."""
     scores = comparison.scores()
-    # SPL and SCT are unknown in a bank without shortest paths.
-    columns = [
-        column
-        for column in COLUMNS[:N_TERMINAL_COLUMNS]
-        if column[1] not in ("spl", "sct") or any(math.isfinite(getattr(row, column[1]).value) for row in scores)
-    ]
+    columns = [column for column in COLUMNS if column[1] in TERMINAL_COLUMNS]
     rows = [
         (
             row_name(row),
@@ -64,6 +61,11 @@ def print_scores(comparison: Comparison) -> None:
     ]
     title = f"{scores[0].episodes} scenarios; brackets: 95 % interval over {sampled(scores)}"
     print_table(("policy", *(title for title, *_ in columns), "time\nms"), rows, title=title)
+    if any(math.isfinite(row.spl.value) or math.isfinite(row.sct.value) for row in scores):  # unknown in many banks
+        columns = [column for column in COLUMNS if column[1] in PATH_COLUMNS]
+        rows = [(row_name(row), *(cell(getattr(row, name), *form) for _, name, *form in columns)) for row in scores]
+        title = "success weighted by optimal cost, path length and completion time"
+        print_table(("policy", *(title for title, *_ in columns)), rows, title=title)
     if any(row.regret.value < 0 for row in scores):
         print(NEGATIVE_REGRET)
     if any(row.true_regret.episodes for row in scores):
