@@ -22,10 +22,10 @@ from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
+from leapnav.experts.problem.structure import Piece, format_pieces, pieces_of
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.initial_paths import initial_paths
 from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths
-from leapnav.experts.structure import Piece, format_pieces, pieces_of
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
