@@ -24,7 +24,7 @@ from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import as_problem
-from leapnav.experts.problem.structure import Piece, format_pieces, obstacle_name, pieces_of
+from leapnav.experts.search.structure import Piece, format_pieces, obstacle_name, pieces_of
 from leapnav.experts.search.tangent_graph import MAX_CORNERS, PlanePiece, corner_count, shortest_plane_path
 
 # Weight of turning relative to that of the speed (m^2): the first and the smallest one, and the factor between two. At

@@ -22,7 +22,7 @@ from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
-from leapnav.experts.problem.structure import Piece, format_pieces, pieces_of
+from leapnav.experts.search.structure import Piece, format_pieces, pieces_of
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.initial_paths import initial_paths
 from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths

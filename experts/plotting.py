@@ -25,8 +25,8 @@ from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import Optimum
 from leapnav.experts.problem.extremal import Extremal, Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
-from leapnav.experts.problem.structure import Piece
 from leapnav.experts.problem.system import ControlAffineSystem
+from leapnav.experts.search.structure import Piece
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
 
 PIECES = {"straight": OPTIMUM, "turn": CURVES[1], "contact": EDGE}  # colors of the pieces of a path
