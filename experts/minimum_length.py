@@ -24,8 +24,8 @@ from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import as_problem
+from leapnav.experts.search.structure import Piece, format_pieces, obstacle_name, pieces_of
 from leapnav.experts.search.tangent_graph import MAX_CORNERS, PlanePiece, corner_count, shortest_plane_path
-from leapnav.experts.structure import Piece, format_pieces, obstacle_name, pieces_of
 
 # Weight of turning relative to that of the speed (m^2): the first and the smallest one, and the factor between two. At
 # 1e-4, discs in 8 scenarios of `clutter` were 0.07 to 0.19 % above the exact length.

@@ -22,10 +22,10 @@ from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
+from leapnav.experts.search.structure import Piece, format_pieces, pieces_of
 from leapnav.experts.solve import solve
 from leapnav.experts.solvers.initial_paths import initial_paths
 from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths
-from leapnav.experts.structure import Piece, format_pieces, pieces_of
 
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
@@ -35,6 +35,7 @@ MAX_PATHS = 4  # local optima that are followed
 LENGTHENINGS = (1.02, 1.005, 1.0)
 UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to whether a robot rotates in place
 FAR = 10.0  # proximity scales; the proximity cost of more distant obstacles is negligible
+SAME_TIME = 1e-5  # relative difference of the costs of ends that does not matter
 SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
@@ -109,7 +110,10 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
     ends = _ends(problem, problems, tol)
     if not ends[0].solved:
         raise SolveError(ends[0].limit, problem.name if isinstance(problem, Scenario) else "")
-    best = _finish(min(ends, key=_limit_cost), problems)
+    lowest = min(map(_limit_cost, ends))
+    # Of equal paths, the one with the smallest control weights.
+    best = max((end for end in ends if _limit_cost(end) <= lowest * (1.0 + SAME_TIME)), key=lambda end: end.solved)
+    best = _finish(best, problems)
     tolerance = 0.5 * len(bounds) * weights[best.solved - 1]
     extremal = best.limit
     lower_bound = np.nan if has_state_cost else extremal.cost / (1.0 + tolerance)
@@ -146,8 +150,17 @@ def _ends(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalCon
 
     def follow(starts: Sequence[_Start]) -> None:
         nonlocal failed
-        for start in sorted(starts, key=lambda start: _lowest_limit(start.extremal))[:MAX_PATHS]:
+        reached: list[_Start] = []
+        followed: list[_Start] = []
+        for start in sorted(starts, key=lambda start: _lowest_limit(start.extremal)):
+            # Of equal extremals, or mirror images, another one is followed if the first one is lost on the way.
+            is_new = not any(_is_same(start, one) for one in followed)
+            if any(_is_same(start, one) for one in reached) or (is_new and len(followed) == MAX_PATHS):
+                continue
+            followed += [start] if is_new else []
             end = _follow(start, problems, min(map(_limit_cost, found), default=math.inf))
+            if end.solved == len(problems):
+                reached.append(start)
             if end.solved:
                 found.append(end)
             else:
@@ -216,34 +229,25 @@ def _with_weight(problem: OptimalControlProblem, bounds: np.ndarray, weight: flo
 
 
 def _starts(problems: Sequence[OptimalControlProblem]) -> list[_Start]:
-    """Return the distinct extremals from which the continuations start."""
+    """Return extremals from which the continuations start."""
     starts = _from_pieces(problems)
     if not starts or _has_state_cost(problems[0]):
         for wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
-            _add(starts, _Start(solve(wound, "multiple_shooting", guess=path), 1))
+            extremal = solve(wound, "multiple_shooting", guess=path)
+            starts += [_Start(extremal, 1)] if extremal.success else []
     return starts
 
 
 def _from_pieces(problems: Sequence[OptimalControlProblem], max_time: float = math.inf) -> list[_Start]:
-    """Return the distinct extremals close to paths of few pieces that take at most a given time (s)."""
-    starts: list[_Start] = []
-    for path in piecewise_paths(problems[0]):
-        found = _first(path, problems) if path.time < max_time else None
-        if found is not None:
-            _add(starts, found)
-    return starts
+    """Return the extremals close to paths of few pieces that take at most a given time (s)."""
+    paths = [path for path in piecewise_paths(problems[0]) if path.time < max_time]
+    return [start for path in paths if (start := _first(path, problems)) is not None]
 
 
-def _add(starts: list[_Start], start: _Start) -> None:
-    """Add a start, unless it is a failure or an extremal that is known."""
-    extremal, solved = start
-    if extremal.success and not any(solved == one.solved and _is_same(extremal, one.extremal) for one in starts):
-        starts.append(start)
-
-
-def _is_same(extremal: Extremal, other: Extremal) -> bool:
+def _is_same(start: _Start, other: _Start) -> bool:
     """Return whether two extremals of the same control weights are one, or mirror images."""
-    return abs(extremal.cost - other.cost) <= SAME_COST * abs(other.cost)
+    difference = abs(start.extremal.cost - other.extremal.cost)
+    return start.solved == other.solved and difference <= SAME_COST * abs(other.extremal.cost)
 
 
 def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _Start | None:

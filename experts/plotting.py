@@ -26,8 +26,8 @@ from leapnav.experts.optimum import Optimum
 from leapnav.experts.problem.extremal import Extremal, Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.problem.system import ControlAffineSystem
+from leapnav.experts.search.structure import Piece
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
-from leapnav.experts.structure import Piece
 
 PIECES = {"straight": OPTIMUM, "turn": CURVES[1], "contact": EDGE}  # colors of the pieces of a path
 MAX_ALTERNATIVES = len(ALTERNATIVES)
