@@ -29,7 +29,7 @@ from leapnav.experts.problem.system import ControlAffineSystem
 from leapnav.experts.search.structure import Piece
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
 
-PIECES = {"straight": OPTIMUM, "turn": CURVES[1], "contact": EDGE}  # colors of the pieces of a path
+PIECES = {"straight": OPTIMUM, "turn": CURVES[4], "contact": WALL}  # colors of the pieces of a path
 MAX_ALTERNATIVES = len(ALTERNATIVES)
 N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
 N_POINTS = 400  # points of a dense path

@@ -103,9 +103,9 @@ def test_a_closed_passage_has_no_path():
 
 
 def test_the_length_of_a_box_is_close_to_its_lower_bound():
-    scenario = among(Circle(center=(3, 2), radius=0.5), robot=Unicycle(footprint=Box(length=0.5, width=0.3)))
-    found = minimum_length(scenario)
-    assert found.lower_bound < found.length < 1.005 * found.lower_bound
+    scenario = among(Circle(center=(3, 2.1), radius=0.5), robot=Unicycle(footprint=Box(length=0.5, width=0.3)))
+    found = minimum_length(scenario, 5e-3)
+    assert found.lower_bound < found.length < 1.01 * found.lower_bound
     assert found.tolerance == pytest.approx(found.length / found.lower_bound - 1)
     assert "contact" in [piece.kind for piece in found.pieces]
     assert found.extremal.certificate.clearance > 0
