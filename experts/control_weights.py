@@ -12,9 +12,10 @@ import math
 import numpy as np
 
 from leapnav.envs.shapes.clearance import path_clearance
-from leapnav.experts.continuation import continuation
+from leapnav.experts.continuation import blend
 from leapnav.experts.hard_limits import follow_limit, softened, without_barrier
 from leapnav.experts.numerics.state_bounds import state_margin
+from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solve import Method, solve
@@ -26,6 +27,7 @@ SEGMENTS, MIN_SEGMENTS, INTERVALS_PER_SEGMENT = 32, 8, 2
 INTERVALS = INTERVALS_PER_SEGMENT * SEGMENTS
 # Newton steps of an attempt; without the limit, a divergent one takes up to 6 s.
 MAX_ITERATIONS = 20
+SMALLEST_STEP = 1 / 64  # between two control weights
 MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
 
 
@@ -35,6 +37,8 @@ def is_free(problem: OptimalControlProblem, states: np.ndarray) -> bool:
         return False
     if problem.field is None or problem.system.position is None:
         return True
+    if problem.outline[:, 4].any():  # the outline of a robot model, with joints
+        return path_clearance(np.ascontiguousarray(states), problem.outline, problem.field) > 0
     at = [problem.system.state.index(symbol) for symbol in problem.system.position]
     heading = problem.system.heading
     headings = np.zeros(len(states)) if heading is None else states[:, problem.system.state.index(heading)]
@@ -84,8 +88,18 @@ def next_extremal(extremal: Extremal, problem: OptimalControlProblem) -> Extrema
 
 def continued(extremal: Extremal, problem: OptimalControlProblem, method: Method) -> Extremal | None:
     """Solve a problem from the extremal of a similar one, by way of intermediate problems if necessary."""
-    *_, last = continuation([extremal.problem, problem], method, guess=extremal)
-    return last if last.success and last.problem.control_weight == problem.control_weight else None
+    origin = extremal.problem
+
+    def advance(fraction: float, guess: Extremal) -> Extremal | None:
+        between = problem if fraction == 1.0 else blend(origin, problem, fraction)
+        if method == "multiple_shooting":  # without more and more segments, which took 100 s where it fails
+            segments = max(2 * SEGMENTS, guess.n_nodes - 1)
+            found = solve(between, method, guess, max_iterations=MAX_ITERATIONS, segments=segments)
+        else:
+            found = solve(between, method, guess)
+        return found if found.success else None
+
+    return step_halving(advance, extremal, min_step=SMALLEST_STEP)
 
 
 def limit_of(extremal: Extremal) -> Extremal:
