@@ -198,6 +198,15 @@ def test_a_case_of_tpcap_is_a_car_that_parks(tmp_path):
     assert optimum.success and optimum.driving_modes[-1] == "backward"
 
 
+def test_the_table_of_tpcap(tmp_path, capsys):
+    write_case(tmp_path, 1, (0, 0, 0), (9, 1, 0), [parked(3, -9, 5, -6)])
+    out = tmp_path / "table.json"
+    assert main(["benchmark", "tpcap", str(tmp_path), "--tol", "0.2", "--json", str(out)]) == 0
+    assert "tpcap-1" in capsys.readouterr().out
+    row = json.loads(out.read_text())["tpcap-1"]
+    assert math.hypot(9, 1) / 2.5 < row["leapnav"] < 1.5 * 9 / 2.5 and row["clearance"] > 0  # at most 2.5 m/s
+
+
 @pytest.mark.parametrize("text", ["", "1,2,3", "0,0,0,5,0,0,1,4,1,1,2,2,3,3\n", "a,b\n"])
 def test_an_invalid_case_of_tpcap_is_named(text, tmp_path):
     (tmp_path / "Case1.csv").write_text(text)

@@ -6,12 +6,16 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from leapnav.commands.options import TaskOptions
 from leapnav.outputs import FAILED, check_outputs, write_json
+
+if TYPE_CHECKING:
+    from leapnav.envs.scenarios.scenario import Scenario
+    from leapnav.experts.minimum_time import MinimumTime
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,6 @@ class BenchmarkDynobench:
         check_outputs(self.json)
         from leapnav.envs.worlds.dynobench import read_dynobench
         from leapnav.envs.worlds.dynobench_rules import check_trajectory, discretise
-        from leapnav.experts import SolveError, minimum_time
 
         problems = read_dynobench(self.folder)
         planners = sorted({planner for problem in problems.values() for planner in problem.durations})
@@ -96,15 +99,9 @@ class BenchmarkDynobench:
             if problem.scenario is None:
                 print(f"{name}: left out: {problem.reason}")
                 continue
-            row: dict[str, float | None] = dict.fromkeys(("leapnav", "steps", "tolerance", "clearance", *planners))
-            try:
-                found = minimum_time(problem.scenario, self.tol)
-            except SolveError as error:
-                print(error)
-            else:
-                certificate = found.extremal.certificate
-                clearance = certificate.clearance if certificate is not None else None
-                row |= {"leapnav": found.horizon, "tolerance": found.tolerance, "clearance": clearance}
+            row, found = _minimum_time(problem.scenario, self.tol)
+            row = {"leapnav": row.pop("leapnav"), "steps": None, **row, **dict.fromkeys(planners)}
+            if found is not None:
                 extremal = found.extremal
                 trajectory = discretise(problem, lambda times: extremal.evaluate(times)[0], found.horizon)  # noqa: B023
                 row["steps"] = problem.time_step * len(trajectory.actions)
@@ -118,12 +115,56 @@ class BenchmarkDynobench:
 
 
 @dataclass(frozen=True)
+class BenchmarkTpcap:
+    """Compute the minimum times of the cases of the competition TPCAP (automated parking).
+
+    The car has the dimensions, the steering and the largest speed of the competition, but no limit of the acceleration,
+    so that the times are shorter than the arrival times of the competition. Obstacles must not be touched.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Directory of the files CaseN.csv."""
+    tol: float = 0.02
+    """Tolerance of the minimum time, see `leapnav.experts.minimum_time`."""
+    json: Path | None = None
+    """JSON file of the table; "-" for standard output."""
+
+    def run(self) -> int:
+        """Compute the minimum times and print the table; it fails if one is missing."""
+        check_outputs(self.json)
+        from leapnav.envs.worlds.tpcap import read_tpcap
+
+        rows: dict[str, dict[str, float | None]] = {}
+        for scenario in read_tpcap(self.folder):
+            cost = scenario.cost.model_copy(update={"proximity_weight": 0.0})
+            rows[scenario.name or ""] = _minimum_time(scenario.model_copy(update={"cost": cost}), self.tol)[0]
+        _print_durations(rows)
+        write_json(rows, self.json)
+        return 0 if all(row["leapnav"] is not None for row in rows.values()) else FAILED
+
+
+def _minimum_time(scenario: Scenario, tol: float) -> tuple[dict[str, float | None], MinimumTime | None]:
+    """Return time (s), tolerance and clearance (m) of the path of minimum time, None if there is none, and the path."""
+    from leapnav.experts import SolveError, minimum_time
+
+    try:
+        found = minimum_time(scenario, tol)
+    except SolveError as error:
+        print(error)
+        return dict.fromkeys(("leapnav", "tolerance", "clearance")), None
+    certificate = found.extremal.certificate
+    clearance = certificate.clearance if certificate is not None else None
+    return {"leapnav": found.horizon, "tolerance": found.tolerance, "clearance": clearance}, found
+
+
+@dataclass(frozen=True)
 class Benchmark:
     """Run a benchmark of the field on your own download."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[BenchmarkBarn, tyro.conf.subcommand("barn")]
         | Annotated[BenchmarkDynobench, tyro.conf.subcommand("dynobench")]
+        | Annotated[BenchmarkTpcap, tyro.conf.subcommand("tpcap")]
     ]
 
 
