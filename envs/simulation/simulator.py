@@ -312,10 +312,12 @@ class BatchSimulator:
                 return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
 
             return track
-        new = np.zeros(len(state))
+        new, joints = np.zeros(len(state)), np.unique(sim.outlines[i, :, 4]).astype(int)
+        joints = joints[joints > 0]  # a trailer does not turn relative to a robot in contact
 
         def follow(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
             model.advance(np.array([0.0, 0.0, heading, *state[3:]]), controls, step, sim.parameters[i], new)
+            new[joints] = state[joints]
             state[3:] = new[3:]
             return new[0] / step, new[1] / step, (new[2] - heading) / step
 
