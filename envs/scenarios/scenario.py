@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -132,10 +133,11 @@ class Scenario(Frozen):
         for end, given in (("start", self.start_state), ("goal", self.goal_state)):
             state = np.array([value or 0.0 for value in given])
             distance, nearest = footprint_clearance(state, self.outline, self.field)
-            if given[2] is None and not self.robot.is_one_disc:  # some heading must be free
-                states = np.tile(state, (N_HEADINGS, 1))
-                states[:, 2] = np.linspace(-np.pi, np.pi, N_HEADINGS)
-                distance, nearest = max(footprint_clearance(state, self.outline, self.field) for state in states)
+            free = [k for k in {2, *self.outline[:, 4].astype(int)} - {0} if given[k] is None]
+            circle = np.linspace(-np.pi, np.pi, N_HEADINGS)
+            for angles in product(circle, repeat=len(free)) if free and not distance > 0 else ():
+                state[free] = angles  # at some heading and hitch angle there must be no contact
+                distance, nearest = max((distance, nearest), footprint_clearance(state, self.outline, self.field))
             if not distance > 0:
                 faults.append(
                     f"{end}: ({state[0]:g}, {state[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"

@@ -147,8 +147,15 @@ def test_a_scenario_with_a_trailer_is_read_as_it_was_written():
         ({"robot": {**ROBOT, "trailer": {"box": {"length": 1.0}}}}, "robot.trailer.box.width: missing"),
         ({"robot": {**ROBOT, "max_hitch_angle": 0.3}, "start_motion": [0, 0.5]}, "hitch_angle from -0.3 to 0.3, got 0"),
         ({"start": [0.7, 0.55, 0], "start_motion": [0, 1.4]}, r"start: \(0.7, 0.55\) is inside the arena wall"),
+        ({"goal": [0.85, 0.55, 0], "goal_motion": [0, 1.4]}, r"goal: \(0.85, 0.55\) is inside the arena wall"),
     ],
 )
 def test_an_invalid_robot_with_a_trailer_is_named(changes, message):
     with pytest.raises(ScenarioError, match=message):
         task(**changes)
+
+
+def test_a_goal_with_a_free_hitch_angle_needs_some_angle_without_contact():
+    assert task(goal=[0.6, 0.55, 0.0]).goal_state == (0.6, 0.55, 0.0, None, None)  # straight behind it is the wall
+    with pytest.raises(ScenarioError, match="goal: .* is inside the arena wall"):
+        task(goal=[0.6, 0.55, 0.0], goal_motion=[None, 0.0])
