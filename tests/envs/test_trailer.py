@@ -157,5 +157,5 @@ def test_an_invalid_robot_with_a_trailer_is_named(changes, message):
 
 def test_a_goal_with_a_free_hitch_angle_needs_some_angle_without_contact():
     assert task(goal=[0.6, 0.55, 0.0]).goal_state == (0.6, 0.55, 0.0, None, None)  # straight behind it is the wall
-    with pytest.raises(ScenarioError, match="goal: .* is inside the arena wall"):
+    with pytest.raises(ScenarioError, match=r"goal: .* is inside the arena wall"):
         task(goal=[0.6, 0.55, 0.0], goal_motion=[None, 0.0])
