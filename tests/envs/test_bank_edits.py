@@ -37,7 +37,9 @@ def original(request, tmp_path_factory):
         )
     rejected = {"no certified optimum": 2}
     write_bank(path, entries, family=family, seed=1, drawn=N_SCENARIOS + 2, rejected=rejected, software="0")
+    lengths = np.append(np.linspace(1.0, 9.0, N_SCENARIOS - 1), math.nan)
     add_datasets(path, lower_bounds=np.append(0.9 * shipped.costs[: N_SCENARIOS - 1], math.nan))
+    add_datasets(path, shortest_lengths=lengths, shortest_times=lengths / 2)
     with h5py.File(path) as file:
         attributes = {name: value for name, value in file.attrs.items() if name != "checksums"}
         return {name: dataset[()] for name, dataset in file.items()}, attributes, ScenarioBank(path)

@@ -26,9 +26,7 @@ def test_a_changed_generator_generates_again(generator, compile_module, changed,
 
     def compile_again():
         # Without the cache of results of this process.
-        compile_module.__wrapped__(
-            ControlAffineSystem(state=(x,), drift=(-x,), fields=((sp.Integer(1),),)), x**2, "none"
-        )
+        compile_module.__wrapped__(ControlAffineSystem(state=(x,), drift=(-x,), fields=((sp.Integer(1),),)), x**2, None)
 
     def generate(*_):
         raise Generated

@@ -65,7 +65,7 @@ def test_the_proximity_cost_of_the_transcription_is_that_of_the_kernels():
     ]
     small = Scenario.from_dict(scenario_fields(obstacles=obstacles))
     x, y = casadi.SX.sym("x"), casadi.SX.sym("y")
-    value = _proximity(small, casadi.vertcat(x, y, 0), (0.0, 0.0, 0.0, 0.3))
+    value = _proximity(small, casadi.vertcat(x, y, 0), (0.0, 0.0, 0.0, 0.3, 0))
     hessian, gradient = casadi.hessian(value, casadi.vertcat(x, y))
     entries = [value, gradient[0], gradient[1], hessian[0, 0], hessian[0, 1], hessian[1, 1]]
     function = casadi.Function("proximity", [x, y], entries)

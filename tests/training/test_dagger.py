@@ -47,6 +47,7 @@ def driven(scenario, states, *, success=False, collision=False, costs=None):
         costs=np.zeros(count) if costs is None else costs,
         episode_return=0.0,
         clearance=0.1,
+        duration=0.05 * (count - 1),
         success=success,
         collision=collision,
         truncated=False,
