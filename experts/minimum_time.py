@@ -18,6 +18,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import check_positive
+from leapnav.experts.continuation import continuation
 from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit_of, next_extremal, transcribed
 from leapnav.experts.optimum import find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
@@ -278,7 +279,10 @@ def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: floa
     for problem in problems[count:]:
         if _lowest_limit(extremal) > best:
             return _End(extremal, 0, extremal)
-        found = next_extremal(extremal, replace(problem, goal=extremal.problem.goal, barrier_weight=barrier))
+        following = replace(problem, goal=extremal.problem.goal, barrier_weight=barrier)
+        found = next_extremal(extremal, following)
+        if not found.success and count == 0:  # without this problem there is no result, so more effort is worth it
+            found = continuation([extremal.problem, following], guess=extremal)[-1]
         if not found.success:
             failed = found
             break
