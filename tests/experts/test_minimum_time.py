@@ -102,7 +102,9 @@ def test_the_minimum_time_of_each_family_of_reeds_and_shepp(family):
     check(reeds_shepp_problem(REEDS_SHEPP_GOALS[family]), lengths[shortest])
 
 
-@pytest.mark.parametrize("goal", [(0, 1, 0), (0.3, 0.1, 2.5), (3, 1, 0.5)])
+@pytest.mark.parametrize(
+    "goal", [(0, 1, 0), *(pytest.param(goal, marks=pytest.mark.slow) for goal in ((0.3, 0.1, 2.5), (3, 1, 0.5)))]
+)
 def test_the_minimum_time_of_the_differential_drive(goal):
     check(drive_problem(goal), balkcom_mason(goal, starts=10))
 
@@ -115,6 +117,7 @@ def test_the_minimum_times_of_random_goals(goal):
     check(drive_problem(goal), balkcom_mason(goal, starts=10))
 
 
+@pytest.mark.slow
 def test_the_closed_forms_agree_with_each_other():
     for x, y, heading in random_goals(50, 1):
         length = min(reeds_shepp((x, y, heading)).values())
