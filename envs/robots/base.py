@@ -250,11 +250,6 @@ class RobotModel(Frozen):
         """Return the values of the parameters of `dynamics`."""
         return ()
 
-    @property
-    def is_one_disc(self) -> bool:
-        """Whether the footprint is one disc around (x, y)."""
-        return self.footprint is None
-
     def outline(self) -> np.ndarray:
         """Return the footprint as a read-only array (K, 5), see `leapnav.envs.robots.footprints.outline_of`."""
         return outline_of((Disc(radius=self.radius),) if self.footprint is None else self.footprint)

@@ -86,10 +86,6 @@ class _Towing(RobotModel):
             )
         return self
 
-    @property
-    def is_one_disc(self) -> bool:
-        return False
-
     def outline(self) -> np.ndarray:
         trailer = outline_of(self.trailer, ahead=-self.hitch_length, joint=len(self.state_names) - 1)
         outline = np.concatenate([super().outline(), trailer])

@@ -219,7 +219,7 @@ class Shortest:
 
     They are the denominators of SPL and SCT in `leapnav evaluate`. The same command resumes after an interruption.
 
-    Exit code 1: neither was found for a scenario, whose name is printed.
+    Exit code 1: one of the two was not found for a scenario, whose name is printed.
     """
 
     file: tyro.conf.Positional[Path]
