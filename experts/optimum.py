@@ -30,6 +30,7 @@ from leapnav.experts.search.candidates import (
 )
 from leapnav.experts.search.lattice import Lattice, is_connected
 from leapnav.experts.search.local_optima import LocalOptima
+from leapnav.experts.search.manoeuvres import manoeuvres
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 from leapnav.experts.solve import solve
@@ -293,6 +294,8 @@ def _search(
         # Lattice paths may lead through passages that are slightly too narrow, so this is checked separately.
         if effort != "low" and (optima is None or not optima.certified) and not is_connected(scenario):
             return optima, Status.NO_PATH
+        if effort != "low" and optima is not None and lattice.refinement == 1:
+            optima.add_manoeuvres(manoeuvres(scenario))
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if shortest_time == np.inf:
         return optima, Status.NO_PATH

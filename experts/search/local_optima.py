@@ -12,7 +12,7 @@ Each candidate path goes through the same steps, and ends in one `Verdict`:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -29,10 +29,13 @@ from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.solvers.multiple_shooting import confirm, polish
 from leapnav.experts.solvers.nodes import SolverOptions
-from leapnav.experts.transcription.direct import RELAXED_DISTANCE, DirectPath, discretise, optimise
+from leapnav.experts.transcription.adaptive import settle
+from leapnav.experts.transcription.direct import MAX_VIOLATION, RELAXED_DISTANCE, DirectPath, discretise, optimise
 
 TOLERANCE = 1e-9
-NEWTON_ITERATIONS = 20  # with 14, 1.4 times as many evaluations in 93 difficult scenarios; with 25 about the same
+# Newton steps of a candidate, and of a manoeuvre, whose Hamiltonian changes abruptly at contacts.
+# With 14 for candidates, 1.4 times as many evaluations in 93 difficult scenarios; with 25 about the same.
+NEWTON_ITERATIONS, MANOEUVRE_ITERATIONS = 20, 60
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
 INTERVALS_PER_SEGMENT, MIN_SEGMENTS, MAX_ATTEMPTS = 8, 8, 3
 # A long refined path: number of intervals above which it is one, attempts that it omits, and intervals per segment.
@@ -61,7 +64,6 @@ RESOLUTION, MAX_PIECES = 0.25, 64
 # Factor of the proximity scale in this for a rectangle, whose corners turn the direction of the distance abruptly. With
 # 1, a rectangle does not pass a gap that is 4 % wider; with 0.05, the search there takes three times as long.
 CORNER_RESOLUTION = 0.2
-MAX_VIOLATION = 1e-3  # sum of the constraint violations of a direct path
 COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 65)  # of the horizon, at which paths are compared
 
 
@@ -133,7 +135,7 @@ class LocalOptima:
     ) -> None:
         self.scenario, self.problem = scenario, softened(problem, energy, SEARCH_WEIGHT)
         self.verdicts: list[Verdict] = []
-        self._relaxed_weight, self._budget = RELAXED_WEIGHT * energy, budget
+        self._energy, self._relaxed_weight, self._budget = energy, RELAXED_WEIGHT * energy, budget
         self._radius = float(scenario.outline[:, 2:4].sum(axis=1).min())  # of the smallest disc inside
         has_corners = isinstance(scenario.robot.footprint, Box)
         self._scale = scenario.cost.proximity_scale * (CORNER_RESOLUTION if has_corners else 1.0) / sharpness
@@ -200,11 +202,15 @@ class LocalOptima:
 
     def _relax(self, path: Trajectory) -> tuple[OptimalControlProblem, DirectPath]:
         """Return the direct path of a path with the relaxed barrier, with its problem."""
-        goal = self.problem.wound_goal(path.states)
-        if goal not in self._wound:
-            self._wound[goal] = self.problem.with_winding_of(path.states)
-        problem = self._wound[goal]
+        problem = self._with_winding(path.states)
         return problem, self._optimise(problem, discretise(problem, path), RELAXED_DISTANCE)
+
+    def _with_winding(self, states: np.ndarray) -> OptimalControlProblem:
+        """Return the problem with the winding of a path."""
+        goal = self.problem.wound_goal(states)
+        if goal not in self._wound:
+            self._wound[goal] = self.problem.with_winding_of(states)
+        return self._wound[goal]
 
     def _tighten(self, problem: OptimalControlProblem, relaxed: DirectPath) -> DirectPath:
         """Return the direct path with the barrier itself, unless the refinement makes this step."""
@@ -231,6 +237,16 @@ class LocalOptima:
             if path.converged and path.violation < MAX_VIOLATION and self._clearance(path) > 0.0:
                 costs.append(path.cost)
         return min(costs, default=math.inf)
+
+    def add_manoeuvres(self, guesses: Iterable[DirectPath]) -> None:
+        """Compute the local optima of paths that are free of contact, on adaptive meshes."""
+        for guess in guesses:
+            problem = self._with_winding(guess.states)
+            paths = settle(problem, guess, self._energy)
+            attempts = ((len(path.controls) // INTERVALS_PER_SEGMENT, path) for path in paths)
+            extremal, _ = self._extremal(problem, attempts, max_iterations=MANOEUVRE_ITERATIONS)
+            if extremal is not None:
+                self.verdicts.append(self._verdict(problem, guess, extremal))
 
     def refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
         """Return the optimum on shorter intervals, of a free horizon with a better duration."""
@@ -292,43 +308,58 @@ class LocalOptima:
         is_expensive = self._is_expensive(refined, REFINED_ERROR)
         extremal, evaluations = None, 0
         if is_feasible or not self.certified:
-            extremal, evaluations = self._extremal(problem, refined)
+            extremal, evaluations = self._extremal(problem, self._attempts(problem, refined), self._extremals())
         if is_expensive:
             self._budget -= evaluations
+        return self._verdict(problem, refined, extremal)
+
+    def _verdict(self, problem: OptimalControlProblem, path: DirectPath, extremal: Extremal | None) -> Verdict:
+        """Return the end of a path with its extremal."""
         if extremal is None:
-            return Verdict(Outcome.STALLED, problem, refined)
+            return Verdict(Outcome.STALLED, problem, path)
         if self._is_known(extremal):
-            return Verdict(Outcome.DUPLICATE, problem, refined, extremal)
+            return Verdict(Outcome.DUPLICATE, problem, path, extremal)
         self._seen.append(_shape(extremal.times, extremal.states))
         if not extremal.success:
-            return Verdict(Outcome.REFUSED, problem, refined, extremal)
-        return Verdict(Outcome.CERTIFIED, problem, refined, extremal, expected_limit(without_barrier(extremal)))
+            return Verdict(Outcome.REFUSED, problem, path, extremal)
+        return Verdict(Outcome.CERTIFIED, problem, path, extremal, expected_limit(without_barrier(extremal)))
 
-    def _extremal(self, problem: OptimalControlProblem, direct: DirectPath) -> tuple[Extremal | None, int]:
-        """Apply multiple shooting to a direct path, and refine the path as long as that fails.
+    def _attempts(self, problem: OptimalControlProblem, direct: DirectPath) -> Iterator[tuple[int, DirectPath]]:
+        """Yield numbers of segments of multiple shooting, each with the path to apply it to."""
+        is_expensive = self._is_expensive(direct, REFINED_ERROR)  # not the optimum
+        # On a long path, some place is too coarse for the first attempts.
+        first = SKIPPED_ATTEMPTS if len(direct.controls) > LONG_PATH else 0
+        for attempt in range(first + (1 if is_expensive else MAX_ATTEMPTS)):
+            if attempt > 0:
+                direct = self._optimise(problem, direct.refined())
+            if attempt >= first:
+                intervals, is_long = len(direct.controls), len(direct.controls) > LONG_PATH * 2**attempt
+                length = INTERVALS_PER_SEGMENT_OF_LONG_PATH if is_long else INTERVALS_PER_SEGMENT
+                yield max(round(intervals / (length * 2**attempt)), MIN_SEGMENTS) * 2**attempt, direct
+
+    def _extremal(
+        self,
+        problem: OptimalControlProblem,
+        attempts: Iterable[tuple[int, DirectPath]],
+        known: Sequence[Extremal] = (),
+        max_iterations: int = NEWTON_ITERATIONS,
+    ) -> tuple[Extremal | None, int]:
+        """Apply multiple shooting in several attempts, until one succeeds or a path is close to a known extremal.
 
         Returns the extremal, or None, and the number of evaluations of the flow.
         """
         history: tuple[Iteration, ...] = ()
         total, refused = 0, None
-        is_expensive = self._is_expensive(direct, REFINED_ERROR)  # not the optimum
-        n_attempts = 1 if is_expensive else MAX_ATTEMPTS
-        # On a long path, some place is too coarse for the first attempts.
-        first = SKIPPED_ATTEMPTS if len(direct.controls) > LONG_PATH else 0
-        for attempt in range(n_attempts + first):
-            if attempt > 0:
-                direct = self._optimise(problem, direct.refined())
-                for extremal in self._extremals():
-                    if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
-                        return extremal, total
-            if attempt < first:
-                continue
-            times, nodes = _shooting_nodes(problem, direct, 2**attempt)
-            status, rows, evaluations = _polish(problem, times, nodes)
+        for segments, direct in attempts:
+            for extremal in known:
+                if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
+                    return extremal, total
+            times, nodes = direct.nodes(problem, segments)
+            status, rows, evaluations = _polish(problem, times, nodes, max_iterations)
             history += rows
             total += evaluations
             if status is Status.SUCCESS:
-                options = SolverOptions(TOLERANCE, NEWTON_ITERATIONS)
+                options = SolverOptions(TOLERANCE, max_iterations)
                 found = confirm(problem, times, nodes, status, history, total, options)
                 if found.status is Status.NOT_CERTIFIED:  # on shorter segments, integration errors grow less
                     refused = found
@@ -390,44 +421,22 @@ class LocalOptima:
 
 
 def _polish(
-    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray
+    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, max_iterations: int
 ) -> tuple[Status, tuple[Iteration, ...], int]:
     """Apply Newton's method, with a free horizon if necessary in two stages, of which the first keeps the times."""
     first_times, first = times.copy(), nodes.copy()
-    status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, NEWTON_ITERATIONS)
+    status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, max_iterations)
     if status is Status.SUCCESS or problem.horizon is not None:
         return status, rows, evaluations
     times[:] = first_times
     fixed = problem.with_horizon(float(times[-1]))
-    status, more, count = polish(fixed, times, first, TOLERANCE, NEWTON_ITERATIONS)
+    status, more, count = polish(fixed, times, first, TOLERANCE, max_iterations)
     rows, evaluations = rows + more, evaluations + count
     if status is Status.SUCCESS:
         nodes[:] = first
-        status, more, count = polish(problem, times, nodes, TOLERANCE, NEWTON_ITERATIONS)
+        status, more, count = polish(problem, times, nodes, TOLERANCE, max_iterations)
         rows, evaluations = rows + more, evaluations + count
     return status, rows, evaluations
-
-
-def _shooting_nodes(
-    problem: OptimalControlProblem, direct: DirectPath, refinement: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and nodes for multiple shooting, chosen from the points of a direct path.
-
-    Args:
-        problem: the problem.
-        direct: the path.
-        refinement: number of its intervals per interval of the first attempt.
-
-    """
-    intervals = len(direct.controls)
-    per_segment = INTERVALS_PER_SEGMENT if intervals <= LONG_PATH * refinement else INTERVALS_PER_SEGMENT_OF_LONG_PATH
-    segments = max(round(intervals / (per_segment * refinement)), MIN_SEGMENTS) * refinement
-    at = np.rint(np.linspace(0, intervals, segments + 1)).astype(int)
-    times, nodes = direct.times[at], np.concatenate([direct.states[at], direct.costates[at]], axis=1)
-    arrays = problem.arrays
-    n = problem.system.n
-    nodes[-1, :n] = np.where(arrays.free, nodes[-1, :n], arrays.goal)
-    return times, nodes
 
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ MIN_TIME_FACTOR = 0.8  # smallest factor by which a free horizon changes at once
 # Distance (proximity scales) below which the relaxed barrier is a quadratic polynomial. With the proximity weight 0.1,
 # 72 of 72 candidates among the walls of `slalom` led to an extremal, and 6 without relaxation; 1.0 gave the same.
 RELAXED_DISTANCE = 0.5
+MAX_VIOLATION = 1e-3  # sum of the constraint violations of a path that is feasible
 STEP_TOLERANCE = 1e-3  # m and rad, less on short paths; the iteration has converged when a full step is smaller
 
 
@@ -81,17 +82,37 @@ class DirectPath:
         states, costates = (interpolate(times, self.times, array) for array in (self.states, self.costates))
         return DirectPath(times, states, self.controls[index], costates, self.cost, self.violation, False)
 
+    def resampled(self, times: np.ndarray) -> DirectPath:
+        """Return the path at other times (M,), which begin and end as those of the path, as an initial guess."""
+        states, costates = (interpolate(times, self.times, array) for array in (self.states, self.costates))
+        index = np.searchsorted(self.times, 0.5 * (times[1:] + times[:-1])) - 1
+        return DirectPath(times, states, self.controls[index], costates, self.cost, self.violation, False)
+
     def scaled(self, factor: float) -> DirectPath:
         """Return the path with all times multiplied by a factor, which keeps the cost of the path."""
         controls, costates = self.controls / factor, self.costates / factor
         return replace(self, times=factor * self.times, controls=controls, costates=costates)
 
+    def nodes(self, problem: OptimalControlProblem, segments: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return times (segments + 1,) and nodes (segments + 1, 2n) for multiple shooting, of points of the path."""
+        at = np.rint(np.linspace(0, len(self.controls), segments + 1)).astype(int)
+        nodes = np.concatenate([self.states[at], self.costates[at]], axis=1)
+        n, arrays = problem.system.n, problem.arrays
+        nodes[-1, :n] = np.where(arrays.free, nodes[-1, :n], arrays.goal)
+        return self.times[at], nodes
+
     def time_factor(self, problem: OptimalControlProblem) -> float:
         """Return the factor of all times that reduces the cost, for a problem with a free horizon."""
-        at = np.unique(np.linspace(0, len(self.times) - 1, HAMILTONIAN_POINTS).astype(int))
+        return time_factor(self.cost, self.slope(problem, HAMILTONIAN_POINTS), MIN_TIME_FACTOR)
+
+    def slope(self, problem: OptimalControlProblem, points: int | None = None) -> float:
+        """Return the derivative of the cost with respect to the logarithm of the horizon, of a local optimum.
+
+        It is the integral of the Hamiltonian, over all nodes or a number of them.
+        """
+        at = np.unique(np.linspace(0, len(self.times) - 1, points or len(self.times)).astype(int))
         z = np.concatenate([self.states[at], self.costates[at]], axis=1)
-        values = hamiltonians(problem.arrays.flow, z)
-        return time_factor(self.cost, float(np.trapezoid(values, self.times[at])), MIN_TIME_FACTOR)
+        return float(np.trapezoid(hamiltonians(problem.arrays.flow, z), self.times[at]))
 
 
 def generated_functions(problem: OptimalControlProblem) -> tuple[FunctionPointer, ...]:
