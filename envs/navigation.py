@@ -38,8 +38,9 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     the robot reaches the goal pose.
 
     The argument `robot` selects the model of the robot: `"unicycle"`, `"differential_drive"`, `"car"`,
-    `"dynamic_unicycle"` or one's own, see `leapnav.envs.RobotModel`. The tables of this page describe the unicycle; for
-    other robots the action and the part `motion` of the observation differ.
+    `"dynamic_car"`, `"dynamic_unicycle"`, `"trailer"`, `"unicycle_trailer"` or one's own, see
+    `leapnav.envs.RobotModel`. The tables of this page describe the unicycle; for other robots the action and the part
+    `motion` of the observation differ.
 
     With `actuation="velocity"`, the robot follows the exact path of each action, for the unicycle a circular arc.
     pymunk integrates the motion of robots with `actuation="motor"`, and simulates the part of a control period after a

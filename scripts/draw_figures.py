@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from leapnav.envs import (
     Car,
     DifferentialDrive,
+    DynamicCar,
     DynamicUnicycle,
     NavigateEnv,
     ScenarioBank,
@@ -48,7 +49,7 @@ def draw_families() -> None:
 
 def draw_robots() -> None:
     """Draw three scenarios with the optima of each robot."""
-    for model in (Unicycle, DifferentialDrive, Car, DynamicUnicycle, Trailer):
+    for model in (Unicycle, DifferentialDrive, Car, DynamicCar, DynamicUnicycle, Trailer):
         figure = Figure(figsize=(9.6, 3.3), layout="constrained")
         for axes, (family, seed) in zip(figure.subplots(1, 3), ROBOT_SCENARIOS, strict=True):
             scenario = sample_scenario(family, seed, model())

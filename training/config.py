@@ -17,7 +17,7 @@ PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_
 # Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
 # robots of the user are text as well.
 FamilyName = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors", "all"] | str
-RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_unicycle"] | str
+RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]

@@ -3,6 +3,7 @@
 from leapnav.envs.robots.base import Dynamics, RobotModel, Symmetry, register
 from leapnav.envs.robots.car import Car
 from leapnav.envs.robots.differential_drive import DifferentialDrive
+from leapnav.envs.robots.dynamic_car import DynamicCar
 from leapnav.envs.robots.dynamic_unicycle import DynamicUnicycle
 from leapnav.envs.robots.footprints import Box, Disc
 from leapnav.envs.robots.trailer import Trailer, UnicycleTrailer
@@ -13,6 +14,7 @@ __all__ = [
     "Car",
     "DifferentialDrive",
     "Disc",
+    "DynamicCar",
     "DynamicUnicycle",
     "Dynamics",
     "RobotModel",

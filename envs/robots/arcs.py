@@ -37,3 +37,11 @@ def advance_arc(x, y, heading, distance, turn):
     """Return the pose at the end of a circular arc of a length (m; negative: backwards) and a turn (rad)."""
     chord, middle = distance * sinc(0.5 * turn), heading + 0.5 * turn
     return x + chord * math.cos(middle), y + chord * math.sin(middle), heading + turn
+
+
+@kernel(types.UniTuple(float64, 2)(float64, float64, float64, float64, float64), inline="always")
+def until_limit(value, rate, low, high, h):
+    """Return the rate of a state, 0 at its limit, and the time, at most h, before it reaches its limit."""
+    if (rate > 0.0 and value >= high) or (rate < 0.0 and value <= low):
+        return 0.0, h
+    return rate, min(((high if rate > 0.0 else low) - value) / rate, h) if rate != 0.0 else h

@@ -116,12 +116,12 @@ class RobotModel(Frozen):
         mirror: the mirror image (left and right exchanged) of a path of the robot is also one, with these changes;
             None if that is no symmetry.
         reversal: the same for all headings rotated by 180 degrees: the robot follows the same path backwards.
-        velocity_states: names of the further states that are the speed and the turn rate, which a contact changes, or
-            None.
+        velocity_states: names of the further states, at most two, that are the speed and the turn rate, which a contact
+            changes.
         key_controls: the two controls, relative to their limits, with which a person drives ahead and turns left; None
             for the first two.
         is_kinematic: whether a shortest path in the metric of the control weights, on the lattice of `lattice_moves`,
-            approximates an optimum. Otherwise candidates are optimised for a unicycle first, and then lifted.
+            approximates an optimum. Otherwise candidates are optimised for a kinematic robot first, and then lifted.
 
     """
 
@@ -138,7 +138,7 @@ class RobotModel(Frozen):
     heading_states: ClassVar[tuple[str, ...]] = ()
     mirror: ClassVar[Symmetry | None] = None
     reversal: ClassVar[Symmetry | None] = None
-    velocity_states: ClassVar[tuple[str, str] | None] = None
+    velocity_states: ClassVar[tuple[str, ...]] = ()
     key_controls: ClassVar[tuple[tuple[float, ...], tuple[float, ...]] | None] = None
     is_kinematic: ClassVar[bool] = False
 
@@ -279,6 +279,10 @@ class RobotModel(Frozen):
     def max_lattice_cell(self) -> float:
         """Return the largest side (m) of a cell with which the moves approximate the motion."""
         return math.inf
+
+    def kinematic(self) -> RobotModel | None:
+        """Return a kinematic robot on whose optima the search of this one is based; None for a unicycle."""
+        return None
 
     def lift(self, times: np.ndarray, poses: np.ndarray, start: Sequence[float]) -> np.ndarray | None:
         """Return states (N, n) whose poses are those of a path.

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 import numpy as np
-from numba import float64, types
+from numba import float64
 from pydantic import model_validator
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import NOTHING, VECTOR
-from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, rotation
+from leapnav.envs.robots.arcs import GAUSS_NODES, GAUSS_WEIGHTS, MAX_PANEL_TURN, rotation, until_limit
 from leapnav.envs.robots.base import (
     ADVANCE_SIGNATURE,
     POSE,
@@ -48,14 +48,6 @@ def _accelerate(q, acceleration, angular, h, new):
     new[3], new[4] = speed + acceleration * h, turn_rate + angular * h
 
 
-@kernel(types.UniTuple(float64, 2)(float64, float64, float64, float64, float64), inline="always")
-def _until_limit(value, rate, low, high, h):
-    """Return the rate of a state, 0 at its limit, and the time, at most h, before it reaches its limit."""
-    if (rate > 0.0 and value >= high) or (rate < 0.0 and value <= low):
-        return 0.0, h
-    return rate, min(((high if rate > 0.0 else low) - value) / rate, h) if rate != 0.0 else h
-
-
 @kernel(ADVANCE_SIGNATURE)
 def advance(q, u, h, parameters, new):
     """Accelerate; the speed and the turn rate stay at their limits."""
@@ -63,8 +55,8 @@ def advance(q, u, h, parameters, new):
         new[i] = q[i]
     left = h
     for _ in range(3):  # up to the limits of both
-        acceleration, first = _until_limit(new[3], u[0], parameters[2], parameters[3], left)
-        angular, second = _until_limit(new[4], u[1], parameters[4], parameters[5], left)
+        acceleration, first = until_limit(new[3], u[0], parameters[2], parameters[3], left)
+        angular, second = until_limit(new[4], u[1], parameters[4], parameters[5], left)
         step = min(first, second)
         _accelerate(new, acceleration, angular, step, new)
         left -= step
@@ -107,7 +99,7 @@ class DynamicUnicycle(RobotModel):
     control_names: ClassVar[tuple[str, ...]] = ("acceleration", "angular_acceleration")
     control_units: ClassVar[tuple[str, ...]] = ("m/s^2", "rad/s^2")
     goal_motion: ClassVar[tuple[float | None, ...]] = (0.0, 0.0)
-    velocity_states: ClassVar[tuple[str, str] | None] = ("speed", "turn_rate")
+    velocity_states: ClassVar[tuple[str, ...]] = ("speed", "turn_rate")
     advance: ClassVar = advance
     state_cost: ClassVar = state_cost
     mirror: ClassVar[Symmetry | None] = Symmetry((1, -1), ((1, 0), (0, -1)))

@@ -284,10 +284,9 @@ class BatchSimulator:
             del self._contacts[i]
         if self.settings.motors:
             episode["vx"], episode["vy"], episode["spin"] = velocity
-        if model.velocity_states is not None:  # what the contact has left of the velocity
-            ahead = velocity[0] * math.cos(pose[2]) + velocity[1] * math.sin(pose[2])
-            for name, value in zip(model.velocity_states, (ahead, velocity[2]), strict=True):
-                state[model.state_names.index(name)] = value
+        ahead = velocity[0] * math.cos(pose[2]) + velocity[1] * math.sin(pose[2])
+        for name, value in zip(model.velocity_states, (ahead, velocity[2]), strict=False):
+            state[model.state_names.index(name)] = value  # what the contact has left of the velocity
         # The effort is that of the actual motion, or of the controls, which are held. Further states change also in
         # contact; the state cost is that at both ends of the period.
         if self.settings.commands_motion:

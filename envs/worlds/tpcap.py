@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 from pymunk.autogeometry import convex_decomposition
 
-from leapnav.envs.robots import Box, Car
+from leapnav.envs.robots import Box, DynamicCar
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes import Polygon
 
-# The car of the competition: dimensions (m) from the middle of the rear axle, and limits (m/s, rad, rad/s).
+# The car of the competition: dimensions (m) from the middle of the rear axle, and limits (m/s, m/s^2, rad, rad/s).
 WHEELBASE, FRONT_OVERHANG, REAR_OVERHANG, WIDTH = 2.8, 0.96, 0.929, 1.942
-MAX_SPEED, MAX_STEERING, MAX_STEERING_RATE = 2.5, 0.75, 0.5
+MAX_SPEED, MAX_ACCELERATION, MAX_STEERING, MAX_STEERING_RATE = 2.5, 1.0, 0.75, 0.5
 MARGIN = 8.0  # m around start and goal, which is the area of the competition
 PROXIMITY_WEIGHT, PROXIMITY_SCALE = 1.0, 0.05
 CASE = "Case"
@@ -32,7 +32,7 @@ CASE = "Case"
 def read_tpcap(folder: str | os.PathLike[str]) -> list[Scenario]:
     """Read the cases of the competition as scenarios with a free horizon, in the order of their numbers.
 
-    The car has no limit of the acceleration.
+    The car starts at rest and is at rest at the goal; its steering is free there.
     Obstacles that are not convex are divided into convex polygons.
 
     Args:
@@ -65,7 +65,7 @@ def _scenario(path: Path) -> Scenario:
     parts = [part for a, b in pairwise(ends.tolist()) for part in convex_parts(points[a:b])]
     start, goal = values[:3], values[3:6]
     low, high = np.minimum(start[:2], goal[:2]) - MARGIN, np.maximum(start[:2], goal[:2]) + MARGIN
-    car = Car(
+    car = DynamicCar(
         footprint=Box(
             length=WHEELBASE + FRONT_OVERHANG + REAR_OVERHANG,
             width=WIDTH,
@@ -74,6 +74,8 @@ def _scenario(path: Path) -> Scenario:
         wheelbase=WHEELBASE,
         max_steering=MAX_STEERING,
         max_speed=MAX_SPEED,
+        max_acceleration=MAX_ACCELERATION,
+        acceleration_weight=1.0 / MAX_ACCELERATION**2,
         # The steering angle changes at most tan(max_steering) times as fast as the steering state.
         max_steering_rate=MAX_STEERING_RATE / math.tan(MAX_STEERING),
         steering_weight=1.0,

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from leapnav.envs.robots import Unicycle
+from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.problem.dynamics import least_squares_controls
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.transcription.direct import discretise, optimise
 
 MAX_LIMIT = 1e3  # m/s or rad/s, for robots without a limit of the speed or the turn rate
-# Two paths of the unicycle are duplicates if they stay within this distance of each other (m, and rad).
+# Two paths of the kinematic robot are duplicates if they stay within this distance of each other (m, and rad).
 DUPLICATE_DISTANCE = 0.05
 COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 33)  # of the horizon
 
@@ -21,8 +21,8 @@ COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 33)  # of the horizon
 class Lifting:
     """The paths of a robot from paths of poses.
 
-    Candidates of a robot that is not kinematic are optimised for a unicycle with the same footprint and weights first:
-    a lattice path has corners, which the robot cannot follow.
+    Candidates of a robot that is not kinematic are optimised for a kinematic robot with the same footprint and limits
+    first: a lattice path has corners, which the robot cannot follow.
 
     Args:
         scenario: the scenario.
@@ -35,15 +35,9 @@ class Lifting:
         self._scenario, self._problem, self._relaxed_weight = scenario, problem, relaxed_weight
         self._companion: OptimalControlProblem | None = None
         self._seen: list[np.ndarray] = []
-        robot = scenario.robot
-        if not robot.is_kinematic:
-            speed, turn_rate = (min(limit, MAX_LIMIT) for limit in robot.speed_limits())
-            limits: dict[str, Any] = {"max_speed": speed, "max_turn_rate": turn_rate}
-            if robot.footprint is None:
-                unicycle = Unicycle(radius=robot.radius, **limits)
-            else:
-                unicycle = Unicycle(footprint=robot.footprint, **limits)
-            update = {"robot": unicycle, "start_motion": None, "goal_motion": None}
+        if not scenario.robot.is_kinematic:
+            self._kinematic = scenario.robot.kinematic() or _unicycle(scenario.robot)
+            update = {"robot": self._kinematic, "start_motion": None, "goal_motion": None}
             companion = OptimalControlProblem.from_scenario(scenario.model_copy(update=update))
             self._companion = companion.with_barrier(problem.barrier_weight)
 
@@ -52,9 +46,11 @@ class Lifting:
         if path.states.shape[1] > 3:
             return path
         if self._companion is not None:
-            companion = self._companion.with_winding_of(path.states)
-            direct = optimise(companion, discretise(companion, path), relaxed_weight=self._relaxed_weight)
-            path = Trajectory(direct.times, direct.states)
+            lifted = self._kinematic.lift(path.times, path.states, self._companion.start)
+            lifted = path if lifted is None else Trajectory(path.times, lifted)
+            companion = self._companion.with_winding_of(lifted.states)
+            direct = optimise(companion, discretise(companion, lifted), relaxed_weight=self._relaxed_weight)
+            path = Trajectory(direct.times, direct.states[:, :3])
             shape = path.resample(COMPARED_FRACTIONS * path.times[-1]).states
             if any(np.abs(shape - other).max() < DUPLICATE_DISTANCE for other in self._seen):
                 return None
@@ -78,3 +74,10 @@ class Lifting:
             (controls,) = least_squares_controls(fields[None, :3], rates[None])
             states[k + 1, 3:] = states[k, 3:] + step * (drift + fields @ controls)[3:]
         return states
+
+
+def _unicycle(robot: RobotModel) -> Unicycle:
+    """Return a unicycle with the footprint and the limits of a robot."""
+    speed, turn_rate = (min(limit, MAX_LIMIT) for limit in robot.speed_limits())
+    limits: dict[str, Any] = {"max_speed": speed, "max_turn_rate": turn_rate}
+    return Unicycle(footprint=robot.footprint, **limits) if robot.footprint else Unicycle(radius=robot.radius, **limits)

@@ -19,7 +19,7 @@ from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
-from leapnav.envs.robots import Car
+from leapnav.envs.robots import Car, DynamicCar, Trailer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.shapes.clearance import footprint_clearance, footprint_clearances
 from leapnav.experts.transcription.direct import DirectPath
@@ -165,7 +165,7 @@ def manoeuvres(scenario: Scenario) -> Iterator[DirectPath]:
     There are none for other robots, and none if start and goal are too far from each other for the grid.
     """
     robot, field, outline = scenario.robot, scenario.field, scenario.outline
-    if type(robot) is not Car or robot.slowest_speed() > 0.0:
+    if not isinstance(robot, Car) or isinstance(robot, Trailer) or robot.slowest_speed() > 0.0:
         return
     start, goal = np.array(scenario.start), np.array(scenario.goal)
     cell, margin = 1.0 / (CELLS_PER_RADIUS * robot.max_curvature), MARGIN_RADII / robot.max_curvature
@@ -191,24 +191,55 @@ def manoeuvres(scenario: Scenario) -> Iterator[DirectPath]:
 
 def _guess(scenario: Scenario, robot: Car, arcs: np.ndarray) -> DirectPath:
     """Return the path along arcs (K, 5), see `_arcs`, with changes of the steering at standstill."""
-    (behind, ahead), (slowest, fastest) = robot.interval("speed"), robot.interval("steering_rate")
-    state = np.array([*arcs[0, :3], scenario.start_state[3]])
+    slowest, fastest = robot.interval("steering_rate")
+    state = np.array([*arcs[0, :3], scenario.start_state[3], 0.0])
     state[2] += 2.0 * math.pi * round((scenario.start[2] - state[2]) / (2.0 * math.pi))
     steps, states, controls = [], [state], []
-    for *_, steering, length in arcs.tolist():
+    for k in np.flatnonzero(np.append(1.0, np.diff(arcs[:, 3:], axis=0).any(axis=1))).tolist():
+        steering, length = arcs[k, 3:].tolist()
+        count = next((i for i, arc in enumerate(arcs[k:, 3:]) if arc.tolist() != [steering, length]), len(arcs) - k)
         change = steering - states[-1][3]
         if abs(change) > 1e-9:
             pieces = math.ceil(PIECES * abs(change) / (math.pi / 4))
             rate = SPEED_FRACTION * (fastest if change > 0 else slowest)
-            for _ in range(pieces):
-                states.append(states[-1] + (0.0, 0.0, 0.0, change / pieces))
+            states += [states[-1] + (0.0, 0.0, 0.0, change * (i + 1) / pieces, 0.0) for i in range(pieces)]
             controls += pieces * [(0.0, rate)]
             steps += pieces * [change / rate / pieces]
-        speed, curvature = SPEED_FRACTION * (ahead if length > 0 else behind), robot.max_curvature * math.sin(steering)
-        for _ in range(PIECES):
-            states.append(np.array([*_along(states[-1], curvature, length / PIECES), steering]))
-        controls += PIECES * [(speed, 0.0)]
-        steps += PIECES * [length / speed / PIECES]
+        start = states[-1]
+        for step, control, distance, speed in _drive(robot, count * length, PIECES * count):
+            states.append(
+                np.array([*_along(start, robot.max_curvature * math.sin(steering), distance), steering, speed])
+            )
+            controls.append((control, 0.0))
+            steps.append(step)
     times = np.append(0.0, np.cumsum(steps))
-    stacked = np.stack(states)
+    stacked = np.stack(states)[:, : len(robot.state_names)]
     return DirectPath(times, stacked, np.array(controls), np.zeros_like(stacked), math.inf, math.inf, False)
+
+
+def _drive(robot: Car, length: float, pieces: int) -> Iterator[tuple[float, float, float, float]]:
+    """Yield the intervals of a drive of a given length (m): duration, control, and distance and speed at the end."""
+    behind, ahead = robot.interval("speed")
+    cruise = SPEED_FRACTION * (ahead if length > 0 else behind)
+    if not isinstance(robot, DynamicCar):
+        for i in range(pieces):
+            yield length / cruise / pieces, cruise, length * (i + 1) / pieces, 0.0
+        return
+    lowest, highest = robot.interval("acceleration")
+    first, last = (highest, lowest) if length > 0 else (lowest, highest)
+    per_square = (
+        0.5 / SPEED_FRACTION * (1.0 / first - 1.0 / last)
+    )  # distance without cruise per square of the top speed
+    top = math.copysign(min(abs(cruise), math.sqrt(length / per_square)), length)
+    first, last = SPEED_FRACTION * first, SPEED_FRACTION * last
+    distance = speed = 0.0
+    for acceleration, duration in (
+        (first, top / first),
+        (0.0, (length - per_square * top**2) / top),
+        (last, -top / last),
+    ):
+        step = duration / pieces
+        for _ in range(pieces if duration > 1e-9 else 0):
+            distance += (speed + 0.5 * acceleration * step) * step
+            speed += acceleration * step
+            yield step, acceleration, distance, speed

@@ -44,6 +44,7 @@ PRINTED = {
     r"\['speed / max_speed', 'turn_rate / max_turn_rate'\]\nTrue\n",
     "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
     "guides/obstacles.md": rf"True {NUMBER}\nTrue\n8 4 True\nrooms-3\n",
+    "robots/dynamic_car.md": rf"{NUMBER}\n",
     "robots/own_robot.md": r"True 4\n",
     "robots/trailer.md": rf"{NUMBER}\n",
     "guides/own_family.md": r"warehouse-0 \(0\.0, 0\.0, 12\.0, 10\.0\) 4\nTrue\n5 warehouse\n",
