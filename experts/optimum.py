@@ -295,7 +295,8 @@ def _search(
         if effort != "low" and (optima is None or not optima.certified) and not is_connected(scenario):
             return optima, Status.NO_PATH
         if effort != "low" and optima is not None and lattice.refinement == 1:
-            optima.add_manoeuvres(manoeuvres(scenario))
+            if optima.add_manoeuvres(manoeuvres(scenario)):
+                return optima, None
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if shortest_time == np.inf:
         return optima, Status.NO_PATH

@@ -238,8 +238,12 @@ class LocalOptima:
                 costs.append(path.cost)
         return min(costs, default=math.inf)
 
-    def add_manoeuvres(self, guesses: Iterable[DirectPath]) -> None:
-        """Compute the local optima of paths that are free of contact, on adaptive meshes."""
+    def add_manoeuvres(self, guesses: Iterable[DirectPath]) -> bool:
+        """Compute the local optima of paths that are free of contact, on adaptive meshes; return whether any is found.
+
+        A local optimum that was known is also found.
+        """
+        found = False
         for guess in guesses:
             problem = self._with_winding(guess.states)
             paths = settle(problem, guess, self._energy)
@@ -247,6 +251,8 @@ class LocalOptima:
             extremal, _ = self._extremal(problem, attempts, max_iterations=MANOEUVRE_ITERATIONS)
             if extremal is not None:
                 self.verdicts.append(self._verdict(problem, guess, extremal))
+                found = found or extremal.success
+        return found
 
     def refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
         """Return the optimum on shorter intervals, of a free horizon with a better duration."""
