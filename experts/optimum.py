@@ -294,9 +294,9 @@ def _search(
         # Lattice paths may lead through passages that are slightly too narrow, so this is checked separately.
         if effort != "low" and (optima is None or not optima.certified) and not is_connected(scenario):
             return optima, Status.NO_PATH
-        if effort != "low" and optima is not None and lattice.refinement == 1:
-            if optima.add_manoeuvres(manoeuvres(scenario)):
-                return optima, None
+        is_first = effort != "low" and lattice.refinement == 1
+        if is_first and optima is not None and optima.add_manoeuvres(manoeuvres(scenario)):
+            return optima, None
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if shortest_time == np.inf:
         return optima, Status.NO_PATH

@@ -53,6 +53,7 @@ MAX_FIRST_WEIGHTS, FIRST_WEIGHT_FACTOR = 3, 0.1
 # If these fail, the horizon is halved at most this often, and then followed back with at least this fraction of the
 # logarithm of the change per step.
 MAX_HALVINGS, MIN_STEP = 12, 1 / 64
+MIN_INTERVAL = 1e-9  # of the nodes on the way, in units of the horizon: steps of an extremal may end next to each other
 
 
 def solve(
@@ -252,8 +253,9 @@ def _from_shorter_horizons(
         longer = guess.problem.with_horizon(horizon * factor ** (fraction - 1.0))
         times = guess.times * (longer.fixed_horizon / guess.horizon)
         times[-1] = longer.fixed_horizon  # exactly
+        distinct = np.concatenate([[True], np.diff(times)[1:] > MIN_INTERVAL * times[-1], [True]])
         path = Trajectory(times, guess.states, guess.costates)
-        extremal = solver(longer, path, replace(options, mesh=times, subdivide=False))
+        extremal = solver(longer, path, replace(options, mesh=times[distinct], subdivide=False))
         return extremal if extremal.success else None
 
     return step_halving(lengthen, first, min_step=MIN_STEP)

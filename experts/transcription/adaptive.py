@@ -22,13 +22,14 @@ from leapnav.experts.transcription.direct import MAX_VIOLATION, DirectPath, opti
 # clearance, and largest change of the length from an interval to the next. Each mesh halves the three.
 LONGEST, RESOLUTION, GROWTH, MESHES = 1 / 150, 0.5, 0.1, 4
 SMALLEST_CLEARANCE = 0.01  # proximity scales; the mesh does not resolve smaller clearances
-# Weights of the barrier before that of the problem, in units of the mean running cost, and the distance (proximity
-# scales) below which it is then a quadratic polynomial.
-FIRST_WEIGHTS, RELAXED_DISTANCE = (8.0, 2.8), 0.2
+# First weight of the barrier, in units of the mean running cost, the factor from one to the next, and the distance
+# (proximity scales) below which the barrier is a quadratic polynomial while its weight is large.
+FIRST_WEIGHT, WEIGHT_FACTOR, RELAXED_DISTANCE = 8.0, 0.35, 0.2
 MAX_ITERATIONS, FIRST_ITERATIONS = 50, 200  # of a descent, and of the first one
 # Horizon: smallest factor of a step, largest numbers of steps and of halvings of one, and relative tolerance, which is
 # divided by 4 when the weight is that of the problem.
 SMALLEST_FACTOR, MAX_STEPS, MAX_HALVINGS, TOLERANCE = 0.85, 20, 2, 0.02
+FINER = 2  # meshes that are tried if the path crosses an obstacle between the nodes
 MAX_INCREASE = 1.2  # factor of the cost in a descent; after a larger one, the path touches an obstacle
 MAX_ROUNDS, MIN_DECREASE = 8, 1e-3  # of descents on a mesh, and relative decrease of the cost after which one follows
 
@@ -47,11 +48,13 @@ def settle(problem: OptimalControlProblem, guess: DirectPath, energy: float) -> 
     """
     descent = _Descent(problem)
     path: DirectPath | None = guess
-    for weight in FIRST_WEIGHTS:
-        if weight * energy > problem.proximity_weight and path is not None:
-            descent.problem = problem.with_barrier(weight * energy)
-            path = descent.improved(path, 1.0, FIRST_ITERATIONS)
-            path = None if path is None else descent.with_best_horizon(path, TOLERANCE)
+    weight = FIRST_WEIGHT * energy
+    while weight > problem.proximity_weight and path is not None:
+        descent.problem = problem.with_barrier(weight)
+        descent.relaxed_distance = RELAXED_DISTANCE if weight > energy else None  # a small barrier would be crossed
+        path = descent.improved(path, 1.0, FIRST_ITERATIONS)
+        path = None if path is None else descent.with_best_horizon(path, TOLERANCE)
+        weight *= WEIGHT_FACTOR
     descent.problem, descent.relaxed_distance = problem, None
     for mesh in range(MESHES):
         descent.mesh = mesh
@@ -91,13 +94,16 @@ class _Descent:
         self._smallest = SMALLEST_CLEARANCE * float(read_header(self._field)["scale"])
 
     def improved(self, path: DirectPath, factor: float, iterations: int = MAX_ITERATIONS) -> DirectPath | None:
-        """Return the optimum on the mesh of a path with its times multiplied by a factor; None if the descent fails."""
-        guess = path.resampled(self._mesh(path)).scaled(factor)
+        """Return the optimum on a mesh for a path, with its times multiplied by a factor; None if the descent fails."""
         weight = None if self.relaxed_distance is None else self.problem.proximity_weight
-        found = optimise(self.problem, guess, iterations, weight, self.relaxed_distance)
-        is_free = path_clearance(found.states, self._outline, self._field) > 0.0
-        is_better = found.violation < MAX_VIOLATION and found.cost < MAX_INCREASE * path.cost
-        return found if is_free and is_better else None
+        for mesh in range(self.mesh, self.mesh + FINER + 1):
+            guess = path.resampled(self._nodes(path, mesh)).scaled(factor)
+            found = optimise(self.problem, guess, iterations, weight, self.relaxed_distance)
+            if not found.violation < MAX_VIOLATION or not found.cost < MAX_INCREASE * path.cost:
+                return None
+            if path_clearance(found.states, self._outline, self._field) > 0.0:
+                return found
+        return None
 
     def with_best_horizon(self, path: DirectPath, tolerance: float) -> DirectPath:
         """Return the optimum with the best horizon, or with that of the problem; that of the last descent if one fails.
@@ -129,10 +135,10 @@ class _Descent:
             path = following
         return path
 
-    def _mesh(self, path: DirectPath) -> np.ndarray:
+    def _nodes(self, path: DirectPath, mesh: int) -> np.ndarray:
         """Return the times of the nodes of a mesh for a path."""
         times, states = path.times, path.states
-        steps, fineness = np.diff(times), 0.5**self.mesh
+        steps, fineness = np.diff(times), 0.5**mesh
         middles = 0.5 * (times[1:] + times[:-1])
         clearances = footprint_clearances(states, self._outline, self._field)
         clearances = np.minimum(np.minimum(clearances[1:], clearances[:-1]), self._between(states))
@@ -143,9 +149,9 @@ class _Descent:
         longest = growth + np.minimum.accumulate(longest - growth)
         longest = np.minimum.accumulate((longest + growth)[::-1])[::-1] - growth
         counts = np.append(0.0, np.cumsum(steps / longest))
-        mesh = np.interp(np.linspace(0.0, counts[-1], math.ceil(counts[-1]) + 1), counts, times)
-        mesh[0], mesh[-1] = times[0], times[-1]
-        return mesh
+        nodes = np.interp(np.linspace(0.0, counts[-1], math.ceil(counts[-1]) + 1), counts, times)
+        nodes[0], nodes[-1] = times[0], times[-1]
+        return nodes
 
     def _between(self, states: np.ndarray) -> np.ndarray:
         """Return the clearances (N,) in the middles between states."""

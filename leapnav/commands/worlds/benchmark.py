@@ -118,8 +118,8 @@ class BenchmarkDynobench:
 class BenchmarkTpcap:
     """Compute the minimum times of the cases of the competition TPCAP (automated parking).
 
-    The car has the dimensions and the limits of the competition: of speed, acceleration, steering and its rate. It is at
-    rest at both ends. Obstacles must not be touched.
+    The car has the dimensions and the limits of the competition: of speed, acceleration, steering and its rate. It is
+    at rest at both ends. Obstacles must not be touched.
     """
 
     folder: tyro.conf.Positional[Path]
