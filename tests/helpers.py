@@ -19,8 +19,9 @@ from scipy.integrate import solve_ivp
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv, Scenario
 from leapnav.envs.robots.base import MODELS
-from leapnav.experts import ControlAffineSystem, OptimalControlProblem, Trajectory
+from leapnav.experts import ControlAffineSystem, OptimalControlProblem, Status, Trajectory
 from leapnav.experts.acting.policy import plan_actions
+from leapnav.experts.search import local_optima
 from leapnav.experts.solve import METHODS
 from leapnav.training import CloningConfig, make_policy
 
@@ -207,3 +208,15 @@ def cluster_that_loses_a_worker(folder: Path, pattern: str) -> Iterator[str]:
         yield cluster.scheduler_address
         killer.join()
     assert len(killed) == 1
+
+
+def let_newton_stall(monkeypatch, cost):
+    """Let Newton's method stall in the search at extremals of a given cost."""
+    polish = local_optima._polish
+
+    def stalled(*arguments):
+        status, rows, evaluations = polish(*arguments)
+        is_it = status is Status.SUCCESS and abs(rows[-1].cost - cost) < 1e-3 * cost
+        return (Status.STALLED if is_it else status), rows, evaluations
+
+    monkeypatch.setattr(local_optima, "_polish", stalled)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import yaml
-from helpers import cluster_that_loses_a_worker
+from helpers import cluster_that_loses_a_worker, let_newton_stall
 
 import leapnav
 from leapnav.cli import main
@@ -86,9 +86,9 @@ def test_a_data_card_says_where_the_scenarios_come_from(tmp_path, capsys):
     assert "sampled by leapnav, family `clutter`, seed 1" in shipped and 'license: "mit"' in shipped
 
 
-def test_doubtful_optima_are_admitted_on_request(tmp_path):
-    # A draw of the included training bank, which does not contain it.
-    stalled = sample_scenario("clutter", np.random.default_rng([0, 391])).model_copy(update={"name": "stalled"})
+def test_doubtful_optima_are_admitted_on_request(tmp_path, monkeypatch):
+    stalled = sample_scenario("clutter", 0).model_copy(update={"name": "stalled"})
+    let_newton_stall(monkeypatch, find_optimum(stalled).cost)
     strict = build_bank_of([stalled], tmp_path / "strict.bank", progress=False)
     assert len(strict) == 0 and strict.given["rejected"] == {"stalled": "a cheaper solution was not certified"}
     bank = build_bank_of([stalled], tmp_path / "all.bank", doubtful=True, progress=False)
