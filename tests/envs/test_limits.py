@@ -7,7 +7,7 @@ import pytest
 from helpers import info_of_plan, scenario_fields
 from scipy.integrate import cumulative_trapezoid
 
-from leapnav.envs import DifferentialDrive, DynamicUnicycle, NavigateEnv, Scenario, ScenarioError, Unicycle
+from leapnav.envs import DifferentialDrive, DynamicCar, DynamicUnicycle, NavigateEnv, Scenario, ScenarioError, Unicycle
 from leapnav.experts import ExpertPolicy, find_optimum
 from leapnav.training.policies.baselines import GoToGoal
 
@@ -115,6 +115,30 @@ def test_a_robot_does_not_accelerate_beyond_the_limits_of_its_states(acceleratio
     heading = cumulative_trapezoid(turn_rate, times, initial=0.0)
     position = [np.trapezoid(speed * function(heading), times) for function in (np.cos, np.sin)]
     assert new == pytest.approx([*position, heading[-1], speed[-1], turn_rate[-1]], abs=1e-8)
+
+
+@pytest.mark.parametrize(("acceleration", "steering_rate"), [(1.5, 2.0), (-3.0, -1.0), (0.0, 4.0)])
+def test_a_car_does_not_accelerate_beyond_the_limits_of_its_speed(acceleration, steering_rate):
+    scenario = task({"model": "dynamic_car", "speed": [-0.6, 1.2]})
+    parameters, new = np.array(scenario.robot.parameters(scenario.cost)), np.zeros(5)
+    start = np.array([0.0, 0.0, 0.3, -0.2, 0.5])
+    DynamicCar.advance(start, np.array([acceleration, steering_rate]), 1.5, parameters, new)
+    times = np.linspace(0.0, 1.5, 200_001)
+    speed, steering = np.clip(0.5 + acceleration * times, -0.6, 1.2), -0.2 + steering_rate * times
+    turn_rate = scenario.robot.max_curvature * speed * np.sin(steering)
+    heading = 0.3 + cumulative_trapezoid(turn_rate, times, initial=0.0)
+    position = [np.trapezoid(speed * function(heading), times) for function in (np.cos, np.sin)]
+    assert new == pytest.approx([*position, heading[-1], steering[-1], speed[-1]], abs=1e-8)
+
+
+def test_the_optimum_of_a_car_respects_the_limit_of_its_speed():
+    robot = {"model": "dynamic_car", "max_speed": 0.9, "max_acceleration": 2.0}
+    scenario = task(robot, horizon=None, cost={"time_weight": 1.0})
+    optimum = find_optimum(scenario, "medium")
+    assert optimum.success and optimum.barrier <= 1e-3
+    states, controls, _ = optimum.evaluate(np.linspace(0.0, optimum.horizon, 1001))
+    assert 0.85 < states[:, 4].max() < 0.9
+    assert np.abs(controls[:, 0]).max() <= 2.0 + 1e-9
 
 
 def test_optima_respect_the_limits_of_states():
