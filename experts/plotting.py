@@ -29,6 +29,7 @@ from leapnav.experts.problem.system import ControlAffineSystem
 from leapnav.experts.search.structure import Piece
 from leapnav.experts.solvers.feasible_path import dense_path, select_sweeps
 
+MAX_MODES = 3  # driving modes that are named in the legend
 PIECES = {"straight": OPTIMUM, "turn": CURVES[4], "contact": WALL}  # colors of the pieces of a path
 MAX_ALTERNATIVES = len(ALTERNATIVES)
 N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
@@ -296,7 +297,9 @@ def _draw_alternatives(axes: Axes, optimum: Optimum, legend_top: float) -> None:
         label = f"J = {other.cost:.4g}"
         if other is not optimum and optimum.cost > 0:
             label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
-        label += f", {', '.join(other.driving_modes) or 'rotation in place'}"
+        modes = other.driving_modes
+        is_long = len(modes) > MAX_MODES
+        label += f", {len(modes)} parts, first {modes[0]}" if is_long else f", {', '.join(modes) or 'rotation in place'}"
         if other.heading_winding:
             label += f", winding {other.heading_winding:+d}"
         axes.plot(*positions.T, color=color, linewidth=width, zorder=2.5, label=label)

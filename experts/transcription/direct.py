@@ -4,7 +4,9 @@ The controls are constant on each interval, the dynamics are integrated by the e
 the trapezoidal rule. The discretised problem is solved by sequential quadratic programming. Each step is computed by
 a Riccati recursion, linear in the number of intervals, with multipliers for the end conditions (A. E. Bryson and Y.-C.
 Ho, Applied Optimal Control, 1975, section 5.3). The Hessian is exact, and shifted until the recursion shows that it is
-positive definite, so that steps descend and leave saddle points. The line search uses the augmented Lagrangian, which
+positive definite, so that steps descend and leave saddle points. A step follows the dynamics, with the feedback of the
+recursion, so that a path that satisfies them keeps to them (C. Mastalli et al., Crocoddyl: an efficient and versatile
+framework for multi-contact optimal control, ICRA 2020). The line search uses the augmented Lagrangian, which
 does not stall on curved constraints as a penalty function does (J. Nocedal and S. J. Wright, Numerical Optimization,
 2nd ed., ch. 15, 17 and 18).
 
