@@ -298,8 +298,10 @@ def _draw_alternatives(axes: Axes, optimum: Optimum, legend_top: float) -> None:
         if other is not optimum and optimum.cost > 0:
             label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
         modes = other.driving_modes
-        is_long = len(modes) > MAX_MODES
-        label += f", {len(modes)} parts, first {modes[0]}" if is_long else f", {', '.join(modes) or 'rotation in place'}"
+        if len(modes) > MAX_MODES:
+            label += f", {len(modes)} parts, first {modes[0]}"
+        else:
+            label += f", {', '.join(modes) or 'rotation in place'}"
         if other.heading_winding:
             label += f", winding {other.heading_winding:+d}"
         axes.plot(*positions.T, color=color, linewidth=width, zorder=2.5, label=label)
