@@ -28,7 +28,9 @@ INTERVALS = INTERVALS_PER_SEGMENT * SEGMENTS
 # Newton steps of an attempt; without the limit, a divergent one takes up to 6 s.
 MAX_ITERATIONS = 20
 SMALLEST_STEP = 1 / 64  # between two control weights
-MAX_VIOLATION = 1e-2  # sum of the constraint violations of a transcription
+# Sum of the constraint violations of a transcription. With 1e-2, one problem of dynobench is solved only to a tolerance
+# of 0.25 instead of 0.02: Newton's method also converges from some transcriptions that have not.
+MAX_VIOLATION = 1.0
 
 
 def is_free(problem: OptimalControlProblem, states: np.ndarray) -> bool:

@@ -34,7 +34,7 @@ FIRST_SHIFT, MAX_SHIFT = 100.0, 1e13
 # unicycle, 54 of 302 of the differential drive and 30 of 581 of the car do not converge; with 10, none, 23 of 300 and
 # none.
 END_PENALTY, PENALTY = 1e4, 10.0
-# Step lengths that the line search tries: 1, 1/2, ... With 5, two of 7 tight parking tasks are not solved.
+# Step lengths that the line search tries: 1, 1/2, ..., each along the dynamics and linearly. With 5, two of 7 tight parking tasks are not solved.
 MAX_STEP_LENGTHS = 10
 MAX_ACTIVE_SETS = 8  # iterations per step that determine the controls at their limits
 
@@ -108,15 +108,24 @@ def _update_active_set(problem, path, expansion, step):
     return changed
 
 
-@kernel(boolean(DISCRETE_PROBLEM, PATH, EVALUATION, MODEL, _STEP, float64, PATH))
-def _take_step(problem, path, found, model, step, damping, moved):
-    """Fill `moved` with the path of a fraction of a step: the controls of the model along the path that they lead to.
+@kernel(boolean(DISCRETE_PROBLEM, PATH, EVALUATION, MODEL, _STEP, float64, boolean, PATH))
+def _take_step(problem, path, found, model, step, damping, follows, moved):
+    """Fill `moved` with the path after a fraction of a step.
 
-    Violations of the dynamics shrink by the fraction. Returns whether the path is finite.
+    If it `follows` the dynamics, the path is the one to which the controls of the model along it lead, and violations
+    of the dynamics shrink by the fraction. Otherwise the step is linear. Returns whether the path is finite.
     """
     data, q, u = problem.data, path.q, path.u
     intervals, m = u.shape
     n = q.shape[1]
+    if not follows:
+        for k in range(intervals + 1):
+            for i in range(n):
+                moved.q[k, i] = q[k, i] + damping * step.dq[k, i]
+        for k in range(intervals):
+            for j in range(m):
+                moved.u[k, j] = min(max(u[k, j] + damping * step.du[k, j], data[m + j]), data[2 * m + j])
+        return True
     for i in range(n):
         moved.q[0, i] = q[0, i]
     for k in range(intervals):
@@ -179,15 +188,16 @@ def descend(problem, backward, path, tolerance, max_iterations):
         violation, weighted, squares = violations(problem, path, found, step.multipliers, step.nu)
         before = current + weighted + PENALTY / horizon * squares
         damping, descends = 1.0, False
-        for _ in range(MAX_STEP_LENGTHS):
-            if _take_step(problem, path, found, model, step, damping, moved):
+        for trial in range(2 * MAX_STEP_LENGTHS):
+            if _take_step(problem, path, found, model, step, damping, trial % 2 == 0, moved):
                 evaluate(problem, moved, tried)
                 cost = discrete_cost(problem, moved, tried)
                 left, weighted, squares = violations(problem, moved, tried, step.multipliers, step.nu)
                 descends = cost + weighted + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
                 if descends:
                     break
-            damping *= 0.5
+            if trial % 2 == 1:
+                damping *= 0.5
         if not descends:
             shift = max(8.0 * shift, first_shift)
             if shift > max_shift:

@@ -6,7 +6,8 @@ a Riccati recursion, linear in the number of intervals, with multipliers for the
 Ho, Applied Optimal Control, 1975, section 5.3). The Hessian is exact, and shifted until the recursion shows that it is
 positive definite, so that steps descend and leave saddle points. A step follows the dynamics, with the feedback of the
 recursion, so that a path that satisfies them keeps to them (C. Mastalli et al., Crocoddyl: an efficient and versatile
-framework for multi-contact optimal control, ICRA 2020). The line search uses the augmented Lagrangian, which
+framework for multi-contact optimal control, ICRA 2020); where that is rejected, the linear step is tried. The line
+search uses the augmented Lagrangian, which
 does not stall on curved constraints as a penalty function does (J. Nocedal and S. J. Wright, Numerical Optimization,
 2nd ed., ch. 15, 17 and 18).
 
