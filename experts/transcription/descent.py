@@ -34,7 +34,8 @@ FIRST_SHIFT, MAX_SHIFT = 100.0, 1e13
 # unicycle, 54 of 302 of the differential drive and 30 of 581 of the car do not converge; with 10, none, 23 of 300 and
 # none.
 END_PENALTY, PENALTY = 1e4, 10.0
-# Step lengths that the line search tries: 1, 1/2, ..., each along the dynamics and linearly. With 5, two of 7 tight parking tasks are not solved.
+# Step lengths that the line search tries: 1, 1/2, ..., each along the dynamics and linearly. With 5, two of 7 tight
+# parking tasks are not solved.
 MAX_STEP_LENGTHS = 10
 MAX_ACTIVE_SETS = 8  # iterations per step that determine the controls at their limits
 
