@@ -162,10 +162,14 @@ def _arcs(grid, goal, start, outline, field):
 def manoeuvres(scenario: Scenario) -> Iterator[DirectPath]:
     """Yield paths of a car from near the start to the goal, as initial guesses of direct transcription.
 
-    There are none for other robots, and none if start and goal are too far from each other for the grid.
+    There are none for other robots or for cars that cannot stop, slow down or steer to both sides, and none if start
+    and goal are too far from each other for the grid.
     """
     robot, field, outline = scenario.robot, scenario.field, scenario.outline
     if not isinstance(robot, Car) or isinstance(robot, Trailer) or robot.slowest_speed() > 0.0:
+        return
+    rates = [robot.interval(name) for name in robot.limited if name != "speed"]
+    if not all(low < 0.0 < high for low, high in rates):
         return
     start, goal = np.array(scenario.start), np.array(scenario.goal)
     cell, margin = 1.0 / (CELLS_PER_RADIUS * robot.max_curvature), MARGIN_RADII / robot.max_curvature

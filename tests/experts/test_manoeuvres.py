@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from leapnav.envs import Box, Car, Cost, Obstacle, Polygon, Scenario, sample_scenario
+from leapnav.envs import Box, Car, Cost, DynamicCar, Obstacle, Polygon, Scenario, Trailer, sample_scenario
 from leapnav.envs.robots.footprints import corners_of
 from leapnav.envs.shapes.clearance import path_clearance
 from leapnav.experts import OptimalControlProblem, find_optimum
@@ -34,7 +34,6 @@ def parallel_parking(spare, **options):
     gap = LENGTH + spare
     return Scenario(
         arena=(-12, -4, 12, 9),
-        robot=CAR,
         start=(-6.0, 2.2, 0.1),
         goal=(-1.4, -WIDTH / 2 - 0.25, 0.0),
         obstacles=(
@@ -44,7 +43,7 @@ def parallel_parking(spare, **options):
             rectangle(-12, 7.0, 24, 0.4),
         ),
         cost=Cost(time_weight=1.0, speed_weight=0.16, proximity_weight=1.0, proximity_scale=0.05),
-        **{"horizon": None, **options},
+        **{"robot": CAR, "horizon": None, **options},
     )
 
 
@@ -118,6 +117,31 @@ def test_a_fixed_horizon_is_kept():
         paths = list(settle(problem.with_winding_of(guess.states), guess, 1.0))
         break
     assert paths and all(path.times[-1] == pytest.approx(18.0, rel=1e-12) for path in paths)
+
+
+def test_a_dynamic_car_brakes_before_it_changes_its_steering():
+    robot = DynamicCar(**{**CAR.model_dump(exclude={"model"}), "footprint": CAR.footprint, "max_acceleration": 1.0})
+    scenario = parallel_parking(1.3, robot=robot)
+    guess = next(manoeuvres(scenario))
+    steers = guess.controls[:, 1] != 0
+    assert np.abs(guess.states[:-1][steers, 4]).max() < 1e-9 and np.abs(guess.controls[:, 0]).max() <= 0.7 + 1e-9
+    problem = OptimalControlProblem.from_scenario(scenario)
+    drift, fields = problem.dynamics((guess.states[1:] + guess.states[:-1]) / 2)
+    rates = drift + np.einsum("kij,kj->ki", fields, guess.controls)
+    np.testing.assert_allclose(np.diff(guess.states, axis=0), rates * np.diff(guess.times)[:, None], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        Car(steering_rate=(0.0, 1.0)),  # it steers to one side only
+        Car(speed=(0.2, 1.0)),  # it cannot stop
+        DynamicCar(acceleration=(0.0, 1.0)),  # it cannot slow down
+        Trailer(),
+    ],
+)
+def test_there_are_no_manoeuvres_of_cars_without_all_controls(robot):
+    assert not list(manoeuvres(sample_scenario("clutter", 1, robot)))
 
 
 def test_there_are_no_manoeuvres_of_other_robots_or_across_large_arenas():
