@@ -34,7 +34,7 @@ FIRST_SHIFT, MAX_SHIFT = 100.0, 1e13
 # unicycle, 54 of 302 of the differential drive and 30 of 581 of the car do not converge; with 10, none, 23 of 300 and
 # none.
 END_PENALTY, PENALTY = 1e4, 10.0
-# Step lengths that the line search tries: 1, 1/2, ..., each along the dynamics and linearly. With 5, two of 7 tight
+# Step lengths that the line search tries: 1, 1/2, ..., along the dynamics, and then linearly. With 5, two of 7 tight
 # parking tasks are not solved.
 MAX_STEP_LENGTHS = 10
 MAX_ACTIVE_SETS = 8  # iterations per step that determine the controls at their limits
@@ -190,15 +190,14 @@ def descend(problem, backward, path, tolerance, max_iterations):
         before = current + weighted + PENALTY / horizon * squares
         damping, descends = 1.0, False
         for trial in range(2 * MAX_STEP_LENGTHS):
-            if _take_step(problem, path, found, model, step, damping, trial % 2 == 0, moved):
+            damping = 0.5 ** (trial % MAX_STEP_LENGTHS)
+            if _take_step(problem, path, found, model, step, damping, trial < MAX_STEP_LENGTHS, moved):
                 evaluate(problem, moved, tried)
                 cost = discrete_cost(problem, moved, tried)
                 left, weighted, squares = violations(problem, moved, tried, step.multipliers, step.nu)
                 descends = cost + weighted + PENALTY / horizon * squares <= before + 1e-9 * abs(before)
                 if descends:
                     break
-            if trial % 2 == 1:
-                damping *= 0.5
         if not descends:
             shift = max(8.0 * shift, first_shift)
             if shift > max_shift:
