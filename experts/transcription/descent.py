@@ -145,9 +145,11 @@ def _take_step(problem, path, found, model, step, damping, follows, moved):
     return True
 
 
-@kernel(tuple_of(boolean, float64, float64)(DISCRETE_PROBLEM, BACKWARD_FUNCTION, PATH, float64, int64))
-def descend(problem, backward, path, tolerance, max_iterations):
+@kernel(tuple_of(boolean, float64, float64)(DISCRETE_PROBLEM, BACKWARD_FUNCTION, PATH, float64, int64, boolean))
+def descend(problem, backward, path, tolerance, max_iterations, alternates):
     """Apply sequential quadratic programming to a path, in place; without costates, they are zero.
+
+    Linear steps are tried after those along the dynamics: at each length if it `alternates`, otherwise after all.
 
     Returns (converged, cost times the unit, sum of the constraint violations).
     """
@@ -190,8 +192,9 @@ def descend(problem, backward, path, tolerance, max_iterations):
         before = current + weighted + PENALTY / horizon * squares
         damping, descends = 1.0, False
         for trial in range(2 * MAX_STEP_LENGTHS):
-            damping = 0.5 ** (trial % MAX_STEP_LENGTHS)
-            if _take_step(problem, path, found, model, step, damping, trial < MAX_STEP_LENGTHS, moved):
+            follows = trial % 2 == 0 if alternates else trial < MAX_STEP_LENGTHS
+            damping = 0.5 ** (trial // 2 if alternates else trial % MAX_STEP_LENGTHS)
+            if _take_step(problem, path, found, model, step, damping, follows, moved):
                 evaluate(problem, moved, tried)
                 cost = discrete_cost(problem, moved, tried)
                 left, weighted, squares = violations(problem, moved, tried, step.multipliers, step.nu)

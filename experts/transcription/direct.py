@@ -191,6 +191,8 @@ def optimise(
     )
     backward = recursion(problem.system.n, problem.system.m)
     path = Path(states, controls, costates, np.zeros(controls.shape, dtype=np.int8))
-    converged, cost, violation = descend(task, backward, path, tolerance, max_iterations)
+    # Close to obstacles, a path that is consistent on other intervals may be in contact when it follows the dynamics.
+    alternates = problem.field is not None
+    converged, cost, violation = descend(task, backward, path, tolerance, max_iterations, alternates)
     costates, cost = costates * unit, cost * unit
     return DirectPath(guess.times, states, controls, costates, cost, violation, converged)
