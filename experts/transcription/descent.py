@@ -26,7 +26,8 @@ from leapnav.experts.transcription.discrete_problem import (
 from leapnav.experts.transcription.quadratic_model import MODEL, Regularisation, empty_model, end_multipliers
 from leapnav.experts.transcription.riccati import BACKWARD_FUNCTION
 
-# Of the Hessian, divided by the square of the horizon (s). Close to an obstacle, the barrier has more curvature than 1e7.
+# Of the Hessian, divided by the square of the horizon (s). Close to an obstacle, the barrier has more curvature than
+# 1e7.
 FIRST_SHIFT, MAX_SHIFT = 100.0, 1e13
 # Penalties on the end conditions in the recursion and on all constraints in the line search, divided by the horizon.
 # With a penalty of 300, full steps are rejected where the dynamics are strongly curved: 10 of 245 paths of the
