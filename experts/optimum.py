@@ -16,7 +16,7 @@ from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
-from leapnav.envs.utils.validation import check_choice
+from leapnav.envs.utils.validation import check_choice, check_positive
 from leapnav.experts.hard_limits import BARRIER_TOLERANCE, FACTOR, follow_best
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Extremal, Status
@@ -33,7 +33,7 @@ from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.manoeuvres import manoeuvres
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
-from leapnav.experts.solve import solve
+from leapnav.experts.solve import local_optima, solve
 from leapnav.experts.transcription.direct import generated_functions
 
 # Factor of the number of candidates for a robot that cannot rotate in place: the costs of its lattice paths differ from
@@ -64,7 +64,7 @@ HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 0.02, 1000.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Optimum(Extremal):
-    """A local optimum of a scenario; `find_optimum` returns the best one that it found.
+    """A local optimum; `find_optimum` returns the best one that it found.
 
     Attributes:
         alternatives: the other distinct local optima that were found and certified, in order of cost; their own
@@ -81,26 +81,27 @@ class Optimum(Extremal):
     @property
     def path_class(self) -> tuple[Side, ...]:
         """The side of the path on which each obstacle lies, in the order of the scenario."""
+        if self.problem.field is None:
+            return ()
         times = np.linspace(0.0, self.horizon, 513)
-        assert self.problem.field is not None
         return path_sides(self.interpolate(times)[:, :2], self.problem.field)
 
     @property
     def speeds(self) -> np.ndarray:
-        """The speed (N,) along the heading (m/s), negative backwards."""
+        """The speed (N,) of a robot along its heading (m/s), negative backwards."""
         drift, fields = self.problem.dynamics(self.states)
         rates = drift + np.einsum("kij,kj->ki", fields, self.controls)
         return rates[:, 0] * np.cos(self.states[:, 2]) + rates[:, 1] * np.sin(self.states[:, 2])
 
     @property
     def driving_modes(self) -> tuple[Mode, ...]:
-        """The sequence of driving modes."""
+        """The sequence of driving modes of a robot."""
         return driving_modes(self.times, self.speeds)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to dictionaries, lists and numbers, including the alternatives and path classes."""
+        """Convert to dictionaries, lists and numbers, including the alternatives and, of a robot, path classes."""
         described = {}
-        if len(self.times):
+        if len(self.times) and self.is_of_robot:
             described = {
                 "path_class": list(self.path_class),
                 "driving_modes": list(self.driving_modes),
@@ -112,6 +113,12 @@ class Optimum(Extremal):
             "alternatives": [alternative.to_dict() for alternative in self.alternatives],
             "doubts": [doubt.to_dict() for doubt in self.doubts],
         }
+
+    @property
+    def is_of_robot(self) -> bool:
+        """Whether the states begin with position and heading, on which driving modes and path classes are defined."""
+        system = self.problem.system
+        return system.heading is not None and system.state[:3] == (*(system.position or ()), system.heading)
 
     @property
     def heading_winding(self) -> int:
@@ -142,39 +149,58 @@ EFFORTS: tuple[Effort, ...] = get_args(Effort)
 
 
 def find_optimum(
-    scenario: Scenario, effort: Effort = "high", *, barrier_tolerance: float = BARRIER_TOLERANCE
+    problem: Scenario | OptimalControlProblem, effort: Effort = "high", *, barrier_tolerance: float = BARRIER_TOLERANCE
 ) -> Optimum:
-    """Find the minimum-cost certified extremal of a scenario.
+    """Find the minimum-cost certified extremal of a scenario or of another optimal control problem.
 
-    A lattice search over position and heading, in the metric of the problem, proposes distinct candidates: different
-    sides of the obstacles, driving modes with cusps, and windings of the heading. Direct transcription improves each
-    to a local optimum and identifies duplicates. Multiple-shooting Newton steps turn the local optima into extremals.
-    The cheapest one with a valid certificate is returned, with the others as `alternatives`.
+    For a scenario, a lattice search over position and heading, in the metric of the problem, proposes distinct
+    candidates: different sides of the obstacles, driving modes with cusps, and windings of the heading. Direct
+    transcription improves each to a local optimum and identifies duplicates. Multiple-shooting Newton steps turn the
+    local optima into extremals. The cheapest one with a valid certificate is returned, with the others as
+    `alternatives`.
+
+    For a problem of another system there is no lattice. Local minima over piecewise constant controls are computed
+    from the straight line and from random controls of a fixed seed, for each winding of the goal angles, and multiple
+    shooting continues from all that differ in cost. Of two mirror images only one is found. Give the scenario itself rather than its problem, for which
+    the search without a lattice may find no more than a worse local optimum.
 
     With the proximity weight 0, obstacles cost nothing and must not be touched. The search then uses a small weight,
     and the best local optima are followed to the weight at which the proximity cost is negligible, see
     `leapnav.experts.hard_limits`.
 
     Args:
-        scenario: the scenario.
+        problem: a scenario, or an optimal control problem.
         effort: "high" finds the optimum and its alternatives. "medium" finds the optimum: candidates and local optima
             that cost more are omitted, which takes 0.3 to 0.5 of the time, and `alternatives` contains only what was
             found on the way. "low" examines the first round of candidates only, of which there are 12, or 36 for a
             robot that cannot rotate in place. It usually contains the optimum, and a scenario without a path is
             recognised 50 times faster; but the only path may be missed, and the status of a failure is a guess.
+            For a problem that is no scenario, "medium" and "low" solve at most four initial paths, until one costs 5 %
+            more than the best, as `solve` does.
         barrier_tolerance: with the proximity weight 0, largest proximity cost that remains, as a fraction of the cost.
 
     Returns:
         An `Optimum`; if nothing is certified, its status is the reason.
 
     Raises:
-        TypeError: `scenario` is not a Scenario.
-        ValueError: the effort is unknown.
+        TypeError: `problem` is neither a scenario nor a problem.
+        ValueError: the effort is unknown, or the tolerance is not positive.
 
     """
-    if not isinstance(cast(object, scenario), Scenario):
-        raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     check_choice("effort", effort, EFFORTS)
+    check_positive("barrier_tolerance", barrier_tolerance)
+    if isinstance(problem, Scenario):
+        return _of_scenario(problem, effort, barrier_tolerance)
+    if not isinstance(cast(object, problem), OptimalControlProblem):
+        expected = "a Scenario (see Scenario.from_dict) or an OptimalControlProblem"
+        raise TypeError(f"problem: expected {expected}, got {type(problem).__name__}")
+    if effort != "high":
+        return as_optimum(solve(problem, "multiple_shooting", barrier_tolerance=barrier_tolerance))
+    best, *others = local_optima(problem, barrier_tolerance)
+    return replace(as_optimum(best), alternatives=tuple(map(as_optimum, others)))
+
+
+def _of_scenario(scenario: Scenario, effort: Effort, barrier_tolerance: float) -> Optimum:
     problem = OptimalControlProblem.from_scenario(scenario)
     _compile_kernels(*generated_functions(problem))
     if problem.horizon is None and problem.starts_at_goal:

@@ -297,13 +297,8 @@ def _draw_alternatives(axes: Axes, optimum: Optimum, legend_top: float) -> None:
         label = f"J = {other.cost:.4g}"
         if other is not optimum and optimum.cost > 0:
             label += f" (+{100 * (other.cost / optimum.cost - 1):.2g} %)"
-        modes = other.driving_modes
-        if len(modes) > MAX_MODES:
-            label += f", {len(modes)} parts, first {modes[0]}"
-        else:
-            label += f", {', '.join(modes) or 'rotation in place'}"
-        if other.heading_winding:
-            label += f", winding {other.heading_winding:+d}"
+        if other.is_of_robot:
+            label += _driving_label(other)
         axes.plot(*positions.T, color=color, linewidth=width, zorder=2.5, label=label)
     hidden = len(optimum.alternatives) - len(shown)
     axes.legend(
@@ -314,6 +309,16 @@ def _draw_alternatives(axes: Axes, optimum: Optimum, legend_top: float) -> None:
         title=f"the best of {hidden + len(entries)} local optima" if hidden else None,
         title_fontsize=9,
     )
+
+
+def _driving_label(optimum: Optimum) -> str:
+    modes = optimum.driving_modes
+    if len(modes) > MAX_MODES:
+        label = f", {len(modes)} parts, first {modes[0]}"
+    else:
+        label = f", {', '.join(modes) or 'rotation in place'}"
+    winding = optimum.heading_winding
+    return f"{label}, winding {winding:+d}" if winding else label
 
 
 def plot_bank(bank: ScenarioBank, path: str | os.PathLike[str], count: int = 24, columns: int = 6) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -33,7 +34,8 @@ from leapnav.experts.solvers.single_shooting import single_shooting
 from leapnav.experts.transcription.direct import mean_running_cost
 
 Method = Literal["single_shooting", "multiple_shooting", "leapfrog", "collocation"]
-METHODS: dict[str, Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal]] = {
+Solver = Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal]
+METHODS: dict[str, Solver] = {
     "single_shooting": single_shooting,
     "multiple_shooting": multiple_shooting,
     "leapfrog": leapfrog,
@@ -48,6 +50,12 @@ OPTIONS = {
 }
 # Without a guess, at most this number of initial paths is solved, until one costs more than the best by this fraction.
 MAX_INITIAL_PATHS, SIMILAR_COST = 4, 0.05
+# Searches for initial paths, if all local optima are wanted. With one, the second local optimum of the swing-up of the
+# cart-pole (known_problems.json) is missed.
+SEEDS = 4
+# Extremals are one if their costs and states agree to these fractions, of the cost and of the largest state.
+SAME_COST, SAME_PATH = 1e-6, 1e-3
+SAMPLES = 129  # of a path that is compared
 # With hard limits, at most this number of first barrier weights is tried, each the last one times this factor.
 MAX_FIRST_WEIGHTS, FIRST_WEIGHT_FACTOR = 3, 0.1
 # If these fail, the horizon is halved at most this often, and then followed back with at least this fraction of the
@@ -122,11 +130,9 @@ def solve(
     elif isinstance(problem, Scenario):
         found = initial_guess(problem, ocp)
         extremal = failure(ocp, Status.NO_PATH) if found is None else solver(*found, options)
-    elif ocp.has_hard_limits and ocp.barrier_weight == 0.0:
-        extremal = _to_limit(solver, ocp, options, barrier_tolerance)
     else:
-        extremal = _without_guess(solver, ocp, options)
-    is_followed = guess is None and not isinstance(problem, Scenario)  # by `_to_limit`, if there are hard limits
+        extremal = _without_guess(solver, ocp, options, barrier_tolerance)[0]
+    is_followed = guess is None and not isinstance(problem, Scenario)  # by `_without_guess`
     if extremal.success and extremal.problem.barrier_weight > ocp.barrier_weight and not is_followed:
         extremal = follow_limit(extremal, ocp.proximity_weight, barrier_tolerance)
     if raise_on_failure and not extremal.success:
@@ -135,7 +141,7 @@ def solve(
 
 
 def _solve_softened(
-    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    solver: Solver,
     problem: OptimalControlProblem,
     guess: Trajectory | Extremal,
     path: Trajectory,
@@ -156,51 +162,88 @@ def _solve_softened(
     return solver(softened(problem, energy), path, options)
 
 
+def local_optima(problem: OptimalControlProblem, barrier_tolerance: float = BARRIER_TOLERANCE) -> list[Extremal]:
+    """Find local optima of a problem by multiple shooting from all initial paths.
+
+    Args:
+        problem: an optimal control problem.
+        barrier_tolerance: with hard limits, largest integral of the barrier as a fraction of the cost.
+
+    Returns:
+        The distinct certified extremals in order of cost. If there are none, one failure.
+
+    """
+    if problem.horizon is None and problem.starts_at_goal:
+        return [failure(problem, Status.ZERO_HORIZON)]
+    distinct: list[Extremal] = []
+    for extremal in _without_guess(multiple_shooting, problem, SolverOptions(), barrier_tolerance, best_only=False):
+        if not any(_is_same(extremal, other) for other in distinct):
+            distinct.append(extremal)
+    return distinct
+
+
+def _is_same(extremal: Extremal, other: Extremal) -> bool:
+    """Return whether two extremals have the same cost and path; the paths of mirror images differ."""
+    if abs(extremal.cost - other.cost) > SAME_COST * abs(other.cost):
+        return False
+    fractions, n = np.linspace(0.0, 1.0, SAMPLES), extremal.problem.system.n
+    states, others = (one.interpolate(fractions * one.horizon)[:, :n] for one in (extremal, other))
+    return bool(np.abs(states - others).max() <= SAME_PATH * (1.0 + np.abs(others).max()))
+
+
 def _without_guess(
-    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
-    problem: OptimalControlProblem,
-    options: SolverOptions,
-) -> Extremal:
-    """The cheapest success from the best initial paths, or from the straight line or shorter horizons if all fail."""
-    best, failed = _from_initial_paths(solver, problem, options)
-    if best is not None:
-        return best
+    solver: Solver, problem: OptimalControlProblem, options: SolverOptions, tolerance: float, best_only: bool = True
+) -> list[Extremal]:
+    """Return the certified extremals in order of cost, followed to the limit if there are hard limits; or one failure.
+
+    A large weight can turn a saddle of the limit into a minimum, such as a straight beam between walls under a load
+    that makes it buckle. On the way to the limit it becomes a saddle again. Then a smaller first weight is tried.
+
+    Args:
+        solver, problem, options: the method, the problem and the options.
+        tolerance: largest integral of the barrier as a fraction of the cost.
+        best_only: whether only initial paths of similar cost are solved, and only the best extremal is followed.
+
+    """
+    if not problem.has_hard_limits or problem.barrier_weight > 0.0:
+        return _from_nothing(solver, problem, options, best_only)
+    weight, failed = first_barrier_weight(problem), []
+    for _ in range(MAX_FIRST_WEIGHTS):
+        found = _from_nothing(solver, problem.with_barrier(weight), options, best_only)
+        if found[0].success:
+            followed = found[:1] if best_only else found
+            found = [follow_limit(extremal, problem.proximity_weight, tolerance) for extremal in followed]
+        reached = sorted((extremal for extremal in found if extremal.success), key=lambda extremal: extremal.cost)
+        if reached:
+            return reached
+        failed += found[:1]
+        if failed[-1].status not in (Status.STALLED, Status.CONJUGATE_POINT):
+            break
+        weight *= FIRST_WEIGHT_FACTOR
+    return failed[:1]
+
+
+def _from_nothing(
+    solver: Solver, problem: OptimalControlProblem, options: SolverOptions, best_only: bool
+) -> list[Extremal]:
+    """Return the successes from initial paths in order of cost, or from the straight line or shorter horizons.
+
+    If all fail, one failure is returned.
+    """
+    found, failed = _from_initial_paths(solver, problem, options, best_only)
+    if found:
+        return found
     line = problem.straight_line()
     failed.append(solver(problem.with_winding_of(line.states), line, options))
     if failed[-1].success:
-        return failed[-1]
+        return failed[-1:]
     # A failure that converged is more informative.
     converged = [extremal for extremal in failed if _has_converged(extremal)]
     if not converged and problem.horizon is not None and options.segments is None:
         lengthened = _from_shorter_horizons(solver, problem, options)
         if lengthened is not None:
-            return lengthened
-    return (converged or failed)[0]
-
-
-def _to_limit(
-    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
-    problem: OptimalControlProblem,
-    options: SolverOptions,
-    tolerance: float,
-) -> Extremal:
-    """The extremal that is followed from a first barrier weight to the limit, without a guess.
-
-    A large weight can turn a saddle of the limit into a minimum, such as a straight beam between walls under a load
-    that makes it buckle. On the way to the limit it becomes a saddle again. Then a smaller first weight is tried.
-    """
-    weight, failed = first_barrier_weight(problem), []
-    for _ in range(MAX_FIRST_WEIGHTS):
-        extremal = _without_guess(solver, problem.with_barrier(weight), options)
-        if extremal.success:
-            extremal = follow_limit(extremal, problem.proximity_weight, tolerance)
-        if extremal.success:
-            return extremal
-        failed.append(extremal)
-        if extremal.status not in (Status.STALLED, Status.CONJUGATE_POINT):
-            break
-        weight *= FIRST_WEIGHT_FACTOR
-    return failed[0]
+            return [lengthened]
+    return (converged or failed)[:1]
 
 
 def _has_converged(extremal: Extremal) -> bool:
@@ -212,26 +255,23 @@ def _has_converged(extremal: Extremal) -> bool:
 
 
 def _from_initial_paths(
-    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
-    problem: OptimalControlProblem,
-    options: SolverOptions,
-) -> tuple[Extremal | None, list[Extremal]]:
-    """The cheapest success from the best initial paths, and the failures."""
-    best: Extremal | None = None
+    solver: Solver, problem: OptimalControlProblem, options: SolverOptions, best_only: bool = True
+) -> tuple[list[Extremal], list[Extremal]]:
+    """Return the successes from the initial paths in order of cost, and the failures."""
+    found: list[Extremal] = []
     failed: list[Extremal] = []
-    for wound, path in islice(initial_paths(problem), MAX_INITIAL_PATHS):
+    paths = islice(initial_paths(problem), MAX_INITIAL_PATHS) if best_only else initial_paths(problem, range(SEEDS))
+    for wound, path in paths:
         extremal = solver(wound, path, options)
-        if not extremal.success:
-            failed.append(extremal)
-        elif best is None or extremal.cost < best.cost:
-            best = extremal
-        elif extremal.cost > best.cost + SIMILAR_COST * abs(best.cost):
+        (found if extremal.success else failed).append(extremal)
+        lowest = min((one.cost for one in found), default=math.inf)
+        if best_only and extremal.success and extremal.cost > lowest + SIMILAR_COST * abs(lowest):
             break
-    return best, failed
+    return sorted(found, key=lambda extremal: extremal.cost), failed
 
 
 def _from_shorter_horizons(
-    solver: Callable[[OptimalControlProblem, Trajectory, SolverOptions], Extremal],
+    solver: Solver,
     problem: OptimalControlProblem,
     options: SolverOptions,
 ) -> Extremal | None:
@@ -243,8 +283,8 @@ def _from_shorter_horizons(
     horizon = problem.fixed_horizon
     for halvings in range(1, MAX_HALVINGS + 1):
         factor = 2.0**halvings
-        first, _ = _from_initial_paths(solver, problem.with_horizon(horizon / factor), options)
-        if first is not None:
+        found, _ = _from_initial_paths(solver, problem.with_horizon(horizon / factor), options)
+        if found:
             break
     else:
         return None
@@ -258,7 +298,7 @@ def _from_shorter_horizons(
         extremal = solver(longer, path, replace(options, mesh=times[distinct], subdivide=False))
         return extremal if extremal.success else None
 
-    return step_halving(lengthen, first, min_step=MIN_STEP)
+    return step_halving(lengthen, found[0], min_step=MIN_STEP)
 
 
 def _from_guess(

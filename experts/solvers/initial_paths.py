@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -35,13 +35,20 @@ FIRST_BARRIER, NEGLIGIBLE = 0.1, 1e-12
 FIRST_HORIZON, MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE, HORIZON_STARTS = 1.0, 0.25, 12, 0.05, 4
 
 
-def initial_paths(problem: OptimalControlProblem, seed: int = 0) -> Iterator[tuple[OptimalControlProblem, Trajectory]]:
+def initial_paths(
+    problem: OptimalControlProblem, seeds: Iterable[int] = (0,)
+) -> Iterator[tuple[OptimalControlProblem, Trajectory]]:
     """Yield nearly feasible paths with costates, in order of cost, each with the problem that has its winding.
 
     Yields nothing if no path to the goal was found.
+
+    Args:
+        problem: the problem.
+        seeds: random seeds of the initial controls, see `local_minima`; a search is made with each.
+
     """
     found: list[tuple[float, OptimalControlProblem, Trajectory]] = []
-    for variant in _windings(problem):
+    for variant, seed in itertools.product(_windings(problem), seeds):
         found += [(cost, variant, path) for cost, path in local_minima(_with_horizon(variant, seed), seed=seed)]
     found.sort(key=lambda entry: entry[0])
     last: float | None = None
