@@ -342,7 +342,7 @@ def test_the_optima_of_many_scenarios_do_not_depend_on_the_number_of_processes()
     assert one[-1].status is Status.HORIZON_TOO_SHORT
     with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
         find_optima(scenarios, workers=0)
-    with pytest.raises(TypeError, match="scenario: expected a Scenario"):
+    with pytest.raises(TypeError, match="problem: expected a Scenario"):
         find_optima([None], progress=False)
 
 
