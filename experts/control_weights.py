@@ -28,6 +28,7 @@ INTERVALS = INTERVALS_PER_SEGMENT * SEGMENTS
 # Newton steps of an attempt; without the limit, a divergent one takes up to 6 s.
 MAX_ITERATIONS = 20
 SMALLEST_STEP = 1 / 64  # between two control weights
+BARRIER_FACTOR = 0.25  # of the barrier weight from one transcription to the next
 # Sum of the constraint violations of a transcription. With 1e-2, one problem of dynobench is solved only to a tolerance
 # of 0.25 instead of 0.02: Newton's method also converges from some transcriptions that have not.
 MAX_VIOLATION = 1.0
@@ -105,6 +106,16 @@ def continued(extremal: Extremal, problem: OptimalControlProblem, method: Method
 
 
 def limit_of(extremal: Extremal) -> Extremal:
-    """Return the extremal close to the limit of hard limits; with the barrier that it has if that is not reached."""
-    limit = follow_limit(extremal)
-    return limit if limit.success else without_barrier(extremal)
+    """Return the extremal close to the limit of hard limits; with the barrier that it has if that is not reached.
+
+    Where Newton's method stalls on the way, the problem is transcribed again with a smaller barrier.
+    """
+    while True:
+        limit = follow_limit(extremal)
+        if limit.success or not extremal.problem.has_hard_limits:
+            return limit if limit.success else without_barrier(extremal)
+        problem = extremal.problem
+        found = next_extremal(extremal, problem.with_barrier(BARRIER_FACTOR * problem.barrier_weight))
+        if not found.success:
+            return without_barrier(extremal)
+        extremal = found

@@ -31,6 +31,10 @@ from leapnav.experts.solvers.piecewise import PiecewisePath, piecewise_paths
 FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its factor from one problem to the next
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
+# Barrier weight (s per second) of hard limits with the first control weights. From the weight at which the barrier is
+# negligible, Newton's method stalled at smaller control weights in 3 of 9 tight parking tasks of a dynamic car. One of
+# these 3 is not solved from 0.1 either, and one not beyond the first control weight from 0.3.
+FIRST_BARRIER = 1.0
 # Duration of the transcription relative to that of the path: more time makes smooth transitions possible, but a robot
 # that cannot slow down may not reach the goal in more time.
 LENGTHENINGS = (1.02, 1.005, 1.0)
@@ -38,6 +42,7 @@ UNIT_LATTICE = (0.25, 1.0, 1.0)  # cell (m) and weights, which do not matter to 
 FAR = 10.0  # proximity scales; the proximity cost of more distant obstacles is negligible
 SAME_TIME = 1e-5  # relative difference of the costs of ends that does not matter
 SAME_COST = 1e-6  # relative; extremals whose costs agree to this are one, or mirror images
+NEGLIGIBLE = 1e-6  # factor of the weights of a scenario
 POINTS = 4001  # at which the controls are examined
 MIN_PIECE = 0.01  # fraction of the time; shorter pieces are transitions
 
@@ -81,8 +86,9 @@ class MinimumTime:
 def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -> MinimumTime:
     """Find a path of minimum time with bounded controls, by continuation to small control weights.
 
-    The horizon, the control weights and the time weight of the problem are ignored. A state cost and the proximity cost
-    of obstacles are kept: the cost is the time plus their integral. With hard limits it is the time.
+    The horizon, the control weights and the time weight of the problem are ignored. The state cost of a problem and the
+    proximity cost of obstacles are kept: the cost is the time plus their integral. For a scenario with hard obstacles
+    it is the time, since the state cost of a robot model, such as that of the speed, is made negligible.
 
     Args:
         problem: a problem with control bounds, or a scenario.
@@ -101,7 +107,7 @@ def minimum_time(problem: OptimalControlProblem | Scenario, tol: float = 1e-3) -
     check_positive("tol", tol)
     if not tol < 1:
         raise ValueError(f"tol: expected a number below 1, got {tol!r}")
-    ocp = as_problem(problem)
+    ocp = as_problem(_without_motion_cost(problem) if isinstance(problem, Scenario) else problem)
     bounds = np.array(ocp.control_bounds if ocp.control_bounds is not None else [(-np.inf, np.inf)])
     if not np.isfinite(bounds).all():
         raise ValueError(f"control_bounds: expected finite numbers, got {ocp.control_bounds!r}")
@@ -168,7 +174,7 @@ def _ends(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalCon
                 failed = failed or end.extremal
 
     if isinstance(given, Scenario):
-        optimum = find_optimum(_with_free_horizon(given))
+        optimum = find_optimum(_softened(given))
         follow([_Start(extremal, 0) for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]])
         # The lattice is accurate for a robot that rotates in place, and paths of few pieces ignore obstacles.
         if not found or (not given.robot.lattice_moves(*UNIT_LATTICE).rotating and _is_far(optimum, given)):
@@ -188,9 +194,17 @@ def _is_far(extremal: Extremal, scenario: Scenario) -> bool:
     return clearance is not None and clearance > FAR * scenario.cost.proximity_scale
 
 
-def _with_free_horizon(scenario: Scenario) -> Scenario:
-    """Return the scenario with a free horizon and the time weight 1."""
-    return scenario.model_copy(update={"horizon": None, "cost": scenario.cost.model_copy(update={"time_weight": 1.0})})
+def _without_motion_cost(scenario: Scenario) -> Scenario:
+    """Return the scenario with negligible weights of the speed and the turn rate, which are states of some robots."""
+    weights = {name: NEGLIGIBLE * getattr(scenario.cost, name) for name in scenario.robot.cost_fields}
+    return scenario.model_copy(update={"cost": scenario.cost.model_copy(update=weights)})
+
+
+def _softened(scenario: Scenario) -> Scenario:
+    """Return the scenario with a free horizon, the time weight 1 and, if its obstacles are hard, the first barrier."""
+    cost = scenario.cost
+    update = {"time_weight": 1.0, "proximity_weight": cost.proximity_weight or FIRST_BARRIER}
+    return scenario.model_copy(update={"horizon": None, "cost": cost.model_copy(update=update)})
 
 
 def _limit_cost(end: _End) -> float:
@@ -269,17 +283,20 @@ def _first(path: PiecewisePath, problems: Sequence[OptimalControlProblem]) -> _S
 def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: float) -> _End:
     """Solve the remaining problems one after the other, up to the first that no method solves.
 
-    They have the winding of the start and, with hard limits, its barrier weight. The continuation ends early, without
-    a solved problem, if its limit costs more than `best`.
+    They have the winding of the start and, with hard limits, its barrier weight, which decreases with the square root
+    of the control weights: smooth controls need distance from the obstacles. The continuation ends early, without a
+    solved problem, if its limit costs more than `best`.
     """
     extremal, count = start
     if not extremal.success:
         return _End(extremal, 0, extremal)
-    barrier, failed = extremal.problem.barrier_weight, extremal
+    failed, first = extremal, problems[max(count - 1, 0)].control_weight[0]
+    barrier = extremal.problem.proximity_weight if problems[0].has_hard_limits else 0.0
     for problem in problems[count:]:
         if _lowest_limit(extremal) > best:
             return _End(extremal, 0, extremal)
-        following = replace(problem, goal=extremal.problem.goal, barrier_weight=barrier)
+        decreased = barrier * math.sqrt(problem.control_weight[0] / first)
+        following = replace(problem, goal=extremal.problem.goal, barrier_weight=decreased)
         found = next_extremal(extremal, following)
         if not found.success and count == 0:  # without this problem there is no result, so more effort is worth it
             found = continuation([extremal.problem, following], guess=extremal)[-1]

@@ -27,7 +27,7 @@ from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.lifting import Lifting
-from leapnav.experts.solvers.multiple_shooting import confirm, polish
+from leapnav.experts.solvers.multiple_shooting import confirm, polish_in_stages
 from leapnav.experts.solvers.nodes import SolverOptions
 from leapnav.experts.transcription.adaptive import settle
 from leapnav.experts.transcription.direct import MAX_VIOLATION, RELAXED_DISTANCE, DirectPath, discretise, optimise
@@ -38,6 +38,10 @@ TOLERANCE = 1e-9
 NEWTON_ITERATIONS, MANOEUVRE_ITERATIONS = 20, 60
 # Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
 INTERVALS_PER_SEGMENT, MIN_SEGMENTS, MAX_ATTEMPTS = 8, 8, 3
+# Numbers of segments of the last attempts on an adaptive mesh. In a door of 0.45 m, 8, 32 and 64 segments converge, but
+# 16, 28, 57 and 114 do not: with many nodes near an edge, the closest feature changes from one Newton step to the next.
+FEW_SEGMENTS = 32, 8
+MAX_SETTLED = 3  # paths at which Newton's method stalled
 # A long refined path: number of intervals above which it is one, attempts that it omits, and intervals per segment.
 LONG_PATH, SKIPPED_ATTEMPTS, INTERVALS_PER_SEGMENT_OF_LONG_PATH = 2048, 2, 3
 # Two paths are duplicates if they stay within this distance of each other (m, and rad for the heading) ...
@@ -246,13 +250,27 @@ class LocalOptima:
         found = False
         for guess in guesses:
             problem = self._with_winding(guess.states)
-            paths = settle(problem, guess, self._energy)
-            attempts = ((len(path.controls) // INTERVALS_PER_SEGMENT, path) for path in paths)
-            extremal, _ = self._extremal(problem, attempts, max_iterations=MANOEUVRE_ITERATIONS)
+            extremal, _ = self._extremal(problem, self._settled(problem, guess), max_iterations=MANOEUVRE_ITERATIONS)
             if extremal is not None:
                 self.verdicts.append(self._verdict(problem, guess, extremal))
                 found = found or extremal.success
         return found
+
+    def settle_doubts(self) -> None:
+        """Compute the local optima of the cheapest paths at which Newton's method stalled, on adaptive meshes."""
+        stalled = [verdict for verdict in self.verdicts if verdict.outcome is Outcome.STALLED]
+        for verdict in sorted(stalled, key=lambda verdict: verdict.cost)[:MAX_SETTLED]:
+            best = min((extremal.cost for extremal in self.certified), default=math.inf)
+            if verdict.cost < best * (1 - DIRECT_ERROR) and self._clearance(verdict.path) > 0.0:
+                self.add_manoeuvres([verdict.path])
+
+    def _settled(self, problem: OptimalControlProblem, guess: DirectPath) -> Iterator[tuple[int, DirectPath]]:
+        """Yield numbers of segments of multiple shooting, each with a path on an adaptive mesh."""
+        path = None
+        for path in settle(problem, guess, self._energy):
+            yield len(path.controls) // INTERVALS_PER_SEGMENT, path
+        if path is not None:
+            yield from ((segments, path) for segments in FEW_SEGMENTS)
 
     def refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
         """Return the optimum on shorter intervals, of a free horizon with a better duration."""
@@ -361,7 +379,7 @@ class LocalOptima:
                 if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
                     return extremal, total
             times, nodes = direct.nodes(problem, segments)
-            status, rows, evaluations = _polish(problem, times, nodes, max_iterations)
+            status, rows, evaluations = polish_in_stages(problem, times, nodes, TOLERANCE, max_iterations)
             history += rows
             total += evaluations
             if status is Status.SUCCESS:
@@ -424,25 +442,6 @@ class LocalOptima:
 
     def _is_close(self, shape: np.ndarray, other: np.ndarray) -> bool:
         return bool(np.abs(shape - other).max() < self._duplicate_distance)
-
-
-def _polish(
-    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, max_iterations: int
-) -> tuple[Status, tuple[Iteration, ...], int]:
-    """Apply Newton's method, with a free horizon if necessary in two stages, of which the first keeps the times."""
-    first_times, first = times.copy(), nodes.copy()
-    status, rows, evaluations = polish(problem, times, nodes, TOLERANCE, max_iterations)
-    if status is Status.SUCCESS or problem.horizon is not None:
-        return status, rows, evaluations
-    times[:] = first_times
-    fixed = problem.with_horizon(float(times[-1]))
-    status, more, count = polish(fixed, times, first, TOLERANCE, max_iterations)
-    rows, evaluations = rows + more, evaluations + count
-    if status is Status.SUCCESS:
-        nodes[:] = first
-        status, more, count = polish(problem, times, nodes, TOLERANCE, max_iterations)
-        rows, evaluations = rows + more, evaluations + count
-    return status, rows, evaluations
 
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:

@@ -97,6 +97,25 @@ def polish(
     return KERNEL_STATUS[code], rows, evaluations
 
 
+def polish_in_stages(
+    problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, tol: float, max_iterations: int
+) -> tuple[Status, tuple[Iteration, ...], int]:
+    """Apply `polish`, with a free horizon if necessary in two stages, of which the first keeps the times."""
+    first_times, first = times.copy(), nodes.copy()
+    status, rows, evaluations = polish(problem, times, nodes, tol, max_iterations)
+    if status is Status.SUCCESS or problem.horizon is not None:
+        return status, rows, evaluations
+    times[:] = first_times
+    fixed = problem.with_horizon(float(times[-1]))
+    status, more, count = polish(fixed, times, first, tol, max_iterations)
+    rows, evaluations = rows + more, evaluations + count
+    if status is Status.SUCCESS:
+        nodes[:] = first
+        status, more, count = polish(problem, times, nodes, tol, max_iterations)
+        rows, evaluations = rows + more, evaluations + count
+    return status, rows, evaluations
+
+
 def _refine(problem: OptimalControlProblem, path: Trajectory, times: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the times of more nodes, and the evaluations of the flow.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def settle(problem: OptimalControlProblem, guess: DirectPath, energy: float) -> 
 
     """
     descent = _Descent(problem)
-    path: DirectPath | None = guess
+    path: DirectPath | None = replace(guess, cost=math.inf)  # its cost has another weight
     weight = FIRST_WEIGHT * energy
     while weight > problem.proximity_weight and path is not None:
         descent.problem = problem.with_barrier(weight)

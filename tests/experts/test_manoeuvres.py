@@ -8,7 +8,7 @@ import pytest
 from leapnav.envs import Box, Car, Cost, DynamicCar, Obstacle, Polygon, Scenario, Trailer, sample_scenario
 from leapnav.envs.robots.footprints import corners_of
 from leapnav.envs.shapes.clearance import path_clearance
-from leapnav.experts import OptimalControlProblem, find_optimum
+from leapnav.experts import OptimalControlProblem, find_optimum, minimum_time
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.manoeuvres import manoeuvres
 from leapnav.experts.transcription.adaptive import settle
@@ -21,6 +21,18 @@ CAR = Car(
     max_speed=2.5,
     max_steering_rate=0.54,
     steering_weight=1.0,
+)
+
+SOFT = Cost(time_weight=1.0, speed_weight=0.16, proximity_weight=1.0, proximity_scale=0.05)
+HARD = Cost(time_weight=1.0, speed_weight=0.16, proximity_weight=0.0, proximity_scale=0.05)
+DYNAMIC_CAR = DynamicCar(
+    footprint=CAR.footprint,
+    wheelbase=2.8,
+    max_steering=0.75,
+    max_speed=2.5,
+    max_steering_rate=0.54,
+    steering_weight=1.0,
+    max_acceleration=1.0,
 )
 
 
@@ -42,8 +54,7 @@ def parallel_parking(spare, **options):
             rectangle(-12, -2.9, 24, 0.4),
             rectangle(-12, 7.0, 24, 0.4),
         ),
-        cost=Cost(time_weight=1.0, speed_weight=0.16, proximity_weight=1.0, proximity_scale=0.05),
-        **{"robot": CAR, "horizon": None, **options},
+        **{"robot": CAR, "horizon": None, "cost": SOFT, **options},
     )
 
 
@@ -97,6 +108,35 @@ def test_a_car_parks_in_a_gap_that_is_hardly_longer(scenario, guess):
 def test_the_search_finds_the_manoeuvre(scenario):
     optimum = find_optimum(scenario)
     assert optimum.success and 15.0 < optimum.cost < 20.0
+
+
+@pytest.mark.slow
+def test_the_minimum_time_of_tight_parking_is_found():
+    """The barrier decreases together with the control weights; Newton's method stalls if it is small from the start."""
+    found = minimum_time(parallel_parking(1.2, robot=DYNAMIC_CAR, cost=HARD), 0.05)
+    assert found.tolerance <= 0.05
+    assert found.extremal.certificate.clearance > 0
+    assert found.extremal.barrier <= 1e-3
+    assert found.horizon < find_optimum(parallel_parking(1.2, robot=DYNAMIC_CAR, cost=HARD)).horizon
+
+
+def test_a_door_is_passed_where_newtons_method_stalls_on_a_fixed_mesh():
+    """A disc of radius 0.21 m and a door of 0.45 m, from the side."""
+    left, right = ([[2.9, a], [3.1, a], [3.1, b], [2.9, b]] for a, b in ((0, 2.775), (3.225, 6)))
+    scenario = Scenario.from_dict(
+        {
+            "arena": [0, 0, 6, 6],
+            "robot": {"model": "unicycle", "radius": 0.21},
+            "start": [1.5, 1.5, math.pi / 2],
+            "goal": [4.5, 4.5, math.pi / 2],
+            "horizon": 15,
+            "obstacles": [{"polygon": {"vertices": left}}, {"polygon": {"vertices": right}}],
+        }
+    )
+    optimum = find_optimum(scenario)
+    assert optimum.success
+    assert optimum.doubts == ()
+    assert optimum.cost == pytest.approx(4.2145477, rel=1e-6)  # of `solve` from the same lattice
 
 
 def test_meshes_are_fine_at_contacts_and_change_slowly(scenario, guess):

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 import sympy as sp
+from helpers import scenario_fields
 from shortest_words import balkcom_mason, dubins, end_of, family_of, reeds_shepp
 
 from leapnav.envs import Scenario, sample_scenario
-from leapnav.envs.robots import Unicycle
+from leapnav.envs.robots import DynamicUnicycle, Unicycle
 from leapnav.envs.shapes import Circle
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, minimum_time
 from leapnav.experts.problem.system import differential_drive, unicycle
@@ -203,3 +204,14 @@ def test_the_best_of_several_paths_has_at_most_the_time_of_the_optimum():
         )
         found = minimum_time(scenario, 1e-2)
         assert found.tolerance == pytest.approx(1e-2) and found.extremal.certificate.clearance > 0
+
+
+def test_the_weights_of_speed_and_turn_rate_do_not_change_the_minimum_time():
+    """From rest to rest over a distance d with the acceleration a: 2 sqrt(d / a)."""
+    robot = DynamicUnicycle(max_acceleration=1.0, max_angular_acceleration=2.0)
+    times = []
+    for weight in (0.01, 1.0):
+        fields = scenario_fields(start=[1, 1, 0], goal=[5, 1, 0], robot=robot, obstacles=[], horizon=None)
+        fields["cost"] = {"time_weight": 1.0, "speed_weight": weight, "turn_weight": weight, "proximity_weight": 0.0}
+        times.append(minimum_time(Scenario.from_dict(fields), 1e-2).horizon)
+    assert times == pytest.approx([4.0, 4.0], rel=1e-2)
