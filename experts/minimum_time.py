@@ -20,7 +20,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import check_positive
 from leapnav.experts.continuation import continuation
 from leapnav.experts.control_weights import INTERVALS, continued, is_free, limit_of, next_extremal, transcribed
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem
 from leapnav.experts.search.structure import Piece, format_pieces, pieces_of
@@ -32,8 +32,7 @@ FIRST_WEIGHT, WEIGHT_FACTOR = 1.0, 0.25  # r of the first problem, and its facto
 START_ORDER = (2, 1, 0)  # problems in which paths of few pieces are solved first
 MAX_PATHS = 4  # local optima that are followed
 # Barrier weight (s per second) of hard limits with the first control weights. From the weight at which the barrier is
-# negligible, Newton's method stalled at smaller control weights in 3 of 9 tight parking tasks of a dynamic car. One of
-# these 3 is not solved from 0.1 either, and one not beyond the first control weight from 0.3.
+# negligible, Newton's method stalled at smaller control weights in 3 of 9 tight parking tasks of a dynamic car.
 FIRST_BARRIER = 1.0
 # Duration of the transcription relative to that of the path: more time makes smooth transitions possible, but a robot
 # that cannot slow down may not reach the goal in more time.
@@ -174,8 +173,10 @@ def _ends(given: OptimalControlProblem | Scenario, problems: Sequence[OptimalCon
                 failed = failed or end.extremal
 
     if isinstance(given, Scenario):
-        optimum = find_optimum(_softened(given))
-        follow([_Start(extremal, 0) for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]])
+        optimum = find_optimum(_with_free_horizon(given, given.cost.proximity_weight))
+        follow(_starts_of(optimum))
+        if given.cost.proximity_weight == 0.0 and not any(end.solved == len(problems) for end in found):
+            follow(_starts_of(find_optimum(_with_free_horizon(given, FIRST_BARRIER))))
         # The lattice is accurate for a robot that rotates in place, and paths of few pieces ignore obstacles.
         if not found or (not given.robot.lattice_moves(*UNIT_LATTICE).rotating and _is_far(optimum, given)):
             best = min(map(_limit_cost, found), default=math.inf)
@@ -200,11 +201,15 @@ def _without_motion_cost(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update={"cost": scenario.cost.model_copy(update=weights)})
 
 
-def _softened(scenario: Scenario) -> Scenario:
-    """Return the scenario with a free horizon, the time weight 1 and, if its obstacles are hard, the first barrier."""
-    cost = scenario.cost
-    update = {"time_weight": 1.0, "proximity_weight": cost.proximity_weight or FIRST_BARRIER}
-    return scenario.model_copy(update={"horizon": None, "cost": cost.model_copy(update=update)})
+def _with_free_horizon(scenario: Scenario, weight: float) -> Scenario:
+    """Return the scenario with a free horizon, the time weight 1 and a proximity weight."""
+    cost = scenario.cost.model_copy(update={"time_weight": 1.0, "proximity_weight": weight})
+    return scenario.model_copy(update={"horizon": None, "cost": cost})
+
+
+def _starts_of(optimum: Optimum) -> list[_Start]:
+    """Return the best local optima of a scenario, from which continuations start."""
+    return [_Start(extremal, 0) for extremal in [optimum, *optimum.alternatives][:MAX_PATHS]]
 
 
 def _limit_cost(end: _End) -> float:
@@ -291,14 +296,16 @@ def _follow(start: _Start, problems: Sequence[OptimalControlProblem], best: floa
     if not extremal.success:
         return _End(extremal, 0, extremal)
     failed, first = extremal, problems[max(count - 1, 0)].control_weight[0]
-    barrier = extremal.problem.proximity_weight if problems[0].has_hard_limits else 0.0
+    barrier = extremal.problem.barrier_weight
+    if count == 0 and problems[0].has_hard_limits:
+        barrier = FIRST_BARRIER
     for problem in problems[count:]:
         if _lowest_limit(extremal) > best:
             return _End(extremal, 0, extremal)
         decreased = barrier * math.sqrt(problem.control_weight[0] / first)
         following = replace(problem, goal=extremal.problem.goal, barrier_weight=decreased)
         found = next_extremal(extremal, following)
-        if not found.success and count == 0:  # without this problem there is no result, so more effort is worth it
+        if not found.success and count == 0 and best == math.inf:  # without this problem there may be no result at all
             found = continuation([extremal.problem, following], guess=extremal)[-1]
         if not found.success:
             failed = found
