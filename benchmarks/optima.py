@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.table import Table
 
 from leapnav.envs import Scenario, Unicycle, sample_scenario
+from leapnav.envs.field.clearance import clearances
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.scenarios.scenario import Circle, Obstacle, Polygon
-from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import OptimalControlProblem, Trajectory, build_bank, find_optimum
 from leapnav.experts.ipopt import Transcription
 from leapnav.experts.search.candidates import CandidateSearch

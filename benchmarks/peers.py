@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import solve_bvp
 
 from leapnav.envs import Scenario
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.field.clearance import clearances
 from leapnav.experts import Status, Trajectory, certify
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.solvers.nodes import default_segments, start_nodes

@@ -17,12 +17,12 @@ from functools import lru_cache
 import numpy as np
 from numba import float32, float64, from_dtype
 
+from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.layout import header_of, read_header
+from leapnav.envs.field.proximity import proximity_value
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import records_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.field import header_of, read_header
-from leapnav.envs.shapes.proximity import proximity_value
 
 SPACING = 0.1  # m, of the grid; larger in an arena in which the grid would have more than MAX_POINTS points
 MAX_POINTS = 40_000

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from leapnav.envs.field.packing import blend_fields
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import blend_fields
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.problem.extremal import Extremal, SolveError
 from leapnav.experts.problem.problem import OptimalControlProblem, as_problem

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from leapnav.envs.shapes.clearance import path_clearance
+from leapnav.envs.field.clearance import path_clearance
 from leapnav.experts.continuation import blend
 from leapnav.experts.hard_limits import follow_limit, softened, without_barrier
 from leapnav.experts.numerics.state_bounds import state_margin

@@ -1,7 +1,7 @@
 """Hard limits as the limit of a barrier: obstacles that cost nothing but must not be touched, and limits of states.
 
 With hard limits, the running cost contains a barrier k b(d / scale) of the distance d from each limit, see
-`leapnav.envs.shapes.barrier`. Its extremals approach those of the hard problem as the weight k decreases. An extremal
+`leapnav.envs.field.barrier`. Its extremals approach those of the hard problem as the weight k decreases. An extremal
 is followed to a weight at which the integral of the barrier is a given fraction of its cost: by Newton's method of
 multiple shooting, from an extrapolation of the two preceding extremals. Close to a limit, d is proportional to sqrt(k),
 so states and costates are extrapolated linearly in sqrt(k).

@@ -10,8 +10,8 @@ import casadi
 import numpy as np
 import sympy as sp
 
+from leapnav.envs.field.barrier import CONTACT
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.barrier import CONTACT
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 
 TOLERANCE, MAX_ITERATIONS = 1e-6, 300

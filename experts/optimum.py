@@ -128,7 +128,7 @@ class Optimum(Extremal):
 
 # The modules with the kernels of a search.
 SEARCH_MODULES = (
-    "leapnav.envs.shapes",
+    "leapnav.envs.field",
     "leapnav.experts.numerics",
     "leapnav.experts.problem",
     "leapnav.experts.search",

@@ -16,10 +16,10 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from leapnav.envs import shapes
+from leapnav.envs.field.clearance import clearance
 from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.utils.colors import ALTERNATIVES, CURVES, EDGE, GOAL, OBSTACLE, OPTIMUM, START, WALL
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import Optimum

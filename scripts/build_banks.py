@@ -8,13 +8,14 @@ processor, and some banks are older than changes of the search. Differences of t
 because the search omits some of the expensive alternatives. Lower bounds, which `leapnav bank prove` adds, and shortest
 paths are not compared.
 
-python scripts/build_banks.py --shortest # adds shortest lengths and minimum times to test banks of the unicycle (hours)
+python scripts/build_banks.py --shortest # adds shortest lengths and minimum times to the test banks (hours)
 """
 
 import argparse
 import os
 import sys
 import tempfile
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,11 @@ def build(directory: Path, workers: int) -> None:
 
 
 def add_shortest(directory: Path, workers: int) -> None:
-    """Add the shortest lengths and minimum times to the test banks of the unicycle, once for each task."""
+    """Add the shortest lengths and minimum times to the test banks, once for each task."""
+    for robot, family in product(ROBOTS, ROBOT_FAMILIES):
+        path = directory / f"{collection_name(family, robot)}-test.bank"
+        if np.isnan(ScenarioBank(path).shortest_times).any():
+            find_shortest(path, workers=workers)
     for family in (*ALL_FAMILIES, *LARGE_FAMILIES):
         path = directory / f"{family}-test.bank"
         if np.isnan(ScenarioBank(path).shortest_times).any():

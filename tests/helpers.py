@@ -212,11 +212,11 @@ def cluster_that_loses_a_worker(folder: Path, pattern: str) -> Iterator[str]:
 
 def let_newton_stall(monkeypatch, cost):
     """Let Newton's method stall in the search at extremals of a given cost."""
-    polish = local_optima._polish
+    polish = local_optima.polish_in_stages
 
     def stalled(*arguments):
         status, rows, evaluations = polish(*arguments)
         is_it = status is Status.SUCCESS and abs(rows[-1].cost - cost) < 1e-3 * cost
         return (Status.STALLED if is_it else status), rows, evaluations
 
-    monkeypatch.setattr(local_optima, "_polish", stalled)
+    monkeypatch.setattr(local_optima, "polish_in_stages", stalled)

@@ -7,16 +7,16 @@ import math
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.distance import part_geometry, wall_distance
+from leapnav.envs.field.layout import displacement_of, header_of, parts_in, time_of
+from leapnav.envs.field.rectangle import ROW, row_axis, separation, wall_separation
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.distance import part_geometry, wall_distance
-from leapnav.envs.shapes.field import header_of, parts_in
-from leapnav.envs.shapes.rectangle import ROW, row_axis, separation, wall_separation
 
 
-@kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
-def obstacle_distance(x, y, field):
-    """Signed distance (m) from a point to the nearest obstacle or wall, and the index of that obstacle.
+@kernel(tuple_of(float64, int64)(float64, float64, float64, CONSTANT))
+def obstacle_distance(x, y, time, field):
+    """Signed distance (m) from a point to the nearest obstacle or wall at a time (s), and the index of that obstacle.
 
     Negative inside. The wall has the index -1.
     """
@@ -27,9 +27,10 @@ def obstacle_distance(x, y, field):
     )
     nearest = -1
     for part in parts_in(field):
-        dx, dy = x - part.x, y - part.y
+        moved_x, moved_y = displacement_of(field, part, time)
+        dx, dy = x - moved_x - part.x, y - moved_y - part.y
         if dx * dx + dy * dy < max(best + part.rim, 0.0) ** 2:  # compares squares, since most parts are farther away
-            distance = part_geometry(x, y, 0.0, field, part)[0]
+            distance = part_geometry(x - moved_x, y - moved_y, 0.0, field, part)[0]
             if distance < best:
                 best, nearest = distance, part.obstacle
     return best, nearest
@@ -37,24 +38,25 @@ def obstacle_distance(x, y, field):
 
 @kernel(tuple_of(float64, int64)(float64, float64, CONSTANT))
 def clearance(x, y, field):
-    """Signed distance (m) from a disc with the radius of the field, and the index of the nearest obstacle.
+    """Signed distance (m) from a disc with the radius of the field at time 0, and the index of the nearest obstacle.
 
     See `obstacle_distance`.
     """
-    distance, nearest = obstacle_distance(x, y, field)
+    distance, nearest = obstacle_distance(x, y, 0.0, field)
     return distance - header_of(field).radius, nearest
 
 
-@kernel(tuple_of(float64, int64)(float64, float64, float64, float64, ROW, CONSTANT))
-def _rectangle_clearance(x, y, cos, sin, row, field):
-    """Signed distance (m) from a rectangle to the nearest obstacle or wall, and the index of that obstacle."""
+@kernel(tuple_of(float64, int64)(float64, float64, float64, float64, ROW, float64, CONSTANT))
+def _rectangle_clearance(x, y, cos, sin, row, time, field):
+    """Signed distance (m) from a rectangle to the nearest obstacle or wall at a time (s), and the obstacle's index."""
     middle, rim = (row[0] + row[1]) / 2.0, math.hypot((row[1] - row[0]) / 2.0, row[2]) + row[3]
     middle_x, middle_y = x + middle * cos, y + middle * sin
     best, nearest = wall_separation(x, y, cos, sin, row, header_of(field)), -1
     for part in parts_in(field):
-        dx, dy = middle_x - part.x, middle_y - part.y
+        moved_x, moved_y = displacement_of(field, part, time)
+        dx, dy = middle_x - moved_x - part.x, middle_y - moved_y - part.y
         if dx * dx + dy * dy < max(best + part.rim + rim, 0.0) ** 2:
-            distance = separation(x, y, cos, sin, row, field, part)
+            distance = separation(x - moved_x, y - moved_y, cos, sin, row, field, part)
             if distance < best:
                 best, nearest = distance, part.obstacle
     return best, nearest
@@ -65,14 +67,15 @@ def footprint_clearance(q, outline, field):
     """Signed distance (m) from the robot's outline to the nearest obstacle or wall, and the index of that obstacle.
 
     Args:
-        q: state of the robot, or its pose (m, rad) if the outline has no joint.
+        q: state of the robot, or its pose (m, rad) if the outline has no joint. Its entry with the index `clock` of the
+            field is the time (s) at which moving obstacles are considered; without one it is 0.
         outline (K, 5): see `leapnav.envs.robots.footprints.outline_of`; rows of zeros are unused.
         field: packed obstacle field.
 
     """
-    x, y = q[0], q[1]
+    x, y, time = q[0], q[1], time_of(q, field)
     if len(outline) == 1 and outline[0, 0] == 0.0 and outline[0, 1] == 0.0:
-        distance, nearest = obstacle_distance(x, y, field)
+        distance, nearest = obstacle_distance(x, y, time, field)
         return distance - outline[0, 3], nearest
     best, found = np.inf, -1
     for k in range(len(outline)):
@@ -80,9 +83,9 @@ def footprint_clearance(q, outline, field):
         cos, sin = math.cos(axis), math.sin(axis)
         if outline[k, 1] > a:
             row = (a, outline[k, 1], outline[k, 2], outline[k, 3])
-            distance, nearest = _rectangle_clearance(x, y, cos, sin, row, field)
+            distance, nearest = _rectangle_clearance(x, y, cos, sin, row, time, field)
         elif outline[k, 3] > 0.0:
-            distance, nearest = obstacle_distance(x + a * cos, y + a * sin, field)
+            distance, nearest = obstacle_distance(x + a * cos, y + a * sin, time, field)
             distance -= outline[k, 3]
         else:
             continue

@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.barrier import barrier
+from leapnav.envs.field.layout import HEADER_TYPE, PART_TYPE, edges_of
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, tuple_of
-from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.field import HEADER_TYPE, PART_TYPE, edges_of
 
 # Smallest distances (m) from the centre of a circle, and from a vertex, with which normal and curvature are computed.
 # Only guesses deep in an obstacle come so close to a centre. The corner of a rectangle comes close to a vertex; the

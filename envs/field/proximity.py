@@ -1,5 +1,6 @@
 """The proximity cost Phi of a packed obstacle field (kernels), with gradient and Hessian or without.
 
+Unless stated otherwise it is that of the walls and of the obstacles at rest; that of the others is in `moving`.
 Phi sums a term for each wall and each part of an obstacle: the proximity weight times the barrier function of
 distance / proximity scale, where the distance is that from the robot's outline.
 """
@@ -11,12 +12,13 @@ import math
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.barrier import barrier
+from leapnav.envs.field.distance import HASH_FACTOR, barrier_term, closest_feature, part_geometry, wall_distance
+from leapnav.envs.field.layout import CUTOFF, header_of, parts_in, parts_near, time_of
+from leapnav.envs.field.moving import moving_row_value
+from leapnav.envs.field.rectangle import OUTLINE_ENTRIES, add_rectangle, rectangle_features, row_axis
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
-from leapnav.envs.shapes.barrier import barrier
-from leapnav.envs.shapes.distance import HASH_FACTOR, barrier_term, closest_feature, part_geometry, wall_distance
-from leapnav.envs.shapes.field import CUTOFF, header_of, parts_in, parts_near
-from leapnav.envs.shapes.rectangle import OUTLINE_ENTRIES, add_rectangle, rectangle_features, row_axis
 
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 
@@ -74,7 +76,7 @@ def proximity_values(xa, ya, xb, yb, xc, yc, radius, field):
             first += barrier((wall_distance(xa, ya, header, side) - radius) * steepness, contact)[0]
             second += barrier(between * steepness, contact)[0]
             third += barrier((wall_distance(xc, yc, header, side) - radius) * steepness, contact)[0]
-    for part in parts:
+    for part in parts[: header.parts - header.moving]:
         if (xb - part.x) ** 2 + (yb - part.y) ** 2 < (part.rim + radius + reach) ** 2:
             first += barrier(part_geometry(xa, ya, radius, field, part)[0] * steepness, contact)[0]
             second += barrier(part_geometry(xb, yb, radius, field, part)[0] * steepness, contact)[0]
@@ -95,7 +97,7 @@ def footprint_proximity(x, y, heading, joint, data, first, field):
 
     Args:
         x, y, heading: position (m), and angle of the axis of these rows (rad).
-        joint: see `leapnav.envs.shapes.rectangle`; other rows are skipped.
+        joint: see `leapnav.envs.field.rectangle`; other rows are skipped.
         data: rows of an outline, from the index `first` to the end. A disc has the half width 0, and its rear and its
             front are its centre.
         first: see `data`.
@@ -142,10 +144,14 @@ def footprint_proximity(x, y, heading, joint, data, first, field):
 
 @kernel(float64(CONSTANT, CONSTANT_MATRIX, CONSTANT))
 def footprint_value(q, outline, field):
-    """Proximity cost of the outline (K, 5) of a robot at a state q, without derivatives."""
+    """Proximity cost of the outline (K, 5) of a robot at a state q, without derivatives, with moving obstacles."""
     x, y, value, weight = q[0], q[1], 0.0, header_of(field).weight
+    moves, time = header_of(field).moving > 0, time_of(q, field)
     for k in range(len(outline)):
         a = outline[k, 0]
+        if moves and outline[k, 3] + outline[k, 2] > 0.0:
+            axis, row = row_axis(q, outline[k, 4]), (a, outline[k, 1], outline[k, 2], outline[k, 3])
+            value += moving_row_value(x, y, math.cos(axis), math.sin(axis), row, time, field)
         if a == 0.0 and outline[k, 1] == 0.0:
             if outline[k, 3] > 0.0:  # otherwise unused
                 value += proximity_value(x, y, outline[k, 3], field)

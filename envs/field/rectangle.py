@@ -14,9 +14,7 @@ import math
 import numpy as np
 from numba import float64, int64
 
-from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, NOTHING, VECTOR, tuple_of
-from leapnav.envs.shapes.distance import (
+from leapnav.envs.field.distance import (
     HASH_FACTOR,
     MIN_DISTANCE,
     barrier_term,
@@ -24,7 +22,9 @@ from leapnav.envs.shapes.distance import (
     part_geometry,
     wall_distance,
 )
-from leapnav.envs.shapes.field import CUTOFF, HEADER_TYPE, PART_TYPE, edges_of, header_of, parts_in, parts_near
+from leapnav.envs.field.layout import CUTOFF, HEADER_TYPE, PART_TYPE, edges_of, header_of, parts_in, parts_near
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CONSTANT, NOTHING, VECTOR, tuple_of
 
 OUTLINE_ENTRIES = 5  # in a row of an outline
 ROW = tuple_of(*[float64] * 4)  # of an outline, without the joint
@@ -153,15 +153,32 @@ def _add_point(rx, ry, cos, sin, row, rounding, header, total):
     total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - (gx * rx + gy * ry)
 
 
+@kernel(NOTHING(float64, float64, float64, float64, ROW, CONSTANT, PART_TYPE, VECTOR), inline="always")
+def add_part(x, y, cos, sin, row, field, part, total):
+    """Add the proximity cost of a rectangle near a part, see `add_rectangle`."""
+    header, radius = header_of(field), row[3]
+    rounding = radius + part.rounding
+    if part.edges == 0:
+        _add_point(part.x - x, part.y - y, cos, sin, row, rounding, header, total)
+        return
+    for edge in edges_of(field, part):
+        _add_point(edge.x - x, edge.y - y, cos, sin, row, rounding, header, total)
+    for k in range(4):
+        ahead, left = (row[1] if k < 2 else row[0]), (row[2] if k % 2 == 0 else -row[2])
+        ox, oy = ahead * cos - left * sin, ahead * sin + left * cos
+        distance, nx, ny, curvature = part_geometry(x + ox, y + oy, radius, field, part)
+        _add_corner(distance, nx, ny, curvature, ox, oy, header, total)
+
+
 @kernel(NOTHING(float64, float64, float64, float64, ROW, CONSTANT, VECTOR))
 def add_rectangle(x, y, cos, sin, row, field, total):
-    """Add the proximity cost of a rectangle, divided by its weight, with derivatives.
+    """Add the proximity cost of a rectangle among obstacles at rest, divided by its weight, with derivatives.
 
     Args:
         x, y, cos, sin: position (m), and cosine and sine of the heading.
         row: row of an outline.
         field: packed obstacle field.
-        total (10,): see the result of `leapnav.envs.shapes.proximity.footprint_proximity`.
+        total (10,): see the result of `leapnav.envs.field.proximity.footprint_proximity`.
 
     """
     header, parts = header_of(field), parts_in(field)
@@ -185,19 +202,8 @@ def add_rectangle(x, y, cos, sin, row, field, total):
     for number in parts_near(middle_x, middle_y, field):
         part = parts[number]
         dx, dy = part.x - middle_x, part.y - middle_y
-        if dx * dx + dy * dy >= (part.rim + rim + reach) ** 2:
-            continue
-        rounding = radius + part.rounding
-        if part.edges == 0:
-            _add_point(part.x - x, part.y - y, cos, sin, row, rounding, header, total)
-            continue
-        for edge in edges_of(field, part):
-            _add_point(edge.x - x, edge.y - y, cos, sin, row, rounding, header, total)
-        for k in range(4):
-            ahead, left = (row[1] if k < 2 else row[0]), (row[2] if k % 2 == 0 else -row[2])
-            ox, oy = ahead * cos - left * sin, ahead * sin + left * cos
-            distance, nx, ny, curvature = part_geometry(x + ox, y + oy, radius, field, part)
-            _add_corner(distance, nx, ny, curvature, ox, oy, header, total)
+        if dx * dx + dy * dy < (part.rim + rim + reach) ** 2:
+            add_part(x, y, cos, sin, row, field, part, total)
 
 
 @kernel(int64(float64, float64, float64, float64, ROW), inline="always")
@@ -206,6 +212,21 @@ def _side(rx, ry, cos, sin, row):
     ahead, left = cos * rx + sin * ry, cos * ry - sin * rx
     along = 0 if ahead < row[0] else 2 if ahead > row[1] else 1
     return 3 * along + (0 if left < -row[2] else 2 if left > row[2] else 1)
+
+
+@kernel(int64(int64, float64, float64, float64, float64, ROW, CONSTANT, PART_TYPE), inline="always")
+def part_features(features, x, y, cos, sin, row, field, part):
+    """Combine a number with that of the closest edges and vertices of a rectangle and a part."""
+    if part.edges == 0:
+        return HASH_FACTOR * features + _side(part.x - x, part.y - y, cos, sin, row)
+    reach = CUTOFF * header_of(field).scale + row[3]
+    for edge in edges_of(field, part):
+        features = HASH_FACTOR * features + _side(edge.x - x, edge.y - y, cos, sin, row)
+    for k in range(4):
+        ahead, left = (row[1] if k < 2 else row[0]), (row[2] if k % 2 == 0 else -row[2])
+        corner_x, corner_y = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+        features = HASH_FACTOR * features + closest_feature(corner_x, corner_y, field, part, reach)
+    return features
 
 
 @kernel(int64(float64, float64, float64, float64, ROW, CONSTANT))
@@ -223,15 +244,6 @@ def rectangle_features(x, y, cos, sin, row, field):
         dx, dy = part.x - middle_x, part.y - middle_y
         if dx * dx + dy * dy >= (part.rim + rim + reach) ** 2:
             continue
-        features = index
-        if part.edges == 0:
-            features = HASH_FACTOR * features + _side(part.x - x, part.y - y, cos, sin, row)
-        for edge in edges_of(field, part):
-            features = HASH_FACTOR * features + _side(edge.x - x, edge.y - y, cos, sin, row)
-        if part.edges > 0:
-            for k in range(4):
-                ahead, left = (row[1] if k < 2 else row[0]), (row[2] if k % 2 == 0 else -row[2])
-                corner_x, corner_y = x + ahead * cos - left * sin, y + ahead * sin + left * cos
-                features = HASH_FACTOR * features + closest_feature(corner_x, corner_y, field, part, reach)
+        features = part_features(index, x, y, cos, sin, row, field, part)
         number += features * features  # a sum does not depend on the order of the parts
     return number

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.barrier import CONTACT, barrier
+from leapnav.envs.field.distance import part_geometry, wall_distance
+from leapnav.envs.field.layout import header_of, parts_in
+from leapnav.envs.field.rectangle import ROW, separation
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, tuple_of
-from leapnav.envs.shapes.barrier import CONTACT, barrier
-from leapnav.envs.shapes.distance import part_geometry, wall_distance
-from leapnav.envs.shapes.field import header_of, parts_in
-from leapnav.envs.shapes.rectangle import ROW, separation
 
 # Added to the distances of the points, relative to the spacing. With 0 (and at least half the spacing), 3 optima of
 # 2,000 scenarios of the unicycle are missed, by 3 to 36 %; for other robots, 7 of 800 results differ from those of the
@@ -42,7 +42,7 @@ def _index_range(low, high, origin, spacing, count):
 
 @kernel(tuple_of(MATRIX, MATRIX)(CONSTANT, ROW, float64, POINT_GRID, float64))
 def sample_grid(field, row, heading, grid, band):
-    """Phi and clearance (m) of a disc or rectangle, both (columns, lines), at the points of a grid.
+    """Phi and clearance (m) of a disc or rectangle among obstacles at rest, both (columns, lines), on a grid of points.
 
     Obstacles farther away than `band` (m) do not contribute to Phi, and the clearance is at most `band`, so that each
     obstacle is evaluated at the points around it only. A path between the points can be farther away from obstacles,
@@ -51,7 +51,7 @@ def sample_grid(field, row, heading, grid, band):
 
     Args:
         field: packed obstacle field.
-        row: row of an outline, see `leapnav.envs.shapes.rectangle`.
+        row: row of an outline, see `leapnav.envs.field.rectangle`.
         heading: of the robot (rad).
         grid: the points, at which the robot's reference point is.
         band: see above.
@@ -80,7 +80,7 @@ def sample_grid(field, row, heading, grid, band):
                     if distance < band:
                         phi[i, j] += weight * barrier((max(distance, 0.0) + offset) * steepness, CONTACT)[0]
                         closest[i, j] = min(closest[i, j], distance)
-    for shape in parts_in(field):
+    for shape in parts_in(field)[: header.parts - header.moving]:
         reach = shape.rim + band + rim
         first, last = _index_range(shape.x - reach, shape.x + reach, x0, spacing, columns)
         bottom, top = _index_range(shape.y - reach, shape.y + reach, y0, spacing, lines)

@@ -79,7 +79,7 @@ def outline_of(footprint: Sequence[Disc] | Box, ahead: float = 0.0, joint: int =
 
 
 def sizes_of(outline: np.ndarray) -> tuple[float, float]:
-    """Return radius and extent (m) of an outline, see `leapnav.envs.shapes.field.HEADER`."""
+    """Return radius and extent (m) of an outline, see `leapnav.envs.field.layout.HEADER`."""
     rear, front, half_width, radius = outline.T[:4]
     return float((half_width + radius).max()), float((np.hypot((front - rear) / 2, half_width) + radius).max())
 

@@ -19,6 +19,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from leapnav.envs.field.clearance import clearances, footprint_clearances
+from leapnav.envs.field.packing import pack_field
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.robots.footprints import sizes_of
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
@@ -26,8 +28,6 @@ from leapnav.envs.scenarios.files import read_scenarios
 from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Area, ScenarioLayout, rounded
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
-from leapnav.envs.shapes.clearance import clearances, footprint_clearances
-from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.validation import check_choice, suggestion
 
 REFERENCE_SPEED = 0.8  # m/s: the horizon is the length of the shortest path divided by this speed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -103,3 +104,20 @@ def read_text(path: Path) -> str:
         others = os.listdir(path.parent) if path.parent.is_dir() else []
         raise FileNotFoundError(f"{path}: no such file{suggestion(path.name, others)}")
     return path.read_text(encoding="utf-8-sig")
+
+
+def check_headings(name: str, start: tuple[float, ...], goal: tuple[float | None, ...]) -> None:
+    """Check the headings of a scenario that a person has written, perhaps in degrees.
+
+    Raises:
+        ScenarioError: a heading is beyond +-2 pi.
+
+    """
+    faults = [
+        f"{field}: expected a heading in radians, at most 2 pi, got {heading:g}; "
+        f"did you mean {math.radians(heading):.4g}?"
+        for field, (_, _, heading) in (("start", start), ("goal", goal))
+        if heading is not None and abs(heading) > 2 * math.pi
+    ]
+    if faults:
+        raise ScenarioError(f"Scenario {name!r}: {' '.join(faults)}")

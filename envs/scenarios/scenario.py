@@ -18,17 +18,25 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator, model_validator
 
+from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.field.packing import field_parts, pack_field, replace_parts
 from leapnav.envs.robots import Box, Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.robots.footprints import sizes_of
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
-from leapnav.envs.scenarios.faults import ScenarioError, fault, one_line, read_text, shorten, unique_keys
+from leapnav.envs.scenarios.faults import (
+    ScenarioError,
+    check_headings,
+    fault,
+    one_line,
+    read_text,
+    shorten,
+    unique_keys,
+)
 from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, rectangle_vertices
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.base import KINDS
-from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import pack_field
 from leapnav.envs.utils.records import Finite, Frozen, Positive
 from leapnav.envs.utils.validation import as_vector, check_positive
 
@@ -130,14 +138,17 @@ class Scenario(Frozen):
     def _check_poses_are_free(self) -> Self:
         names = [f"obstacles[{i}]" for i in range(len(self.obstacles))] + ["the arena wall"]
         faults = []
-        for end, given in (("start", self.start_state), ("goal", self.goal_state)):
-            state = np.array([value or 0.0 for value in given])
-            distance, nearest = footprint_clearance(state, self.outline, self.field)
+        at_rest = [part for part in field_parts(self.field) if not len(part.knots)] if self.moves else []
+        for end, given, time in (("start", self.start_state, 0.0), ("goal", self.goal_state, self.horizon)):
+            # Whether a moving obstacle is at the goal when the robot arrives is not known if the horizon is free.
+            field = self.field if time is not None or not self.moves else replace_parts(self.field, at_rest)
+            state = np.array([*(value or 0.0 for value in given), time or 0.0])
+            distance, nearest = footprint_clearance(state, self.outline, field)
             free = [k for k in {2, *self.outline[:, 4].astype(int)} - {0} if given[k] is None]
             circle = np.linspace(-np.pi, np.pi, N_HEADINGS)
             for angles in product(circle, repeat=len(free)) if free and not distance > 0 else ():
                 state[free] = angles  # at some heading and hitch angle there must be no contact
-                distance, nearest = max((distance, nearest), footprint_clearance(state, self.outline, self.field))
+                distance, nearest = max((distance, nearest), footprint_clearance(state, self.outline, field))
             if not distance > 0:
                 faults.append(
                     f"{end}: ({state[0]:g}, {state[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
@@ -148,10 +159,16 @@ class Scenario(Frozen):
 
     @cached_property
     def field(self) -> np.ndarray:
-        """The packed obstacle field, see `leapnav.envs.shapes.field` (read-only)."""
-        cost = self.cost
-        shapes = [obstacle.shape for obstacle in self.obstacles]
-        return pack_field(shapes, self.arena, sizes_of(self.outline), cost.proximity_weight, cost.proximity_scale)
+        """The packed obstacle field, see `leapnav.envs.field.layout` (read-only)."""
+        obstacles, weights = self.obstacles, (self.cost.proximity_weight, self.cost.proximity_scale)
+        shapes, motions = [one.shape for one in obstacles], [one.knots for one in obstacles]
+        clock = self.robot.sizes()[0]
+        return pack_field(shapes, self.arena, sizes_of(self.outline), *weights, motions=motions, clock=clock)
+
+    @property
+    def moves(self) -> bool:
+        """Whether an obstacle moves by itself."""
+        return any(len(obstacle.knots) for obstacle in self.obstacles)
 
     @cached_property
     def outline(self) -> np.ndarray:
@@ -215,7 +232,8 @@ class Scenario(Frozen):
 
         """
         x, y, heading, *motion = as_vector("state", state, len(self.robot.state_names)).tolist()
-        update: dict[str, Any] = {"start": (x, y, heading)}
+        obstacles = tuple(obstacle.after(time) for obstacle in self.obstacles)
+        update: dict[str, Any] = {"start": (x, y, heading), "obstacles": obstacles}
         if self.horizon is not None:
             update["horizon"] = float(self.horizon - time)
         if motion:
@@ -313,7 +331,7 @@ class Scenario(Frozen):
             raise ScenarioError(f"scenario {source}: not valid JSON: {error}") from None
         scenario = cls.from_dict(fields)
         if not is_text:  # written by hand, perhaps in degrees
-            check_headings(scenario)
+            check_headings(scenario.name, scenario.start, scenario.goal)
         return scenario
 
     @classmethod
@@ -422,23 +440,6 @@ def _read_robot(fields: Mapping[str, Any]) -> tuple[RobotModel, list[str]]:
             fault(details, partial(_known_fields, robot=model), ("robot",))
             for details in error.errors(include_url=False)
         ]
-
-
-def check_headings(scenario: Scenario) -> None:
-    """Check the headings of a scenario that a person has written, perhaps in degrees.
-
-    Raises:
-        ScenarioError: a heading is beyond +-2 pi.
-
-    """
-    faults = [
-        f"{field}: expected a heading in radians, at most 2 pi, got {heading:g}; "
-        f"did you mean {math.radians(heading):.4g}?"
-        for field, (_, _, heading) in (("start", scenario.start), ("goal", scenario.goal))
-        if heading is not None and abs(heading) > 2 * math.pi
-    ]
-    if faults:
-        raise ScenarioError(f"Scenario {scenario.name!r}: {' '.join(faults)}")
 
 
 def _known_fields(location: Sequence[Any], robot: type[RobotModel] = Unicycle) -> tuple[str, ...]:

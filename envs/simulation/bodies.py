@@ -19,13 +19,14 @@ import pymunk.batch
 from numba import float64
 from pymunk.constraints import Constraint, GearJoint, PivotJoint
 
+from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.field.layout import read_header
+from leapnav.envs.field.packing import FieldPart, displacements, field_parts, parts_at, replace_parts
+from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR
 from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.settings import Motor
-from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import FieldPart, field_parts, read_header, replace_parts
-from leapnav.envs.shapes.proximity import footprint_value
 from leapnav.envs.simulation.stepping import GRAVITY
 
 WALL_THICKNESS = 1.0  # m, outside the arena
@@ -88,7 +89,8 @@ VelocityFunction = Callable[[float, float, float, float], tuple[float, float, fl
 class ContactWorld:
     """One robot and the obstacles of its arena, for the control periods with contact.
 
-    Obstacles with a mass are at rest at the start of each period and whenever the robot does not push them.
+    Obstacles with a mass are at rest at the start of each period and whenever the robot does not push them. Moving
+    obstacles follow their paths, whatever they push.
 
     Args:
         field: the packed field of the scenario.
@@ -115,8 +117,11 @@ class ContactWorld:
         shapes: list[pymunk.Shape] = []
         self._parts = field_parts(field)
         self._movable = {k: pymunk.Body() for k, mass in enumerate(masses) if mass is not None}
+        self._knots = {part.obstacle: part.knots for part in self._parts if len(part.knots)}
+        self._moving = {k: pymunk.Body(body_type=pymunk.Body.KINEMATIC) for k in self._knots}
+        bodies = {**self._movable, **self._moving}
         for part in self._parts:
-            body, points = self._movable.get(part.obstacle, static), part.vertices.tolist()
+            body, points = bodies.get(part.obstacle, static), part.vertices.tolist()
             if len(points) == 1:
                 shapes.append(pymunk.Circle(body, part.rounding, points[0]))
             elif len(points) == 2:
@@ -138,7 +143,7 @@ class ContactWorld:
             shapes.append(pymunk.Poly(static, [(left, below), (right, below), (right, above), (left, above)]))
         for shape in shapes:
             shape.friction = 1.0  # Chipmunk multiplies the coefficients of both shapes
-        self._space.add(*self._movable.values(), *shapes)
+        self._space.add(*bodies.values(), *shapes)
         for body in self._movable.values():
             self._space.add(*_ground_friction(static, body))
 
@@ -147,6 +152,7 @@ class ContactWorld:
         state: np.ndarray,
         velocity: np.ndarray,
         steer: VelocityFunction,
+        time: float,
         duration: float,
         substeps: int,
     ) -> tuple[float, float, float, float]:
@@ -156,6 +162,7 @@ class ContactWorld:
             state (n,): state of the robot, whose pose is overwritten. The angles of its joints do not change.
             velocity: velocity (2) (m/s) and angular velocity (rad/s); overwritten.
             steer: see `VelocityFunction`.
+            time: of the episode (s), at the start of the period.
             duration: length of the period (s).
             substeps: number of steps.
 
@@ -180,23 +187,36 @@ class ContactWorld:
         self._space.add(body, *outline)
         step = duration / substeps
         lowest, speed_integral, turn_integral = math.inf, 0.0, 0.0
-        phi = footprint_value(state, self._smaller, self.field)
+        phi = footprint_value(state, self._smaller, self._field_at(time))
         phi_sum = phi / 2  # trapezoidal rule
-        for _ in range(substeps):
+        for k in range(substeps):
+            self._start_moving(time + k * step, step)
             self._space.step(step)
             before = state.copy()
             state[:3] = _pose(body)
             self._move_obstacles()
-            lowest = min(lowest, resolve_overlap(before, state, self._outline, self.field))
+            field = self._field_at(time + (k + 1) * step)
+            lowest = min(lowest, resolve_overlap(before, state, self._outline, field))
             body.position = float(state[0]), float(state[1])
             moved = (state[:3] - before[:3]).tolist()
             speed_integral += (moved[0] ** 2 + moved[1] ** 2) / step
             turn_integral += moved[2] ** 2 / step
-            phi = footprint_value(state, self._smaller, self.field)
+            phi = footprint_value(state, self._smaller, field)
             phi_sum += phi
         velocity[:] = *body.velocity, body.angular_velocity
         self._space.remove(body, *outline)
         return lowest, speed_integral, turn_integral, (phi_sum - phi / 2) * step
+
+    def _start_moving(self, time: float, step: float) -> None:
+        """Place the moving obstacles at a time (s), with the velocities that lead to their places after a step (s)."""
+        for k, body in self._moving.items():
+            first, last = displacements(self._knots[k], np.array([time, time + step])).tolist()
+            body.position = first[0], first[1]
+            body.velocity = (last[0] - first[0]) / step, (last[1] - first[1]) / step
+
+    def _field_at(self, time: float) -> np.ndarray:
+        """Return the packed field with the moving obstacles at rest where they are at a time (s)."""
+        return replace_parts(self.field, parts_at(self.field, time)) if self._moving else self.field
 
     def _move_obstacles(self) -> None:
         """Update the field after obstacles have moved."""

@@ -11,11 +11,11 @@ import numpy as np
 from gymnasium import spaces
 from numba import float32, from_dtype, types
 
+from leapnav.envs.field.layout import header_of
 from leapnav.envs.geodesics import MAX_DETOUR, geodesic_detours, geodesic_distance
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.shapes.field import header_of
 from leapnav.envs.simulation.sensing import map_surroundings, scan
 from leapnav.envs.simulation.state import PACKED, Simulation, field_of, row_of
 from leapnav.envs.simulation.stepping import wrapped
@@ -283,14 +283,13 @@ class ObservationLayout:
             return flat
         return {name: np.ascontiguousarray(flat[..., part]) for name, part in self._slices.items()}
 
-    def scan(self, pose: np.ndarray, field: np.ndarray) -> np.ndarray:
+    def scan(self, pose: np.ndarray, time: float, field: np.ndarray) -> np.ndarray:
         """Return the lidar ranges (m) at a pose; empty without a lidar."""
         if not self._settings.has_lidar:
             return np.empty(0)
         x, y, heading = pose[:3].tolist()
         buffers = self._buffers
-        cos, sin = math.cos(heading), math.sin(heading)
-        scan(x, y, cos, sin, field, self._settings.lidar_range, buffers.beams, buffers.scratch)
+        scan(x, y, heading, time, field, self._settings.lidar_range, buffers.beams, buffers.scratch)
         return buffers.scratch[2, : self._settings.lidar_beams].copy()
 
     def fill(self, robots: np.ndarray, packed: tuple[np.ndarray, ...], out: np.ndarray) -> None:
@@ -321,7 +320,7 @@ def observe_robots(robots, packed, packed_buffers, out):
         cos, sin = math.cos(heading), math.sin(heading)
         noise = sim.noise[i, episode.steps % sim.noise.shape[1]]
         if at.lidar >= 0:  # from the true pose, not from the sensed one
-            scan(x, y, cos, sin, field, settings.lidar_range, beams, scratch)
+            scan(x, y, heading, episode.time, field, settings.lidar_range, beams, scratch)
         # Achieved goals are observed without noise, because they determine the reward.
         if deviation != 0.0 and not settings.goal_conditioned:
             x += deviation * noise[sensing]
@@ -374,7 +373,8 @@ def observe_robots(robots, packed, packed_buffers, out):
             row[at.distance] = geodesic_distance(x, y, sim.maps[i])
         if at.walls >= 0:
             surroundings = row[at.walls :]
-            map_surroundings(x, y, cos, sin, field, settings.map_obstacles, settings.map_vertices, surroundings)
+            obstacles, vertices = settings.map_obstacles, settings.map_vertices
+            map_surroundings(x, y, heading, episode.time, field, obstacles, vertices, surroundings)
         for k in range(len(row)):
             value = np.float32(row[k])
             value = bounds[0, k] if value < bounds[0, k] else value

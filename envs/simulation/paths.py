@@ -12,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import float64, int64, types
 
+from leapnav.envs.field.barrier import CONTACT
+from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.field.layout import header_of
+from leapnav.envs.field.proximity import footprint_value, proximity_values
+from leapnav.envs.field.rectangle import row_axis
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import FunctionPointer, function_at
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, STATE_COST_SIGNATURE
-from leapnav.envs.shapes.barrier import CONTACT
-from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.field import header_of
-from leapnav.envs.shapes.proximity import footprint_value, proximity_values
-from leapnav.envs.shapes.rectangle import row_axis
 
 ADVANCE_FUNCTION = types.FunctionType(ADVANCE_SIGNATURE)
 STATE_COST_FUNCTION = types.FunctionType(STATE_COST_SIGNATURE)
@@ -68,14 +68,14 @@ class Path(NamedTuple):
 
     Attributes:
         motion: kernels of the robot's model.
-        q (n,): state at the start.
+        q (n + 1,): state at the start, and its time (s) in the episode.
         u (m,): held controls.
         parameters: parameters of the model.
         outline (K, 5): footprint, see `leapnav.envs.robots.footprints.outline_of`.
         field: packed obstacle field.
         duration: s.
-        samples (5 or more, n): working memory: the states at the nodes of a panel, and two other states. Further rows
-            are not used.
+        samples (5 or more, n + 1): working memory: the states at the nodes of a panel, and two other states, with
+            their times. Further rows are not used.
 
     """
 
@@ -116,8 +116,10 @@ def coast(q, u, h, parameters, new):
 
 @kernel(NOTHING(PATH, float64, VECTOR), inline="always")
 def state_after(path, fraction, new):
-    """Write the state at a fraction of the path to new (n,)."""
+    """Write the state at a fraction of the path, and its time, to new (n + 1,)."""
     path.motion.advance(path.q, path.u, path.duration * fraction, path.parameters, new)
+    last = len(new) - 1
+    new[last] = path.q[last] + path.duration * fraction
 
 
 @kernel(float64(PATH, VECTOR), inline="always")
@@ -143,9 +145,13 @@ def _speed_after(path, q):
 
 @kernel(float64(PATH, VECTOR), inline="always")
 def largest_distance(path, end):
-    """Return a bound of the distance (m) that a disc or corner of the robot travels along the path to a state."""
+    """Return a bound of the distance (m) that a disc or corner of the robot travels along the path to a state.
+
+    That of the obstacles is added.
+    """
     first, last = _speed_after(path, path.q), _speed_after(path, end)
-    return path.duration * (max(first, last) + SPEED_MARGIN * abs(first - last))
+    robot = max(first, last) + SPEED_MARGIN * abs(first - last)
+    return path.duration * (robot + header_of(path.field).top_speed)
 
 
 @kernel(types.UniTuple(float64, 3)(PATH, float64, float64, VECTOR), inline="always")
@@ -232,7 +238,7 @@ def _panel_costs(path, start, width):
         state_after(path, start + NODES[k] * width, samples[k])
         state_cost += NODE_WEIGHTS[k] * path.motion.state_cost(samples[k], path.parameters)
     first, second, third = samples[0], samples[1], samples[2]
-    if _has_rectangle(outline):
+    if _has_rectangle(outline) or header_of(path.field).moving > 0:
         for k in range(3):
             proximity += NODE_WEIGHTS[k] * footprint_value(samples[k], outline, path.field)
         return proximity * width, state_cost * width
@@ -295,7 +301,7 @@ def drive_path(path, before, new):
     Args:
         path: the path, of a positive duration.
         before: clearance (m) at the start.
-        new (n,): overwritten by the state at the end.
+        new (n + 1,): overwritten by the state at the end and its time.
 
     Returns:
         See `first_contact`; then the integrals of the proximity cost and of the state cost.

@@ -10,12 +10,12 @@ from functools import cache
 import numpy as np
 import pygame
 
+from leapnav.envs.field.packing import parts_at
 from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.shapes import Capsule
-from leapnav.envs.shapes.field import field_parts
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.utils.colors import EDGE, FAILURE, GOAL, OBSTACLE, OPTIMUM, POLICY, WALL
 
@@ -106,7 +106,7 @@ def draw_scene(scene: Scene) -> np.ndarray:
     beams = _lidar_ends(to_pixels, scene)
     for end, _ in beams:
         pygame.draw.line(canvas, RAY, to_pixels(*scene.state[:2]), end, max(1, line // 2))
-    for vertices, rounding, _ in field_parts(scene.field):
+    for vertices, rounding, *_ in parts_at(scene.field, scene.time):
         if len(vertices) == 1:
             center, radius = to_pixels(*vertices[0].tolist()), rounding * scale
             pygame.draw.circle(canvas, OBSTACLE, center, radius)

@@ -7,11 +7,12 @@ import math
 import numpy as np
 from numba import float64, int64, types
 
+from leapnav.envs.field.distance import part_geometry
+from leapnav.envs.field.layout import PART_TYPE, displacement_of, edges_of, header_of, parts_in
+from leapnav.envs.field.packing import field_parts
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
-from leapnav.envs.shapes.distance import part_geometry
-from leapnav.envs.shapes.field import PART_TYPE, edges_of, field_parts, header_of, parts_in
 
 WALL_ENTRIES = 6  # of a map, before the obstacles
 # Up to this number of beams it takes less time to intersect a circle with all of them, in vector instructions, than to
@@ -101,24 +102,25 @@ def _shorten(cx, cy, r, reach, dxs, dys, nearest):
 
 
 @kernel(NOTHING(float64, float64, float64, float64, CONSTANT, float64, MATRIX, MATRIX))
-def scan(x, y, cos, sin, field, reach, beams, scratch):
+def scan(x, y, heading, time, field, reach, beams, scratch):
     """Compute lidar ranges (m).
 
     Polygons are intersected only with the beams that may meet a circle around them, and so are circles if there are
     many beams.
 
     Args:
-        x, y: position of the lidar (m).
-        cos, sin: of its heading.
+        x, y, heading: position (m) and heading (rad) of the lidar.
+        time: of the episode (s), for the positions of moving obstacles.
         field: the packed field of the scenario.
         reach: maximum range (m).
         beams (2, n): cosines and sines of the angles 2 pi k / n of the beams in the lidar's frame.
         scratch (3, 2 n): working memory; the first n entries of row 2 are the ranges afterwards.
 
     """
-    count = beams.shape[1]
+    count, cos, sin = beams.shape[1], math.cos(heading), math.sin(heading)
     dxs, dys, nearest = scratch[0], scratch[1], scratch[2]
     parts, arena = parts_in(field), header_of(field).arena
+    has_polygons = header_of(field).edges > 0
     to_right, to_top, to_left, to_bottom = arena[2] - x, arena[3] - y, arena[0] - x, arena[1] - y
     for k in range(count):
         dx = cos * beams[0, k] - sin * beams[1, k]
@@ -129,12 +131,14 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
         dxs[k], dys[k] = dx, dy
         nearest[k] = first if first < reach else reach
     # The beams that may meet an obstacle are consecutive, if beam count + k is beam k.
-    selects = count > MAX_VECTORISED_BEAMS or (len(parts) > 0 and parts[-1].edges > 0)
+    selects = count > MAX_VECTORISED_BEAMS or has_polygons
     if selects:
         for k in range(count):
             dxs[count + k], dys[count + k], nearest[count + k] = dxs[k], dys[k], nearest[k]
     for part in parts:
-        cx, cy = part.x - x, part.y - y
+        moved_x, moved_y = displacement_of(field, part, time)
+        px, py = x - moved_x, y - moved_y
+        cx, cy = part.x - px, part.y - py
         if cx * cx + cy * cy >= (part.rim + reach) ** 2:
             continue
         first, size = 0, count
@@ -145,9 +149,9 @@ def scan(x, y, cos, sin, field, reach, beams, scratch):
             rays = part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size)
             _shorten(cx, cy, part.rim, reach, rays[0], rays[1], rays[2])
             continue
-        is_inside = part.rounding > 0.0 and part_geometry(x, y, 0.0, field, part)[0] <= 0.0
+        is_inside = part.rounding > 0.0 and part_geometry(px, py, 0.0, field, part)[0] <= 0.0
         for k in range(first, first + size):
-            hit = 0.0 if is_inside else _range_to_polygon(x, y, dxs[k], dys[k], field, part)
+            hit = 0.0 if is_inside else _range_to_polygon(px, py, dxs[k], dys[k], field, part)
             nearest[k] = min(nearest[k], hit)
     for k in range(count):
         hit = min(nearest[k], nearest[count + k]) if selects else nearest[k]
@@ -167,7 +171,7 @@ def check_map(field: np.ndarray, map_vertices: int) -> None:
 @kernel(
     NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR),
 )
-def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
+def map_surroundings(x, y, heading, time, field, obstacles, vertices, out):
     """Describe the walls and the nearest parts of obstacles in the robot's frame, in order of distance.
 
     Each part of an obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the
@@ -175,14 +179,14 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
     are zeros.
 
     Args:
-        x, y: position of the robot (m).
-        cos, sin: of its heading.
+        x, y, heading: position (m) and heading (rad) of the robot.
+        time: of the episode (s), for the positions of moving obstacles.
         field: the packed field of the scenario.
         obstacles, vertices: number of rows, and of vertices in each.
         out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten.
 
     """
-    parts, arena = parts_in(field), header_of(field).arena
+    parts, arena, cos, sin = parts_in(field), header_of(field).arena, math.cos(heading), math.sin(heading)
     out[0], out[1], out[2], out[3] = x - arena[0], y - arena[1], arena[2] - x, arena[3] - y
     out[4], out[5] = cos, sin
     out[WALL_ENTRIES:] = 0.0
@@ -190,7 +194,8 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
     distances = np.full(obstacles, np.inf)
     numbers = np.zeros(obstacles, np.int64)
     for number in range(len(parts)):
-        distance = part_geometry(x, y, 0.0, field, parts[number])[0]
+        moved_x, moved_y = displacement_of(field, parts[number], time)
+        distance = part_geometry(x - moved_x, y - moved_y, 0.0, field, parts[number])[0]
         rank = obstacles
         while rank > 0 and distance < distances[rank - 1]:
             rank -= 1
@@ -200,13 +205,15 @@ def map_surroundings(x, y, cos, sin, field, obstacles, vertices, out):
             distances[rank], numbers[rank] = distance, number
     for k in range(min(obstacles, len(parts))):
         part = parts[numbers[k]]
+        moved_x, moved_y = displacement_of(field, part, time)
+        px, py = x - moved_x, y - moved_y
         edges = edges_of(field, part)
         row = WALL_ENTRIES + k * (2 + 2 * vertices)
         out[row], out[row + 1] = 1.0, part.rounding
         for j in range(vertices):
-            dx, dy = part.x - x, part.y - y
+            dx, dy = part.x - px, part.y - py
             if part.edges > 0:
                 edge = edges[j % part.edges]
-                dx, dy = edge.x - x, edge.y - y
+                dx, dy = edge.x - px, edge.y - py
             out[row + 2 + 2 * j] = cos * dx + sin * dy
             out[row + 3 + 2 * j] = cos * dy - sin * dx

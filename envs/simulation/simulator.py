@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.field.clearance import clearances, footprint_clearance, footprint_clearances
+from leapnav.envs.field.proximity import footprint_value
+from leapnav.envs.field.rectangle import OUTLINE_ENTRIES
 from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
 from leapnav.envs.kernels.internals import FunctionPointer
@@ -15,9 +18,6 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.shapes.clearance import clearances, footprint_clearance, footprint_clearances
-from leapnav.envs.shapes.proximity import footprint_value
-from leapnav.envs.shapes.rectangle import OUTLINE_ENTRIES
 from leapnav.envs.simulation import stepping
 from leapnav.envs.simulation.bodies import ContactWorld, MotorBodies, VelocityFunction, resolve_overlap
 from leapnav.envs.simulation.observations import ObservationLayout, observe_robots
@@ -278,7 +278,9 @@ class BatchSimulator:
         else:
             velocity = np.array(steer(0.0, 0.0, float(pose[2]), 0.0))
         world = self._contacts[i]
-        lowest, squared_speed, squared_turn_rate, proximity = world.simulate(state, velocity, steer, duration, substeps)
+        time = float(episode["time"]) + float(episode["duration"]) - duration
+        found = world.simulate(state, velocity, steer, time, duration, substeps)
+        lowest, squared_speed, squared_turn_rate, proximity = found
         if world.field is not self.fields[i]:  # obstacles have moved; the next world begins with them at rest
             self.fields[i] = world.field
             del self._contacts[i]
@@ -297,7 +299,8 @@ class BatchSimulator:
             ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
             episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
-        episode["pose_clearance"] = footprint_clearance(state, outline, self.fields[i])[0]
+        timed = np.append(state, time + duration)
+        episode["pose_clearance"] = footprint_clearance(timed, outline, self.fields[i])[0]
         episode["clearance"] = min(episode["clearance"], lowest)
 
     def _velocity_function(self, i: int, step: float) -> VelocityFunction:
@@ -332,7 +335,7 @@ class BatchSimulator:
 
     def ranges(self, i: int) -> np.ndarray:
         """Return the lidar ranges of a robot without noise (m); empty without a lidar."""
-        return self.layout.scan(self.states[i], self.fields[i])
+        return self.layout.scan(self.states[i], float(self.episodes["time"][i]), self.fields[i])
 
     def __getstate__(self) -> dict[str, Any]:
         # Contact worlds have no memory between periods, so they can be created again.

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 from numba import float32, from_dtype, int64, types
 
+from leapnav.envs.field.packing import pack_field
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import part_of, vector_at
 from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, VECTOR
 from leapnav.envs.settings import SETTINGS
-from leapnav.envs.shapes.field import pack_field
 
 N_GUIDE_POINTS = 17  # points along the reference path, for the potential
 

@@ -10,11 +10,11 @@ import math
 import numpy as np
 from numba import boolean, float64, int64, types
 
+from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import matrix_of
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
 from leapnav.envs.settings import MOTOR_TYPE
-from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.simulation.paths import ADDRESSES, MOTION, Path, drive_path, motion_at
 from leapnav.envs.simulation.state import PACKED, SIMULATION, Simulation, field_of, row_of
 
@@ -139,11 +139,12 @@ def begin_periods(actions, active, packed):
     return _begin_periods(actions, active, Simulation(*packed))
 
 
-@kernel(float64(SIMULATION, int64, MOTION, VECTOR, float64, MATRIX), inline="always")
-def _follow(sim, i, motion, u, duration, scratch):
+@kernel(float64(SIMULATION, int64, MOTION, VECTOR, float64, float64, MATRIX), inline="always")
+def _follow(sim, i, motion, u, time, duration, scratch):
     """Move robot i with controls u for a duration (s), up to the first contact, and add the proximity and state cost.
 
-    The rows of `scratch` (7 or more, n) are those of `Path.samples`, and two for the states at both ends.
+    It begins at a time (s) of the episode. The rows of `scratch` (7 or more, n + 1) are those of `Path.samples`, and
+    two for the states at both ends.
 
     Returns:
         The fraction of the duration before the contact, or 1.
@@ -153,6 +154,7 @@ def _follow(sim, i, motion, u, duration, scratch):
     q, new = scratch[5], scratch[6]
     for k in range(n):
         q[k] = state[k]
+    q[n] = time
     field = field_of(sim.fields, i)
     path = Path(motion, q, u, row_of(sim.parameters, i), outline_of(sim, i), field, duration, scratch)
     lowest, fraction, after, proximity, state_cost = drive_path(path, episode.pose_clearance, new)
@@ -185,11 +187,11 @@ def drive(actions, active, packed, addresses):
     invalid = _begin_periods(actions, active, sim)
     if invalid >= 0:
         return invalid
-    scratch, motion = np.empty((7, sim.states.shape[1])), motion_at(addresses)
+    scratch, motion = np.empty((7, sim.states.shape[1] + 1)), motion_at(addresses)
     for i in range(len(active)):
         episode, controls = sim.episodes[i], row_of(sim.controls, i)
         if episode.duration > 0.0:
-            fraction = _follow(sim, i, motion, controls, episode.duration, scratch)
+            fraction = _follow(sim, i, motion, controls, episode.time, episode.duration, scratch)
             episode.effort += effort(row_of(sim.weights, i), controls) * episode.duration * fraction
             episode.remaining = episode.duration * (1.0 - fraction)
     return -1
@@ -254,8 +256,8 @@ def push_bodies(bodies, packed, addresses, substep, substeps):
         _read_bodies(bodies, sim, substeps)
     if substep == substeps:
         return
-    settings, scratch = sim.settings[0], np.empty((9, 3))
-    velocity, moved = scratch[7], scratch[8, :2]
+    settings, scratch = sim.settings[0], np.empty((9, 4))
+    velocity, moved = scratch[7, :3], scratch[8, :2]
     for i in range(len(bodies)):
         episode, body = sim.episodes[i], row_of(bodies, i)
         step = episode.duration / substeps
@@ -264,7 +266,7 @@ def push_bodies(bodies, packed, addresses, substep, substeps):
         if step == 0.0 or episode.in_contact:
             continue
         velocity[0], velocity[1], velocity[2] = episode.vx, episode.vy, episode.spin
-        fraction = _follow(sim, i, motion, velocity, step, scratch)
+        fraction = _follow(sim, i, motion, velocity, episode.time + substep * step, step, scratch)
         moved[0], moved[1] = math.sqrt(episode.vx**2 + episode.vy**2), episode.spin
         episode.effort += effort(row_of(sim.weights, i), moved) * step * fraction
         for k in range(3):

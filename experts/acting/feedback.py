@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from leapnav.envs.field.clearance import footprint_clearances
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.utils.validation import as_vector
 from leapnav.experts.acting.barrier import barrier_integral, reference_problem
 from leapnav.experts.acting.gains import Gains

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from leapnav.envs.field.layout import read_header
+from leapnav.envs.field.proximity import proximity_value
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import read_header
-from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.bounds.distance import Distance, Medium
 from leapnav.experts.bounds.duality import best_energy

@@ -17,12 +17,12 @@ from minari.data_collector import EpisodeBuffer
 
 import leapnav
 from leapnav.envs.episodes import play_episode
+from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import collection_name
 from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES, MAX_HORIZON
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
-from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.envs.utils.files import digest
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions

@@ -3,7 +3,7 @@
 The exact theory (A. E. Bryson, W. F. Denham, S. E. Dreyfus, Optimal programming problems with inequality constraints I,
 AIAA Journal 1, 1963) requires that the sequence of the arcs on limits is known in advance. The barrier does not: each
 limit adds the barrier weight times b(d / scale) to the running cost, where d is the distance of the state from the
-limit, see `leapnav.envs.shapes.barrier`.
+limit, see `leapnav.envs.field.barrier`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.barrier import barrier
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, VECTOR, tuple_of
-from leapnav.envs.shapes.barrier import barrier
 
 # Scale of a barrier, relative to the width of the interval or, for a limit on one side, to the largest distance of
 # start and goal from it. The optimum for a vanishing weight does not depend on it.

@@ -1,4 +1,4 @@
-"""Code generation of the dynamics with controls as arguments, for direct transcription.
+"""Code generation of the dynamics with the controls as arguments, for direct transcription.
 
 The extremal flow (`generated_flow`) determines the controls from the costates. Direct transcription varies states and
 controls independently. It needs one step of the dynamics q' = a(q) + B(q) u, its Jacobians, and the Hessian of the

@@ -22,7 +22,7 @@ from leapnav.experts.problem.code_generation import Assignments, load
 from leapnav.experts.problem.system import ControlAffineSystem
 
 # What obstacles contribute: None for nothing, () for the proximity cost of one disc at the position with the radius of
-# the field, or the distinct joints of the outline of a footprint, see `leapnav.envs.shapes.rectangle`.
+# the field, or the distinct joints of the outline of a footprint, see `leapnav.envs.field.rectangle`.
 Obstacles = tuple[int, ...] | None
 
 
@@ -209,8 +209,8 @@ def import_costs(limited: Sequence[int]) -> list[str]:
     limits = ["from leapnav.experts.numerics.state_bounds import limit_cost"] if limited else []
     names = "disc_features, disc_proximity, footprint_features, footprint_proximity"
     return [
-        "from leapnav.envs.shapes.field import header_of",
-        f"from leapnav.envs.shapes.proximity import {names}",
+        "from leapnav.envs.field.layout import header_of",
+        f"from leapnav.envs.field.proximity import {names}",
         *limits,
     ]
 

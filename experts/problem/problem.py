@@ -6,16 +6,17 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from leapnav.envs.field.layout import read_header
+from leapnav.envs.field.packing import check_field, with_weight
+from leapnav.envs.field.proximity import footprint_proximities
 from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.robots.footprints import Box, Disc, outline_of
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import check_field, read_header, with_weight
-from leapnav.envs.shapes.proximity import footprint_proximities
 from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.flow import EndCondition, ExtremalFlow
 from leapnav.experts.numerics.interpolation import interpolate
@@ -26,7 +27,7 @@ from leapnav.experts.problem.system import (
     as_expression,
     state_cost_of,
     system_of,
-    time_weight_symbol,
+    weighted_by_time,
 )
 
 if TYPE_CHECKING:
@@ -287,7 +288,7 @@ class OptimalControlProblem:
     def _compiled(self) -> tuple[ControlAffineSystem, sp.Expr]:
         """System and state cost in the form that is compiled: a time weight is an additional parameter."""
         state_cost = as_expression("state_cost", self.state_cost)
-        return (self.system, state_cost) if self.time_weight == 0.0 else _weighted(self.system, state_cost)
+        return (self.system, state_cost) if self.time_weight == 0.0 else weighted_by_time(self.system, state_cost)
 
     @property
     def _obstacles(self) -> Obstacles:
@@ -369,13 +370,6 @@ class OptimalControlProblem:
         goal = np.array([s if g is None else g for s, g in zip(self.start, self.goal, strict=True)], dtype=float)
         fraction = np.linspace(0.0, 1.0, points)[:, None]
         return Trajectory(np.linspace(0.0, self.horizon or 1.0, points), start + fraction * (goal - start))
-
-
-@cache
-def _weighted(system: ControlAffineSystem, state_cost: sp.Expr) -> tuple[ControlAffineSystem, sp.Expr]:
-    """Return a system and its state cost with the time weight as an additional parameter."""
-    weight = time_weight_symbol()
-    return replace(system, parameters=(*system.parameters, weight)), state_cost + weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -132,6 +132,13 @@ def time_weight_symbol() -> sp.Symbol:
     import sympy as sp
 
     return sp.Symbol("_leapnav_time_weight", nonnegative=True)
+
+
+@cache
+def weighted_by_time(system: ControlAffineSystem, state_cost: sp.Expr) -> tuple[ControlAffineSystem, sp.Expr]:
+    """Return a system and its state cost with the time weight as an additional parameter."""
+    weight = time_weight_symbol()
+    return replace(system, parameters=(*system.parameters, weight)), state_cost + weight
 
 
 def as_expression(where: str, value: Any) -> sp.Expr:

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import matrix_of, part_of
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, NOTHING, VECTOR, tuple_of
-from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW
 from leapnav.experts.numerics.integrator import (
     ALL_STAGES,

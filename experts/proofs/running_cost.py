@@ -29,13 +29,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import boolean, float32, float64, types
 
+from leapnav.envs.field.barrier import CONTACT, barrier
+from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.layout import header_of
+from leapnav.envs.field.packing import with_weight
+from leapnav.envs.field.proximity import proximity_value
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.barrier import CONTACT, barrier
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.field import header_of, with_weight
-from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts.proofs.cells import GEOMETRY, Grid
 
 ROUNDING = 1e-9  # m, added to e: 1000 times the rounding errors of distances

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
+from leapnav.envs.field.packing import with_weight
+from leapnav.envs.field.sampling import PointGrid, sample_grid
 from leapnav.envs.robots.footprints import arm_of, enclosed_radius
 from leapnav.envs.robots.moves import ANGLES, HEADINGS, Moves
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.field import with_weight
-from leapnav.envs.shapes.sampling import PointGrid, sample_grid
 from leapnav.experts.search.shortest_paths import Nodes
 
 # Smallest and largest cell (m), and number of cells from start to goal: small enough for manoeuvres over a short

@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from leapnav.envs.field.clearance import footprint_clearances, path_clearance
 from leapnav.envs.robots import Box
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearances, path_clearance
 from leapnav.experts.hard_limits import LARGEST_REDUCTION, SEARCH_WEIGHT, expected_limit, softened, without_barrier
 from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.problem.certificate import certify
@@ -257,11 +257,10 @@ class LocalOptima:
         return found
 
     def settle_doubts(self) -> None:
-        """Compute the local optima of the cheapest paths at which Newton's method stalled, on adaptive meshes."""
-        stalled = [verdict for verdict in self.verdicts if verdict.outcome is Outcome.STALLED]
+        """Compute the local optima of paths that cost less than the best extremal, on adaptive meshes."""
+        stalled = [verdict for verdict in self.verdicts if verdict.outcome is Outcome.STALLED and self.certified]
         for verdict in sorted(stalled, key=lambda verdict: verdict.cost)[:MAX_SETTLED]:
-            best = min((extremal.cost for extremal in self.certified), default=math.inf)
-            if verdict.cost < best * (1 - DIRECT_ERROR) and self._clearance(verdict.path) > 0.0:
+            if verdict.cost < self.best.cost * (1 - DIRECT_ERROR) and self._clearance(verdict.path) > 0.0:
                 self.add_manoeuvres([verdict.path])
 
     def _settled(self, problem: OptimalControlProblem, guess: DirectPath) -> Iterator[tuple[int, DirectPath]]:

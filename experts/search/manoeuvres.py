@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import boolean, float64, int64
 
+from leapnav.envs.field.clearance import footprint_clearance, footprint_clearances
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 from leapnav.envs.robots import Car, DynamicCar, Trailer
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearance, footprint_clearances
 from leapnav.experts.transcription.direct import DirectPath
 
 CELLS_PER_RADIUS = 16  # cells of the grid per smallest radius of a turn

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from leapnav.envs.shapes.field import obstacle_centres
+from leapnav.envs.field.packing import obstacle_centres
 
 Side = Literal["left", "right"]
 Mode = Literal["forward", "backward"]

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from leapnav.envs.shapes.clearance import footprint_clearance
+from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.experts.problem.extremal import Extremal
 
 Kind = Literal["straight", "turn", "contact"]

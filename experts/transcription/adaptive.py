@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from leapnav.envs.shapes.clearance import footprint_clearances, path_clearance
-from leapnav.envs.shapes.field import read_header
+from leapnav.envs.field.clearance import footprint_clearances, path_clearance
+from leapnav.envs.field.layout import read_header
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.transcription.direct import MAX_VIOLATION, DirectPath, optimise
 

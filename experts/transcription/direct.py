@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from leapnav.envs.field.packing import with_weight
 from leapnav.envs.kernels.internals import FunctionPointer
-from leapnav.envs.shapes.field import with_weight
 from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.numerics.time_scaling import time_factor

@@ -18,8 +18,9 @@ from starlette.routing import Route
 
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.families import FAMILIES
+from leapnav.envs.scenarios.faults import check_headings
 from leapnav.envs.scenarios.obstacle import Obstacle
-from leapnav.envs.scenarios.scenario import Scenario, check_headings
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils import colors
 from leapnav.experts.acting.policy import NoOptimumError
 from leapnav.play.solving import PlaySolver, bank_scenario
@@ -119,7 +120,7 @@ def create_app(solver: PlaySolver, scenario: Scenario, host: str = "127.0.0.1") 
 
     def check(content: dict[str, Any]) -> dict[str, Any]:
         scenario = _scenario(content)
-        check_headings(scenario)  # the content of a file or a link
+        check_headings(scenario.name, scenario.start, scenario.goal)  # the content of a file or a link
         return {"scenario": scenario.to_dict()}
 
     def parts(content: dict[str, Any]) -> dict[str, Any]:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.field.clearance import footprint_clearances
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import FAMILIES
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.envs.utils.validation import check_choice, check_integer
 from leapnav.experts.optimum import Optimum, as_optimum, find_optimum, shortest_horizon
 from leapnav.experts.problem.extremal import Extremal, Status

@@ -15,10 +15,10 @@ from helpers import let_newton_stall
 
 import leapnav
 from leapnav.envs import FAMILIES, BankError, ScenarioBank, sample_scenario
+from leapnav.envs.field.clearance import clearances
 from leapnav.envs.scenarios.bank import ADDED, SPLITS, TYPES, VERSION
 from leapnav.envs.scenarios.bank_writing import BankEntry, write_bank
 from leapnav.envs.scenarios.families import ALL_FAMILIES
-from leapnav.envs.shapes.clearance import clearances
 from leapnav.experts import ExpertPolicy, Status, Trajectory, build_bank, find_optimum, solve
 from leapnav.experts.data.banks import Rejection, draw, judge
 from leapnav.experts.data.store import ResumableStore

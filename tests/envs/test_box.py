@@ -8,16 +8,16 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from leapnav.envs import Box, Circle, Obstacle, Polygon, Scenario, ScenarioError, Unicycle
-from leapnav.envs.robots.footprints import arm_of, corners_of, enclosed_radius, sizes_of
-from leapnav.envs.shapes.capsule import Capsule
-from leapnav.envs.shapes.clearance import footprint_clearance, footprint_clearances, obstacle_distance, path_clearance
-from leapnav.envs.shapes.proximity import (
+from leapnav.envs.field.clearance import footprint_clearance, footprint_clearances, obstacle_distance, path_clearance
+from leapnav.envs.field.proximity import (
     footprint_features,
     footprint_proximities,
     footprint_proximity,
     footprint_value,
 )
-from leapnav.envs.shapes.sampling import OFFSET, PointGrid, sample_grid
+from leapnav.envs.field.sampling import OFFSET, PointGrid, sample_grid
+from leapnav.envs.robots.footprints import arm_of, corners_of, enclosed_radius, sizes_of
+from leapnav.envs.shapes.capsule import Capsule
 
 OBSTACLES = (
     Obstacle(circle=Circle(center=(3.0, 3.0), radius=0.5)),
@@ -56,12 +56,12 @@ def outline_points(pose, spacing=2e-3):
 
 def test_the_clearance_is_the_distance_of_the_closest_point_of_the_outline():
     for pose in poses(400):
-        distances = [obstacle_distance(*point, SCENARIO.field)[0] for point in outline_points(pose)]
+        distances = [obstacle_distance(*point, 0.0, SCENARIO.field)[0] for point in outline_points(pose)]
         clearance, nearest = footprint_clearance(pose, SCENARIO.outline, SCENARIO.field)
         if clearance > 0:
             assert -1e-12 < min(distances) - clearance < 1e-4  # the points are 2 mm apart
             x, y = outline_points(pose)[int(np.argmin(distances))]
-            assert nearest == obstacle_distance(x, y, SCENARIO.field)[1]
+            assert nearest == obstacle_distance(x, y, 0.0, SCENARIO.field)[1]
         elif min(distances) > 0:  # an obstacle inside the robot, or one that crosses it
             assert clearance < 0
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import leapnav  # noqa: F401 (registers)
 from leapnav.envs import NavigateEnv, Scenario, ScenarioError, sample_scenario
-from leapnav.envs.shapes.clearance import clearance, clearances
+from leapnav.envs.field.clearance import clearance, clearances
 from leapnav.envs.simulation.observations import GOAL_ENTRIES
 
 ID = "leapnav/Navigate-v0"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from leapnav.envs import FAMILIES, sample_scenario
+from leapnav.envs.field.clearance import clearance
 from leapnav.envs.scenarios.families import ALL_FAMILIES
-from leapnav.envs.shapes.clearance import clearance
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from leapnav.envs import Capsule, Circle, NavigateEnv, NavigateVectorEnv, Obstacle, Polygon, Scenario
-from leapnav.envs.shapes.field import field_parts
+from leapnav.envs.field.packing import field_parts
 from leapnav.experts import find_optimum
 
 SQUARE = Polygon(vertices=((3.0, 1.5), (4.0, 1.5), (4.0, 2.5), (3.0, 2.5)))

@@ -6,16 +6,16 @@ import pytest
 from helpers import best_known, scenario_fields
 
 from leapnav.envs import Circle, Obstacle, Polygon, Scenario, Unicycle
-from leapnav.envs.kernels.internals import FunctionPointer
-from leapnav.envs.shapes.barrier import CONTACT, barrier
-from leapnav.envs.shapes.clearance import clearance, clearances
-from leapnav.envs.shapes.proximity import (
+from leapnav.envs.field.barrier import CONTACT, barrier
+from leapnav.envs.field.clearance import clearance, clearances
+from leapnav.envs.field.proximity import (
     disc_features,
     footprint_features,
     proximity,
     proximity_value,
     proximity_values,
 )
+from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.simulation import paths
 
 SCENARIOS = [best_known()[i][0] for i in (0, 11, 15, 17, 20)]  # discs, polygons, rooms, slalom

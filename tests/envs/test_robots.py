@@ -26,10 +26,10 @@ from leapnav.envs import (
     UnicycleTrailer,
     sample_scenario,
 )
+from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.robots import register
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.cost import Cost
-from leapnav.envs.shapes.clearance import footprint_clearance
 from leapnav.experts import ExpertPolicy, OptimalControlProblem, find_optimum
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.problem.system import switching_functions, system_of

@@ -8,8 +8,8 @@ from PIL import Image
 
 from leapnav.cli import main
 from leapnav.envs import Scenario
+from leapnav.envs.field.clearance import clearance
 from leapnav.envs.scenarios.files import read_scenarios
-from leapnav.envs.shapes.clearance import clearance
 from leapnav.envs.worlds.ros_map import read_ros_map, sample_on_map
 from leapnav.experts import find_optimum
 

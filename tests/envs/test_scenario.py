@@ -7,8 +7,8 @@ import pytest
 from helpers import scenario_fields
 
 from leapnav.envs import Scenario, ScenarioError
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.proximity import proximity
+from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.proximity import proximity
 
 
 def square(x, y, side=1.0):

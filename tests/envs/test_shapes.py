@@ -13,13 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.path import Path as Outline
 
 from leapnav.envs import Capsule, Circle, NavigateEnv, Obstacle, Polygon, Scenario, ScenarioError, Shape
+from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.distance import part_geometry
+from leapnav.envs.field.layout import parts_in
+from leapnav.envs.field.packing import MAX_PARTS_WITHOUT_GRID, blend_fields, obstacle_centres
+from leapnav.envs.field.proximity import proximity, proximity_value, proximity_values
+from leapnav.envs.field.sampling import OFFSET, PointGrid, sample_grid
 from leapnav.envs.shapes import register
 from leapnav.envs.shapes.base import KINDS
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.distance import part_geometry
-from leapnav.envs.shapes.field import MAX_PARTS_WITHOUT_GRID, blend_fields, obstacle_centres, parts_in
-from leapnav.envs.shapes.proximity import proximity, proximity_value, proximity_values
-from leapnav.envs.shapes.sampling import OFFSET, PointGrid, sample_grid
 from leapnav.envs.simulation.rendering import Scene, draw_scene
 from leapnav.envs.simulation.sensing import scan
 from leapnav.envs.utils.colors import OBSTACLE
@@ -148,7 +149,7 @@ def lidar(scenario, x, y, heading, count=64, reach=5.0):
     turn = 2 * math.pi * np.arange(count) / count
     scratch = np.zeros((3, 2 * count))
     beams = np.ascontiguousarray(np.stack([np.cos(turn), np.sin(turn)]))
-    scan(x, y, math.cos(heading), math.sin(heading), scenario.field, reach, beams, scratch)
+    scan(x, y, heading, 0.0, scenario.field, reach, beams, scratch)
     return heading + turn, scratch[2, :count].copy()
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from leapnav.envs import Box, NavigateEnv, Scenario, ScenarioError, Trailer, Unicycle
-from leapnav.envs.shapes.clearance import footprint_clearance, footprint_clearances
-from leapnav.envs.shapes.proximity import footprint_proximities
+from leapnav.envs.field.clearance import footprint_clearance, footprint_clearances
+from leapnav.envs.field.proximity import footprint_proximities
 from leapnav.experts import OptimalControlProblem, find_optimum
 
 ROBOT = {

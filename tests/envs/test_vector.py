@@ -11,7 +11,7 @@ from helpers import scenario_fields
 
 import leapnav  # noqa: F401 (registers)
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.field.clearance import clearance
 
 ID, GOAL_ID = "leapnav/Navigate-v0", "leapnav/NavigateGoal-v0"
 TIME_LIMITED = scenario_fields(horizon=None, time_limit=3.03, cost={"time_weight": 0.5})

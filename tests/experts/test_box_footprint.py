@@ -7,8 +7,8 @@ import pytest
 from helpers import info_of_plan
 
 from leapnav.envs import Box, Capsule, Cost, Obstacle, Polygon, Scenario, Unicycle, sample_scenario
+from leapnav.envs.field.clearance import footprint_clearances
 from leapnav.envs.robots.footprints import corners_of
-from leapnav.envs.shapes.clearance import footprint_clearances
 from leapnav.experts import OptimalControlProblem, find_optimum, minimum_time, solve
 
 BOX = Box(length=0.5, width=0.25)

@@ -8,7 +8,7 @@ from helpers import best_known, published_problems, shooting_guess
 from scipy.integrate import cumulative_simpson
 
 from leapnav.envs import Scenario
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.field.clearance import clearances
 from leapnav.experts import (
     ControlAffineSystem,
     OptimalControlProblem,

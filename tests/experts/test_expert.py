@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
-from leapnav.envs.shapes.clearance import clearance
+from leapnav.envs.field.clearance import clearance
 from leapnav.experts import ExpertPolicy, NoOptimumError, Trajectory, find_optimum
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.training import make_vec_env

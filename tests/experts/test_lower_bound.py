@@ -12,11 +12,11 @@ import pytest
 from helpers import DISC_AND_TRIANGLE as SCENARIO
 
 from leapnav.cli import main
+from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.layout import read_header
+from leapnav.envs.field.proximity import proximity_value
 from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.field import read_header
-from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts import LowerBound, Optimum, Proof, check_proof, find_optimum, lower_bound
 from leapnav.experts.bounds.plotting import plot_tube
 from leapnav.experts.proofs.cells import BLOCK, CellSet, Grid, gather, make_layout, scatter

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from leapnav.envs import Box, Car, Cost, DynamicCar, Obstacle, Polygon, Scenario, Trailer, sample_scenario
+from leapnav.envs.field.clearance import path_clearance
 from leapnav.envs.robots.footprints import corners_of
-from leapnav.envs.shapes.clearance import path_clearance
 from leapnav.experts import OptimalControlProblem, find_optimum, minimum_time
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.search.manoeuvres import manoeuvres

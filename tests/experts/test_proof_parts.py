@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from helpers import DISC_AND_TRIANGLE
 
+from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.proximity import proximity_value
 from leapnav.envs.scenarios.families import sample_scenario
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import clearance
-from leapnav.envs.shapes.proximity import proximity_value
 from leapnav.experts.proofs.cells import CellSet, Grid
 from leapnav.experts.proofs.checker import check_proof
 from leapnav.experts.proofs.gauge import gauge, gauge_minimum, gradient_bound, make_source

@@ -5,8 +5,8 @@ import pytest
 from helpers import ROBOTS, scenario_fields
 
 from leapnav.envs import Scenario, ScenarioBank, sample_scenario
-from leapnav.envs.shapes.clearance import footprint_clearance
-from leapnav.envs.shapes.proximity import disc_proximity, footprint_proximity
+from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.field.proximity import disc_proximity, footprint_proximity
 from leapnav.experts import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.second_opinion import Opinion, second_opinion, verify_bank

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from leapnav.cli import main, parse
 from leapnav.envs import FAMILIES, NavigateEnv, Scenario, ScenarioError
-from leapnav.envs.shapes.clearance import clearances
+from leapnav.envs.field.clearance import clearances
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, find_optimum, solve, unicycle, verify
 
 # For cases that take tenths of a second each: they are re-integrated by an independent integrator.

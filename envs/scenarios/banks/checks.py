@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from leapnav.envs.field.clearance import footprint_clearances
+from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.robots.footprints import arm_of
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.shapes.clearance import footprint_clearances
-from leapnav.envs.shapes.proximity import footprint_value
 from leapnav.envs.utils.validation import is_integer
 
 MAX_POINT_INTERVAL = 0.1  # s between the stored points of an optimum
