@@ -17,6 +17,7 @@ import numpy as np
 from leapnav.envs.robots import Disc, Unicycle
 from leapnav.envs.robots.footprints import enclosed_radius
 from leapnav.envs.scenarios.cost import Cost
+from leapnav.envs.scenarios.faults import check_at_rest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import check_positive
 from leapnav.experts.control_weights import limit_of, next_extremal
@@ -90,6 +91,7 @@ def minimum_length(scenario: Scenario, tol: float = 1e-3) -> MinimumLength:
     if not isinstance(scenario, Scenario):
         raise TypeError(f"scenario: expected a Scenario (see Scenario.from_dict), got {type(scenario).__name__}")
     check_positive("tol", tol)
+    check_at_rest(scenario.moves, "minimum_length")
     if not tol < 1:
         raise ValueError(f"tol: expected a number below 1, got {tol!r}")
     bound, pieces = math.nan, None

@@ -9,6 +9,7 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
+from leapnav.envs.field.packing import with_weight
 from leapnav.envs.kernels import prepare
 from leapnav.envs.kernels.compilation import GENERATED
 from leapnav.envs.kernels.decorator import kernels_of
@@ -34,6 +35,7 @@ from leapnav.experts.search.manoeuvres import manoeuvres
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 from leapnav.experts.solve import local_optima, solve
+from leapnav.experts.spacetime.candidates import SpaceTimeSearch
 from leapnav.experts.transcription.direct import generated_functions
 
 # Factor of the number of candidates for a robot that cannot rotate in place: the costs of its lattice paths differ from
@@ -58,6 +60,8 @@ ALTERNATIVES_BUDGET = 240_000
 # Of a second search with hard limits, see `LocalOptima`: with 1, a box of 0.5 x 0.25 m does not pass through a gap
 # of 0.26 m from the side.
 SHARPNESS = 4.0
+# Horizons of the paths among moving obstacles if it is free, in units of the time of a straight line.
+HORIZON_FACTORS = 1.0, 1.4, 2.0
 # `shortest_horizon`: relative tolerance, and largest multiple of the scenario's horizon.
 HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 0.02, 1000.0
 
@@ -84,7 +88,7 @@ class Optimum(Extremal):
         if self.problem.field is None:
             return ()
         times = np.linspace(0.0, self.horizon, 513)
-        return path_sides(self.interpolate(times)[:, :2], self.problem.field)
+        return path_sides(times, self.interpolate(times)[:, :2], self.problem.field)
 
     @property
     def speeds(self) -> np.ndarray:
@@ -133,6 +137,7 @@ SEARCH_MODULES = (
     "leapnav.experts.problem",
     "leapnav.experts.search",
     "leapnav.experts.solvers.newton",
+    "leapnav.experts.spacetime",
     "leapnav.experts.transcription",
     GENERATED,
 )
@@ -208,7 +213,8 @@ def _of_scenario(scenario: Scenario, effort: Effort, barrier_tolerance: float) -
     horizon = math.inf if scenario.horizon is None else scenario.horizon
     if np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) > scenario.robot.speed_limits()[0] * horizon:
         return as_optimum(failure(problem, Status.HORIZON_TOO_SHORT))
-    optima, failed = _search(scenario, problem, effort)
+    search = _search_in_time if scenario.moves else _search
+    optima, failed = search(scenario, problem, effort)
     if optima is None or (failed is not None and not optima.certified):
         return as_optimum(failure(problem, failed or Status.NO_PATH))
     if effort != "low":
@@ -217,7 +223,7 @@ def _of_scenario(scenario: Scenario, effort: Effort, barrier_tolerance: float) -
     if found.problem.barrier_weight > 0.0 and not found.success:
         # The continuation stalled at a barrier weight, or the barrier makes the flow in a narrow gap too sensitive.
         weight = max(FACTOR**2 * found.problem.barrier_weight, scenario.cost.proximity_weight)
-        optima, _ = _search(scenario, problem.with_barrier(weight), effort, SHARPNESS)
+        optima, _ = search(scenario, problem.with_barrier(weight), effort, SHARPNESS)
         if optima is not None and optima.certified:
             found = _result(optima, barrier_tolerance, effort)
     return found
@@ -329,6 +335,27 @@ def _search(
     if shortest_time == np.inf:
         return optima, Status.NO_PATH
     return optima, Status.HORIZON_TOO_SHORT if shortest_time > horizon else None
+
+
+def _search_in_time(
+    scenario: Scenario, problem: OptimalControlProblem, effort: Effort, sharpness: float = 1.0
+) -> tuple[LocalOptima | None, Status | None]:
+    """Search paths over position and time among moving obstacles; returns the same as `_search`."""
+    horizons = [problem.horizon]
+    if problem.horizon is None:
+        distance = math.dist(scenario.start[:2], scenario.goal[:2]) + scenario.robot.speed_limits()[1] ** -1
+        horizons = [factor * distance / scenario.cruise_speed for factor in HORIZON_FACTORS]
+    assert problem.field is not None
+    field = with_weight(problem.field, problem.proximity_weight)
+    searches = [SpaceTimeSearch(scenario, field, horizon) for horizon in horizons if horizon is not None]
+    searches = [search for search in searches if search.cheapest < math.inf]
+    if not searches:
+        return None, Status.NO_PATH
+    energy = min(search.cheapest / search.horizon for search in searches)
+    optima = LocalOptima(scenario, problem, energy, ALTERNATIVES_BUDGET if effort == "high" else 0.0, sharpness)
+    for search in searches:
+        optima.add(search.candidates())
+    return optima, None
 
 
 def _lattices(scenario: Scenario, effort: Effort) -> Iterator[tuple[Callable[[], Lattice], bool]]:

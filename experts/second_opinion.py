@@ -13,6 +13,7 @@ import numpy as np
 from joblib import delayed
 
 from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.faults import check_at_rest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
@@ -80,6 +81,7 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     if cost is None:
         optimum = find_optimum(scenario)
         cost = optimum.cost if optimum.success else math.inf
+    check_at_rest(scenario.moves, "a second opinion")
     problem = OptimalControlProblem.from_scenario(scenario)
     rng = np.random.default_rng(seed)
     best, source, tried = cost, None, 0

@@ -331,8 +331,15 @@ def _equals(packed: np.ndarray, field: np.ndarray) -> bool:
     )
 
 
-def obstacle_centres(packed: np.ndarray) -> np.ndarray:
-    """Return a point inside each obstacle in the scenario's order, (n, 2): the centre of its first part."""
-    _, shapes, *_ = _unpack(packed)
-    first = np.unique(shapes["obstacle"], return_index=True)[1]
-    return np.stack([shapes["x"], shapes["y"]], axis=1)[first]
+def obstacle_centres(packed: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return a point inside each obstacle in the scenario's order at times (N,) (s): the centre of its first part.
+
+    The shape of the result is (N, n, 2).
+    """
+    _, shapes, _, knots = _unpack(packed)
+    centres = np.empty((len(times), 0, 2))
+    for number in np.unique(shapes["obstacle"], return_index=True)[1]:
+        x, y, *_, first, count = shapes[number].tolist()
+        moved = displacements(knots[first : first + count], times) if count else np.zeros((len(times), 2))
+        centres = np.concatenate([centres, (moved + np.array([x, y]))[:, None]], axis=1)
+    return centres

@@ -106,6 +106,12 @@ def read_text(path: Path) -> str:
     return path.read_text(encoding="utf-8-sig")
 
 
+def check_at_rest(moves: bool, what: str) -> None:
+    """Raise ValueError if obstacles move, for what considers obstacles at rest only."""
+    if moves:
+        raise ValueError(f"obstacles: {what}: expected obstacles at rest, but one has a velocity or a path")
+
+
 def check_headings(name: str, start: tuple[float, ...], goal: tuple[float | None, ...]) -> None:
     """Check the headings of a scenario that a person has written, perhaps in degrees.
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.field.clearance import footprint_clearances
-from leapnav.envs.scenarios.faults import ScenarioError
+from leapnav.envs.scenarios.faults import ScenarioError, check_at_rest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import as_vector
 from leapnav.experts.acting.barrier import barrier_integral, reference_problem
@@ -82,11 +82,12 @@ class Feedback:
         searches: number of searches so far.
 
     Raises:
-        ValueError: no optimum was found.
+        ValueError: no optimum was found, or an obstacle moves.
 
     """
 
     def __init__(self, scenario: Scenario, path: Trajectory | Extremal, *, effort: Effort = "medium") -> None:
+        check_at_rest(scenario.moves, "the expert in closed loop")
         self.scenario = scenario
         self._effort: Effort = effort
         self.searches = 0

@@ -20,6 +20,7 @@ from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank, collection_name, digest
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
 from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
+from leapnav.envs.scenarios.faults import check_at_rest
 from leapnav.envs.scenarios.files import PathLike, check_collection, read_scenarios
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
@@ -308,6 +309,7 @@ def solve_for_bank(scenario: Scenario, doubtful: bool = False) -> Arrays:
     A doubtful optimum is admitted only on request, with the reason in "doubt". The time limit of a scenario with a free
     horizon and without a limit is 3 times the duration of its optimum.
     """
+    check_at_rest(scenario.moves, "a bank")
     optimum = find_optimum(scenario)
     rejection = judge(optimum)
     if rejection is not None and not (doubtful and optimum.success):

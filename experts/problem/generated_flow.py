@@ -58,7 +58,7 @@ def compile_flow(
 
 def declare(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obstacles, limited: tuple[int, ...]) -> str:
     """Return a text that identifies a system with its cost."""
-    places = system.position, system.heading, obstacles, limited
+    places = system.position, system.heading, system.clock, obstacles, limited
     return sp.srepr((system.state, system.parameters, system.drift, system.fields, state_cost, str(places)))
 
 
@@ -126,25 +126,29 @@ class ObstacleTerm(NamedTuple):
 
     Attributes:
         joint: the joint; None for one disc at the position.
-        states: for x, y and, of an outline, the angle of the axis, the indices of the states whose sum it is.
+        states: for x, y, of an outline the angle of the axis, and among moving obstacles the time, the indices of the
+            states whose sum it is.
+        moves: whether it is the cost of the moving obstacles, not of those at rest.
 
     """
 
     joint: int | None
     states: tuple[tuple[int, ...], ...]
+    moves: bool = False
 
     def symbols(self) -> tuple[str, ...]:
         """Return the names of the value, the gradient and the Hessian (upper triangle, by rows)."""
-        name, letters = f"phi{self.joint or ''}", "xyh"[: len(self.states)]
+        name, letters = f"{'psi' if self.moves else 'phi'}{self.joint or ''}", "xyht"[: len(self.states)]
         pairs = ["".join(pair) for pair in combinations_with_replacement(letters, 2)]
         return (name, *(f"{name}_{letter}" for letter in (*letters, *pairs)))
 
     def call(self, name: str, first: int) -> str:
         """Return the call of a function of a disc or of a footprint, whose outline begins at an index of the data."""
         states = ", ".join(" + ".join(f"q{i}" for i in sum_of) for sum_of in self.states)
+        prefix = "moving_" if self.moves else ""
         if self.joint is None:
-            return f"disc_{name}({states}, header_of(field).radius, field)"
-        return f"footprint_{name}({states}, {self.joint}, data, {first}, field)"
+            return f"{prefix}disc_{name}({states}, header_of(field).radius, field)"
+        return f"{prefix}footprint_{name}({states}, {self.joint}, data, {first}, field)"
 
 
 def obstacle_terms(system: ControlAffineSystem, obstacles: Obstacles) -> list[ObstacleTerm]:
@@ -153,9 +157,15 @@ def obstacle_terms(system: ControlAffineSystem, obstacles: Obstacles) -> list[Ob
         return []
     position = tuple((system.state.index(symbol),) for symbol in system.position)
     if not obstacles or system.heading is None:
-        return [ObstacleTerm(None, position)]
-    heading = system.state.index(system.heading)
-    return [ObstacleTerm(joint, (*position, (heading, joint) if joint else (heading,))) for joint in obstacles]
+        terms = [ObstacleTerm(None, position)]
+    else:
+        heading = system.state.index(system.heading)
+        axes = [(heading, joint) if joint else (heading,) for joint in obstacles]
+        terms = [ObstacleTerm(joint, (*position, axis)) for joint, axis in zip(obstacles, axes, strict=True)]
+    if system.clock is not None:
+        time = (system.state.index(system.clock),)
+        terms += [ObstacleTerm(term.joint, (*term.states, time), True) for term in terms]
+    return terms
 
 
 def add_terms(
@@ -208,7 +218,9 @@ def import_costs(limited: Sequence[int]) -> list[str]:
     """Return the lines that import what the lines of `call_costs` call."""
     limits = ["from leapnav.experts.numerics.state_bounds import limit_cost"] if limited else []
     names = "disc_features, disc_proximity, footprint_features, footprint_proximity"
+    moving = ", ".join(f"moving_{name}" for name in names.split(", "))
     return [
+        f"from leapnav.envs.field.moving import {moving}",
         "from leapnav.envs.field.layout import header_of",
         f"from leapnav.envs.field.proximity import {names}",
         *limits,

@@ -177,12 +177,15 @@ class OptimalControlProblem:
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> OptimalControlProblem:
-        """Return the problem of a scenario, with the robot's limits as control bounds."""
-        robot, cost = scenario.robot, scenario.cost
+        """Return the problem of a scenario, with the robot's limits as control bounds.
+
+        Among moving obstacles, the time is the last state: H + lambda_t is constant, and lambda_t(T) = 0.
+        """
+        robot, cost, timed, bounds = scenario.robot, scenario.cost, scenario.moves, scenario.robot.state_bounds()
         return cls(
-            system=system_of(type(robot)),
-            start=move_inside(robot.state_bounds(), scenario.start_state),
-            goal=move_inside(robot.state_bounds(), scenario.goal_state),
+            system=system_of(type(robot), timed),
+            start=(*move_inside(bounds, scenario.start_state), *((0.0,) if timed else ())),
+            goal=(*move_inside(bounds, scenario.goal_state), *((None,) if timed else ())),
             horizon=scenario.horizon,
             control_weight=robot.control_weight(cost),
             state_cost=state_cost_of(type(robot)),
@@ -191,7 +194,7 @@ class OptimalControlProblem:
             parameters=robot.parameters(cost),
             footprint=scenario.outline if scenario.outline[:, 4].any() else robot.footprint,
             time_weight=cost.time_weight,
-            state_bounds=robot.state_bounds(),
+            state_bounds=(*bounds, None) if timed and bounds is not None else bounds,
         )
 
     def with_winding_of(self, states: np.ndarray) -> OptimalControlProblem:

@@ -33,6 +33,7 @@ class ControlAffineSystem:
         labels: names of the n states and the m controls with their units, in Matplotlib's mathtext, for plots; by
             default the symbols of the states, and u_1, ..., u_m.
         heading: the state symbol that is the heading, for systems with a footprint.
+        clock: the state symbol that is the time, for systems among moving obstacles; its drift is 1.
 
     Attributes:
         n: number of states.
@@ -57,6 +58,7 @@ class ControlAffineSystem:
     parameters: tuple[sp.Symbol, ...] = field(default=())
     labels: tuple[str, ...] = field(default=(), compare=False)
     heading: sp.Symbol | None = None
+    clock: sp.Symbol | None = None
 
     def __init__(
         self,
@@ -69,6 +71,7 @@ class ControlAffineSystem:
         *,
         labels: Sequence[str] = (),
         heading: sp.Symbol | None = None,
+        clock: sp.Symbol | None = None,
     ) -> None:
         import sympy as sp
 
@@ -97,6 +100,7 @@ class ControlAffineSystem:
             "position": None if position is None else tuple(position),
             "parameters": tuple(parameters),
             "heading": heading,
+            "clock": clock,
         }
         for where, expressions in [
             ("drift", values["drift"]),
@@ -109,7 +113,8 @@ class ControlAffineSystem:
                     f"the parameters are {tuple(parameters)}"
                 )
         places = {"angles": values["angles"], "position": values["position"] or ()}
-        for where, chosen in (*places.items(), ("heading", () if heading is None else (heading,))):
+        single = {"heading": heading, "clock": clock}
+        for where, chosen in (*places.items(), *((name, (s,) if s is not None else ()) for name, s in single.items())):
             if not set(chosen) <= set(state):
                 raise ValueError(f"{where}: {chosen} is not among the state symbols {tuple(state)}")
         for name, value in values.items():
@@ -132,6 +137,14 @@ def time_weight_symbol() -> sp.Symbol:
     import sympy as sp
 
     return sp.Symbol("_leapnav_time_weight", nonnegative=True)
+
+
+@cache
+def clock_symbol() -> sp.Symbol:
+    """Return the symbol of the time as a state; its name is not one that users choose."""
+    import sympy as sp
+
+    return sp.Symbol("_leapnav_clock", real=True)
 
 
 @cache
@@ -164,19 +177,23 @@ def as_expression(where: str, value: Any) -> sp.Expr:
 
 
 @cache
-def system_of(model: type[RobotModel]) -> ControlAffineSystem:
-    """Return the system of a robot model."""
+def system_of(model: type[RobotModel], timed: bool = False) -> ControlAffineSystem:
+    """Return the system of a robot model; if it is timed, with the time as its last state, for moving obstacles."""
     dynamics = model.dynamics()
     x, y, heading = dynamics.state[:3]
+    labels, n = list(dynamics.labels), len(dynamics.state)
+    if timed and labels:
+        labels.insert(n, "$t$ (s)")
     return ControlAffineSystem(
-        state=dynamics.state,
-        drift=dynamics.drift,
-        fields=dynamics.fields,
+        state=(*dynamics.state, *((clock_symbol(),) if timed else ())),
+        drift=(*dynamics.drift, *((1,) if timed else ())),
+        fields=[(*column, *((0,) if timed else ())) for column in dynamics.fields],
         angles=(heading, *(dynamics.state[model.state_names.index(name)] for name in model.heading_states)),
         position=(x, y),
         parameters=dynamics.parameters,
-        labels=dynamics.labels,
+        labels=labels,
         heading=heading,
+        clock=clock_symbol() if timed else None,
     )
 
 

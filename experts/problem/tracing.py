@@ -9,6 +9,7 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.field.layout import header_of
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import matrix_of, part_of
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, NOTHING, VECTOR, tuple_of
@@ -174,7 +175,9 @@ def dense_clearance(field, outline, places, times, starts, terms):
     for k in range(len(outline)):
         arm = max(arm, math.hypot(max(abs(outline[k, 0]), abs(outline[k, 1])), outline[k, 2]))
         last = max(last, int(outline[k, 4]))
-    q, before = np.zeros(last + 1), np.zeros(last + 1)
+    clock, top_speed = header_of(field).clock, header_of(field).top_speed
+    entries = max(last, clock) + 1
+    q, before = np.zeros(entries), np.zeros(entries)
     _interpolate(0.0, places, starts[0], terms[0], q)
     smallest, _ = footprint_clearance(q, outline, field)
     for k in range(len(times) - 1):
@@ -184,8 +187,9 @@ def dense_clearance(field, outline, places, times, starts, terms):
         for part in range(1, 9):
             _interpolate(part / 8.0, places, starts[k], terms[k], q)
             travelled = math.hypot(q[0] - before[0], q[1] - before[1])
-            for i in range(2, len(q)):
+            for i in range(2, last + 1):
                 travelled += arm * abs(q[i] - before[i])
+            travelled += top_speed * (times[k + 1] - times[k]) / 8.0
             length = max(length, 8.0 * travelled)
             before[:] = q
         length = 1.5 * length + 1e-12

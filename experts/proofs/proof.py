@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.robots import DifferentialDrive, Unicycle
+from leapnav.envs.scenarios.faults import check_at_rest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import atomic_path
 
@@ -148,6 +149,7 @@ def find_ends(scenario: Scenario) -> tuple[Pose, Pose]:
         ValueError: they cannot; the message names the field.
 
     """
+    check_at_rest(scenario.moves, "lower bounds")
     robot = scenario.robot
     if not isinstance(robot, Unicycle | DifferentialDrive):
         raise ValueError(f"robot: lower bounds need a unicycle or a differential_drive, got {robot.model!r}")

@@ -45,9 +45,19 @@ class Lifting:
         """Return the path in the robot's states, or None for a duplicate of an earlier path."""
         if path.states.shape[1] > 3:
             return path
+        lifted = self._lift(path)
+        return None if lifted is None else self._timed(lifted)
+
+    def _timed(self, path: Trajectory) -> Trajectory:
+        """Return a path with the time as its last state, among moving obstacles."""
+        if self._problem.system.clock is None:
+            return path
+        return Trajectory(path.times, np.column_stack([path.states, path.times]))
+
+    def _lift(self, path: Trajectory) -> Trajectory | None:
         if self._companion is not None:
             lifted = self._kinematic.lift(path.times, path.states, self._companion.start)
-            lifted = path if lifted is None else Trajectory(path.times, lifted)
+            lifted = self._timed(path if lifted is None else Trajectory(path.times, lifted))
             companion = self._companion.with_winding_of(lifted.states)
             direct = optimise(companion, discretise(companion, lifted), relaxed_weight=self._relaxed_weight)
             path = Trajectory(direct.times, direct.states[:, :3])
@@ -55,7 +65,7 @@ class Lifting:
             if any(np.abs(shape - other).max() < DUPLICATE_DISTANCE for other in self._seen):
                 return None
             self._seen.append(shape)
-        if self._problem.system.n == 3:
+        if len(self._scenario.robot.state_names) == 3:
             return path
         start = self._scenario.start_state
         states = self._scenario.robot.lift(path.times, path.states, start)
@@ -69,10 +79,10 @@ class Lifting:
             step = times[k + 1] - times[k]
             row = states[k : k + 1].copy()
             row[0, :3] = 0.5 * (poses[k] + poses[k + 1])
-            (drift,), (fields,) = self._problem.dynamics(row)
+            (drift,), (fields,) = self._problem.dynamics(self._timed(Trajectory(times[k : k + 1], row)).states)
             rates = (poses[k + 1] - poses[k]) / step - drift[:3]
             (controls,) = least_squares_controls(fields[None, :3], rates[None])
-            states[k + 1, 3:] = states[k, 3:] + step * (drift + fields @ controls)[3:]
+            states[k + 1, 3:] = states[k, 3:] + step * (drift + fields @ controls)[3 : states.shape[1]]
         return states
 
 

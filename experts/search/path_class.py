@@ -15,19 +15,21 @@ Mode = Literal["forward", "backward"]
 MIN_MODE_DISTANCE = 0.02  # m; shorter sections in one driving mode are ignored
 
 
-def path_sides(positions: np.ndarray, field: np.ndarray) -> tuple[Side, ...]:
+def path_sides(times: np.ndarray, positions: np.ndarray, field: np.ndarray) -> tuple[Side, ...]:
     """Return the side of a path on which each obstacle lies, in the order of the scenario.
 
     The bearing of the path from the centre of an obstacle changes by a positive angle if the obstacle lies to the left.
     For paths with the same ends this angle differs by multiples of 2 pi, so paths with the same sides are homotopic
-    unless one of them encircles an obstacle.
+    unless one of them encircles an obstacle. The bearing from a moving obstacle is that from where it is at the time:
+    a path that passes in front of it has it on one side, and a path that passes behind it on the other.
 
     Args:
+        times: (N,) (s).
         positions: x, y (m) of a densely sampled path, (N, 2).
         field: packed obstacles (`Scenario.field`).
 
     """
-    offsets = positions[:, None] - obstacle_centres(field)
+    offsets = positions[:, None] - obstacle_centres(field, times)
     bearing = np.unwrap(np.arctan2(offsets[..., 1], offsets[..., 0]), axis=0)
     return tuple("left" if swept > 0 else "right" for swept in bearing[-1] - bearing[0])
 

@@ -221,7 +221,7 @@ def test_the_optimum_is_certified_and_free(shape):
     distances = [distance_to(shape, x, y) for x, y in path[:, :2]]
     assert min(distances) > ROBOT
     field = optimum.problem.field
-    (x, y), sides = obstacle_centres(field)[0], path_sides(path[:, :2], field)
+    (x, y), sides = obstacle_centres(field, np.zeros(1))[0, 0], path_sides(times, path[:, :2], field)
     above = path[np.argmin(abs(path[:, 0] - x)), 1] > y
     assert sides == ("right" if above else "left",)
 
@@ -236,7 +236,7 @@ def test_scenarios_are_read_as_written(shape):
     assert np.array_equal(pickle.loads(pickle.dumps(scenario)).field, scenario.field)
     assert scenario.obstacles[0].shape == shape
     assert (scenario.obstacles[0].circle is None) == (shape.kind != "circle")
-    ((x, y),) = obstacle_centres(scenario.field)
+    (((x, y),),) = obstacle_centres(scenario.field, np.zeros(1))
     assert distance_to(shape, x, y) < 0
 
 
@@ -415,8 +415,8 @@ def test_paths_between_the_parts_of_a_shape_pass_it_on_the_side_of_its_first_par
     register(Heap)
     field = scenario_of(Heap(centers=((4.0, 4.0), (4.0, 1.0)))).field
     ends = np.linspace(1, 7, 50)
-    assert path_sides(np.column_stack([ends, np.full(50, 3.0)]), field) == ("left",)
-    assert path_sides(np.column_stack([ends, np.full(50, 5.0)]), field) == ("right",)
+    assert path_sides(ends, np.column_stack([ends, np.full(50, 3.0)]), field) == ("left",)
+    assert path_sides(ends, np.column_stack([ends, np.full(50, 5.0)]), field) == ("right",)
 
 
 def test_unknown_shapes_are_refused():

@@ -16,15 +16,15 @@ OBSTACLES = [
 def test_sides_are_those_seen_by_the_driver_in_the_order_of_the_file():
     field = Scenario.from_dict(scenario_fields(obstacles=OBSTACLES)).field
     line = np.linspace([1.0, 5.0], [9.0, 5.0], 50)
-    assert path_sides(line, field) == ("left", "right")
-    assert path_sides(line[::-1], field) == ("right", "left")
+    assert path_sides(np.zeros(50), line, field) == ("left", "right")
+    assert path_sides(np.zeros(50), line[::-1], field) == ("right", "left")
 
 
 def test_passing_an_obstacle_on_the_other_side_changes_only_its_side():
     field = Scenario.from_dict(scenario_fields(obstacles=OBSTACLES)).field
     shares = np.linspace(0.0, 1.0, 200)
     over = np.column_stack([1.0 + 8.0 * shares, 5.0 + 4.0 * np.sin(np.pi * shares)])
-    assert path_sides(over, field) == ("right", "right")
+    assert path_sides(shares, over, field) == ("right", "right")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Search among moving obstacles: paths over position and time."""

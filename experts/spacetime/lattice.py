@@ -1,0 +1,151 @@
+"""Shortest paths over position and time on a grid, by dynamic programming over layers of time (kernels).
+
+In each layer the robot is in a cell of the arena, and moves to a nearby cell in the next one, or waits. A move costs
+1/2 w |d|^2 / dt for its length d, and the proximity cost where it ends. Forward from the start and backward from the
+goal, all cells of all layers together give the cheapest path through each cell at each time. Paths differ by the side
+on which they pass each obstacle as it moves, which includes the order: before or behind it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import float64, int64
+
+from leapnav.envs.field.clearance import obstacle_distance
+from leapnav.envs.field.layout import header_of
+from leapnav.envs.field.proximity import footprint_value
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, NOTHING, VECTOR
+from leapnav.envs.scenarios.scenario import Scenario
+
+CELL = 0.25  # m, side of a cell, unless the arena is larger than MAX_CELLS cells
+MAX_CELLS = 64  # cells per side
+MIN_LAYERS, MAX_LAYERS = 40, 160
+MAX_SPEED_FACTOR = 4.0  # largest speed of a move, in units of that on the straight line
+REACH = 3  # cells that a move at the largest speed is long, if the number of layers permits
+MAX_DEPTH = 0.5  # cells by which the centre of a cell may be too close to an obstacle
+SIDES = 1 << 20  # numbers of obstacles in a signature are spread by a multiple of it
+
+
+class SpaceTimeGrid(NamedTuple):
+    """Cells of an arena in layers of time.
+
+    Attributes:
+        x0, y0: centre of the first cell (m).
+        cell: side of a cell (m).
+        columns, lines: number of cells.
+        step: s between two layers.
+        layers: number of steps.
+        reach: largest length of a move (cells).
+
+    """
+
+    x0: float
+    y0: float
+    cell: float
+    columns: int
+    lines: int
+    step: float
+    layers: int
+    reach: int
+
+
+def grid_of(scenario: Scenario, horizon: float) -> SpaceTimeGrid:
+    """Return the grid of a scenario for a horizon (s)."""
+    x_min, y_min, x_max, y_max = scenario.arena
+    cell = max(CELL, (x_max - x_min) / MAX_CELLS, (y_max - y_min) / MAX_CELLS)
+    columns, lines = (max(round((high - low) / cell), 1) for low, high in ((x_min, x_max), (y_min, y_max)))
+    x0 = 0.5 * (x_min + x_max - (columns - 1) * cell)
+    y0 = 0.5 * (y_min + y_max - (lines - 1) * cell)
+    mean = np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) / horizon
+    fastest = min(scenario.robot.speed_limits()[0], MAX_SPEED_FACTOR * mean) * horizon / cell  # cells
+    layers = int(np.clip(np.ceil(fastest / REACH), MIN_LAYERS, MAX_LAYERS))
+    reach = min(max(int(np.ceil(fastest / layers)), 1), 2 * REACH)
+    return SpaceTimeGrid(x0, y0, cell, columns, lines, horizon / layers, layers, reach)
+
+
+@kernel(NOTHING(CONSTANT, CONSTANT_MATRIX, VECTOR, CUBE))
+def sample_layers(field, outline, places, costs):
+    """Fill costs (layers + 1, columns, lines) with the proximity cost of a step; infinite in obstacles.
+
+    Args:
+        field: packed obstacle field.
+        outline (K, 5): of the robot, with its heading at 0.
+        places (5,): x0, y0, cell (m), step (s), and the robot's radius (m).
+        costs: overwritten.
+
+    """
+    q = np.zeros(max(header_of(field).clock + 1, 3))
+    cell, step, radius = places[2], places[3], places[4]
+    for k in range(costs.shape[0]):
+        q[len(q) - 1] = k * step
+        for i in range(costs.shape[1]):
+            for j in range(costs.shape[2]):
+                q[0], q[1] = places[0] + i * cell, places[1] + j * cell
+                distance = obstacle_distance(q[0], q[1], k * step, field)[0] - radius
+                costs[k, i, j] = np.inf
+                if distance > -MAX_DEPTH * cell:
+                    costs[k, i, j] = step * footprint_value(q, outline, field)
+
+
+@kernel(int64(float64, float64, float64, float64), inline="always")
+def crossing(x, y, to_x, to_y):
+    """Return 1 if a step relative to an obstacle crosses the ray above it from left to right, -1 from right to left."""
+    if (x < 0.0) == (to_x < 0.0):
+        return 0
+    height = y + (to_y - y) * (x / (x - to_x))
+    if height <= 0.0:
+        return 0
+    return 1 if x < 0.0 else -1
+
+
+@kernel(NOTHING(CUBE, INTEGERS, VECTOR, CUBE, INTEGERS, MATRIX, INTEGERS))
+def spread(costs, start, weights, values, parents, centres, signatures):
+    """Compute the cheapest path from a cell in the first layer to each cell of each layer.
+
+    Args:
+        costs (layers + 1, columns, lines): of the cells, for the time of a step; the first axis may be reversed.
+        start (3,): column and line, and the largest length of a move (cells).
+        weights (2,): cost of a move of one cell, and its tolerance.
+        values (layers + 1, columns, lines): overwritten by the costs of the paths.
+        parents: of each cell, flat; overwritten by the number of the cell before, -1 for none.
+        centres (layers + 1, 2 obstacles): positions of the obstacles (cells), in the order of the layers.
+        signatures: of each cell, flat; overwritten by that of its path, see `crossing`.
+
+    """
+    layers, columns, lines = costs.shape
+    reach, size = start[2], columns * lines
+    values[:] = np.inf
+    parents[:] = -1
+    signatures[:] = 0
+    values[0, start[0], start[1]] = 0.0
+    for k in range(1, layers):
+        for i in range(columns):
+            for j in range(lines):
+                if costs[k, i, j] == np.inf:
+                    continue
+                best, parent = np.inf, -1
+                for a in range(max(i - reach, 0), min(i + reach + 1, columns)):
+                    for b in range(max(j - reach, 0), min(j + reach + 1, lines)):
+                        square = (a - i) * (a - i) + (b - j) * (b - j)
+                        if square <= reach * reach:
+                            value = values[k - 1, a, b] + weights[0] * square
+                            if value < best:
+                                best, parent = value, a * lines + b
+                if parent >= 0:
+                    node = k * size + i * lines + j
+                    values[k, i, j] = best + costs[k, i, j]
+                    parents[node] = parent
+                    a, b = parent // lines, parent % lines
+                    signature = signatures[(k - 1) * size + parent]
+                    for n in range(centres.shape[1] // 2):
+                        crossed = crossing(
+                            a - centres[k - 1, 2 * n],
+                            b - centres[k - 1, 2 * n + 1],
+                            i - centres[k, 2 * n],
+                            j - centres[k, 2 * n + 1],
+                        )
+                        signature += crossed * (SIDES * (n + 1) * (n + 1) + 7919 * (n + 1))
+                    signatures[node] = signature

@@ -1,0 +1,172 @@
+"""Optima among moving obstacles: before or behind, waiting, certificates, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers import scenario_fields
+
+from leapnav.envs import NavigateEnv, Scenario
+from leapnav.envs.field.packing import displacements
+from leapnav.experts import (
+    ExpertPolicy,
+    NoOptimumError,
+    OptimalControlProblem,
+    build_bank_of,
+    find_optimum,
+    lower_bound,
+    minimum_length,
+    plot_extremal,
+    solve,
+    verify,
+)
+from leapnav.experts.search.path_class import path_sides
+from leapnav.experts.second_opinion import second_opinion
+
+
+def crossing(velocity, **changes):
+    """A disc that crosses the way from (1, 5) to (9, 5) where a robot at constant speed would be."""
+    horizon = changes.get("horizon", 8.0) or 8.0
+    obstacle = {"circle": {"center": [5.0, 5.0 - velocity * horizon / 2], "radius": 0.6}, "velocity": [0.0, velocity]}
+    fields = {"start": [1, 5, 0], "goal": [9, 5, 0], "horizon": 8.0, "obstacles": [obstacle], **changes}
+    return Scenario.from_dict(scenario_fields(**fields))
+
+
+def random_crossing(seed):
+    rng = np.random.default_rng(seed)
+    start, goal = [1.0, rng.uniform(2, 8), rng.uniform(-3, 3)], [9.0, rng.uniform(2, 8), rng.uniform(-3, 3)]
+    obstacles = []
+    for _ in range(4):
+        share, speed, angle = rng.uniform(0.3, 0.7), rng.uniform(0.3, 1.2), rng.uniform(-3, 3)
+        velocity = speed * np.array([math.cos(angle), math.sin(angle)])
+        at = np.array(start[:2]) + share * np.subtract(goal[:2], start[:2])
+        circle = {"center": (at - velocity * 11.0 * share).tolist(), "radius": 0.4}
+        obstacles.append({"circle": circle, "velocity": velocity.tolist()})
+    return Scenario.from_dict(scenario_fields(start=start, goal=goal, horizon=11.0, obstacles=obstacles))
+
+
+def clearances(scenario, optimum):
+    times = np.linspace(0.0, optimum.horizon, 3001)
+    states = optimum.interpolate(times)[:, :2]
+    distances = []
+    for obstacle in scenario.obstacles:
+        centres = obstacle.circle.center + displacements(obstacle.knots, times)
+        distances.append(np.hypot(*(states - centres).T) - obstacle.circle.radius - scenario.robot.radius)
+    return np.array(distances)
+
+
+@pytest.mark.parametrize("velocity", [0.3, 0.8, 1.5])
+def test_before_and_behind_are_separate_optima(velocity):
+    scenario = crossing(velocity)
+    optimum = find_optimum(scenario)
+    assert optimum.success
+    mirrored = optimum.alternatives[0]  # the scene is symmetric in space and time
+    assert mirrored.cost == pytest.approx(optimum.cost, rel=1e-8)
+    assert {optimum.path_class, mirrored.path_class} == {("left",), ("right",)}
+    for extremal in (optimum, mirrored):
+        assert extremal.certificate.clearance == pytest.approx(clearances(scenario, extremal).min(), abs=1e-4)
+        assert verify(extremal) < 1e-7
+        assert extremal.costates[-1, 3] == pytest.approx(0.0, abs=1e-8)  # of the time, which is free at the end
+        np.testing.assert_allclose(extremal.states[:, 3], extremal.times, atol=1e-9)
+
+
+def test_the_best_order_changes_with_the_phase_of_the_obstacle():
+    """If the disc is late, the robot passes in front of it; if it is early, behind it."""
+    classes = []
+    for shift in (-1.5, 1.5):
+        obstacle = {"circle": {"center": [5.0, 1.8 + shift], "radius": 0.6}, "velocity": [0.0, 0.8]}
+        classes.append(find_optimum(crossing(0.8, obstacles=[obstacle])).path_class)
+    assert set(classes) == {("left",), ("right",)}
+
+
+def test_the_robot_waits_at_a_door():
+    """A disc goes through a door that has room for one; the robot waits or goes first."""
+    walls = [[[4.8, 0], [5.2, 0], [5.2, 4.3], [4.8, 4.3]], [[4.8, 5.7], [5.2, 5.7], [5.2, 10], [4.8, 10]]]
+    disc = {"circle": {"center": [9.0, 5.0], "radius": 0.4}, "path": {"times": [0, 12], "points": [[9, 5], [1, 5]]}}
+    fields = {"start": [1, 3, 0], "goal": [9, 7, 0], "horizon": 14.0}
+    scenario = crossing(0.8, obstacles=[*({"polygon": {"vertices": wall}} for wall in walls), disc], **fields)
+    optimum = find_optimum(scenario)
+    assert optimum.success
+    assert optimum.certificate.clearance > 0
+    at = np.interp(5.0, optimum.states[:, 0], optimum.times)  # when the robot is in the door
+    assert abs(at - 6.0) > 0.8  # the disc is there after 6 s
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"horizon": None, "cost": {"time_weight": 1.0}},
+        {"cost": {"proximity_weight": 0.0}},
+        {"robot": {"model": "car"}},
+        {"robot": {"model": "dynamic_unicycle"}},
+        {"robot": {"model": "unicycle", "footprint": {"box": {"length": 0.5, "width": 0.3}}}},
+    ],
+    ids=["free", "hard", "car", "dynamic_unicycle", "box"],
+)
+def test_other_tasks_are_solved(changes):
+    optimum = find_optimum(crossing(0.8, **changes))
+    assert optimum.success
+    assert optimum.certificate.clearance > 0
+    if changes.get("horizon", 8.0) is None:
+        assert np.abs(optimum.hamiltonian).max() < 1e-7
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_scenes_are_certified(seed):
+    scenario = random_crossing(seed)
+    optimum = find_optimum(scenario, "medium")
+    assert optimum.success
+    assert clearances(scenario, optimum).min() > 0
+
+
+def test_the_search_misses_few_optima_of_static_scenarios():
+    """With an obstacle far away that moves, the search over position and time finds what the lattice finds."""
+    obstacle = {"circle": {"center": [4.5, 4.4], "radius": 0.8}}
+    far = {"circle": {"center": [1000.0, 1000.0], "radius": 0.1}, "velocity": [1.0, 0.0]}
+    still = Scenario.from_dict(scenario_fields(obstacles=[obstacle]))
+    timed = Scenario.from_dict(scenario_fields(obstacles=[obstacle, far]))
+    assert find_optimum(timed).cost == pytest.approx(find_optimum(still).cost, rel=1e-9)
+
+
+def test_an_obstacle_without_velocity_is_at_rest():
+    obstacle = {"circle": {"center": [4.5, 4.4], "radius": 0.8}}
+    still, zero = (scenario_fields(obstacles=[{**obstacle, **motion}]) for motion in ({}, {"velocity": [0.0, 0.0]}))
+    assert find_optimum(Scenario.from_dict(zero)).cost == find_optimum(Scenario.from_dict(still)).cost
+
+
+def test_a_guess_is_solved_and_an_optimum_is_drawn(tmp_path):
+    scenario = crossing(0.8)
+    optimum = find_optimum(scenario)
+    again = solve(OptimalControlProblem.from_scenario(scenario), "multiple_shooting", guess=optimum)
+    assert again.success
+    assert again.cost == pytest.approx(optimum.cost, rel=1e-9)
+    plot_extremal(optimum, tmp_path / "optimum.png", scenario)
+
+
+def test_the_sides_of_a_moving_obstacle_are_those_where_it_is():
+    field = crossing(1.0).field
+    times = np.linspace(0.0, 8.0, 100)
+    line = np.column_stack([1.0 + times, np.full(100, 5.0)])
+    early, late = line.copy(), line.copy()
+    early[:, 0] += 1.5 * np.sin(np.pi * times / 8)
+    late[:, 0] -= 1.5 * np.sin(np.pi * times / 8)
+    # In front of the disc, which comes from the right; then it passes on the right.
+    assert path_sides(times, early, field) == ("right",)
+    assert path_sides(times, late, field) == ("left",)
+
+
+def test_what_considers_obstacles_at_rest_only_refuses_others(tmp_path):
+    scenario = crossing(0.8)
+    for call in (
+        lambda: minimum_length(scenario),
+        lambda: lower_bound(scenario),
+        lambda: second_opinion(scenario),
+        lambda: build_bank_of([scenario], tmp_path / "moving.bank", progress=False),
+    ):
+        with pytest.raises(ValueError, match="expected obstacles at rest, but one has a velocity or a path"):
+            call()
+    env = NavigateEnv(scenario=scenario)
+    expert = ExpertPolicy(env)
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(NoOptimumError, match="expected obstacles at rest"):
+        expert.predict(observation)
