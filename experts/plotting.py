@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from leapnav.envs import shapes
 from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.packing import displacements
 from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
@@ -34,6 +34,7 @@ PIECES = {"straight": OPTIMUM, "turn": CURVES[4], "contact": WALL}  # colors of 
 MAX_ALTERNATIVES = len(ALTERNATIVES)
 N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
 N_POINTS = 400  # points of a dense path
+N_POSITIONS = 6  # of a moving obstacle, evenly spaced in time
 N_FIELD_POINTS = 200  # sample points per side of an obstacle field
 MAX_BOUND = 3.0  # control bounds up to this multiple of the largest control are within the axes
 MIN_DRIFT = 1e-9  # smallest half-height of the Hamiltonian's axes, so that rounding errors do not fill them
@@ -44,13 +45,15 @@ MAX_LINEAR_SPREAD = 100.0  # in units of the smallest distance; a larger spread 
 
 
 def draw_scenario(axes: Axes, scenario: Scenario) -> None:
-    """Draw arena, obstacles, start and goal to scale, in metres."""
+    """Draw arena, obstacles, start and goal to scale, in metres; moving obstacles at several times, ever fainter."""
     x_min, y_min, x_max, y_max = scenario.arena
-    for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
-        if isinstance(part, shapes.Circle):
-            axes.add_patch(Circle(part.center, part.radius, facecolor=OBSTACLE, edgecolor=EDGE))
-        else:
-            axes.add_patch(Polygon(part.outline(), facecolor=OBSTACLE, edgecolor=EDGE))
+    for obstacle in scenario.obstacles:
+        times = np.linspace(0.0, scenario.episode_limit, N_POSITIONS if len(obstacle.knots) else 1)
+        moved = displacements(obstacle.knots, times) if len(times) > 1 else np.zeros((1, 2))
+        for part in obstacle.shape.parts():
+            for k in range(len(times)):
+                fill = {"facecolor": OBSTACLE, "edgecolor": EDGE, "alpha": 0.7**k}
+                axes.add_patch(Polygon(part.outline() + moved[k], clip_on=True, **fill))
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
     for state, color in ((scenario.start_state, START), (scenario.goal_state, GOAL)):
         draw_robot(axes, state, scenario.outline, color)

@@ -141,10 +141,10 @@ def time_weight_symbol() -> sp.Symbol:
 
 @cache
 def clock_symbol() -> sp.Symbol:
-    """Return the symbol of the time as a state; its name is not one that users choose."""
+    """Return the symbol of the time as a state; a symbol "t" without the assumption is another one."""
     import sympy as sp
 
-    return sp.Symbol("_leapnav_clock", real=True)
+    return sp.Symbol("t", real=True)
 
 
 @cache
