@@ -183,7 +183,7 @@ class OptimalControlProblem:
         """
         robot, cost, timed, bounds = scenario.robot, scenario.cost, scenario.moves, scenario.robot.state_bounds()
         return cls(
-            system=system_of(type(robot), timed),
+            system=system_of(type(robot), True) if timed else system_of(type(robot)),
             start=(*move_inside(bounds, scenario.start_state), *((0.0,) if timed else ())),
             goal=(*move_inside(bounds, scenario.goal_state), *((None,) if timed else ())),
             horizon=scenario.horizon,

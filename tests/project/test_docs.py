@@ -43,7 +43,7 @@ PRINTED = {
     "guides/deploy.md": r"open\.onnx\.json\n0 goal\.ahead m\n(\d .*\n){8}9 lidar\[0\], .*\n"
     r"\['speed / max_speed', 'turn_rate / max_turn_rate'\]\nTrue\n",
     "guides/learners.md": r"0\.\d+ 0\.\d+ 0\.\d+\n8 \(\d+, 41\) \['control', 'cost_to_go', 'costate', .*\]\n",
-    "guides/obstacles.md": rf"True {NUMBER}\nTrue\n8 4 True\nrooms-3\n",
+    "guides/obstacles.md": rf"True {NUMBER}\nTrue\n\('right',\) \[\('left',\)\]\n8 4 True\nrooms-3\n",
     "robots/dynamic_car.md": rf"{NUMBER}\n",
     "robots/own_robot.md": r"True 4\n",
     "robots/trailer.md": rf"{NUMBER}\n",
