@@ -60,8 +60,9 @@ ALTERNATIVES_BUDGET = 240_000
 # Of a second search with hard limits, see `LocalOptima`: with 1, a box of 0.5 x 0.25 m does not pass through a gap
 # of 0.26 m from the side.
 SHARPNESS = 4.0
-# Horizons of the paths among moving obstacles if it is free, in units of the time of a straight line.
-HORIZON_FACTORS = 1.0, 1.4, 2.0
+# Horizons of the paths among moving obstacles if it is free, in units of the time of a straight line (s), at least
+# `SHORTEST`.
+HORIZON_FACTORS, SHORTEST = (1.0, 1.4, 2.0), 1.0
 # `shortest_horizon`: relative tolerance, and largest multiple of the scenario's horizon.
 HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 0.02, 1000.0
 
@@ -343,8 +344,8 @@ def _search_in_time(
     """Search paths over position and time among moving obstacles; returns the same as `_search`."""
     horizons = [problem.horizon]
     if problem.horizon is None:
-        distance = math.dist(scenario.start[:2], scenario.goal[:2]) + scenario.robot.speed_limits()[1] ** -1
-        horizons = [factor * distance / scenario.cruise_speed for factor in HORIZON_FACTORS]
+        duration = max(math.dist(scenario.start[:2], scenario.goal[:2]) / scenario.cruise_speed, SHORTEST)
+        horizons = [factor * duration for factor in HORIZON_FACTORS]
     assert problem.field is not None
     field = with_weight(problem.field, problem.proximity_weight)
     searches = [SpaceTimeSearch(scenario, field, horizon) for horizon in horizons if horizon is not None]

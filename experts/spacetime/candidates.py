@@ -45,7 +45,7 @@ class SpaceTimeSearch:
         radius = float(scenario.outline[:, 2:4].sum(axis=1).min())
         sample_layers(field, scenario.outline, np.array([grid.x0, grid.y0, grid.cell, grid.step, radius]), costs)
         speed_weight = scenario.robot.metric(scenario.cost)[0]
-        weights = np.array([0.5 * speed_weight * grid.cell**2 / grid.step, 0.0])
+        weight = 0.5 * speed_weight * grid.cell**2 / grid.step
         times = grid.step * np.arange(grid.layers + 1)
         # Not the centres of cells, so that no path passes exactly above or below an obstacle.
         centres = (obstacle_centres(field, times) - (grid.x0, grid.y0)) / grid.cell + OFFSET
@@ -57,7 +57,7 @@ class SpaceTimeSearch:
             layers, places = np.ascontiguousarray(costs[::order]), np.ascontiguousarray(centres[::order])
             values, parents = np.empty_like(costs), np.empty(costs.size, np.int64)
             signatures = np.empty(costs.size, np.int64)
-            spread(layers, np.array([*cell, grid.reach]), weights, values, parents, places, signatures)
+            spread(layers, np.array([*cell, grid.reach]), weight, values, parents, places, signatures)
             shape = costs.shape
             found.append([array.reshape(shape)[::order] for array in (values, parents, signatures)])
         (self._before, self._parents, signed), (self._after, self._children, unsigned) = found

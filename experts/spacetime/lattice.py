@@ -26,7 +26,8 @@ MIN_LAYERS, MAX_LAYERS = 40, 160
 MAX_SPEED_FACTOR = 4.0  # largest speed of a move, in units of that on the straight line
 REACH = 3  # cells that a move at the largest speed is long, if the number of layers permits
 MAX_DEPTH = 0.5  # cells by which the centre of a cell may be too close to an obstacle
-SIDES = 1 << 20  # numbers of obstacles in a signature are spread by a multiple of it
+# Factors of the crossings of an obstacle in a signature, so that different crossings have different sums.
+SQUARE, LINEAR = 1 << 20, 7919
 
 
 class SpaceTimeGrid(NamedTuple):
@@ -101,14 +102,14 @@ def crossing(x, y, to_x, to_y):
     return 1 if x < 0.0 else -1
 
 
-@kernel(NOTHING(CUBE, INTEGERS, VECTOR, CUBE, INTEGERS, MATRIX, INTEGERS))
-def spread(costs, start, weights, values, parents, centres, signatures):
+@kernel(NOTHING(CUBE, INTEGERS, float64, CUBE, INTEGERS, MATRIX, INTEGERS))
+def spread(costs, start, weight, values, parents, centres, signatures):
     """Compute the cheapest path from a cell in the first layer to each cell of each layer.
 
     Args:
         costs (layers + 1, columns, lines): of the cells, for the time of a step; the first axis may be reversed.
         start (3,): column and line, and the largest length of a move (cells).
-        weights (2,): cost of a move of one cell, and its tolerance.
+        weight: cost of a move of one cell; that of longer moves grows with the square of their length.
         values (layers + 1, columns, lines): overwritten by the costs of the paths.
         parents: of each cell, flat; overwritten by the number of the cell before, -1 for none.
         centres (layers + 1, 2 obstacles): positions of the obstacles (cells), in the order of the layers.
@@ -131,7 +132,7 @@ def spread(costs, start, weights, values, parents, centres, signatures):
                     for b in range(max(j - reach, 0), min(j + reach + 1, lines)):
                         square = (a - i) * (a - i) + (b - j) * (b - j)
                         if square <= reach * reach:
-                            value = values[k - 1, a, b] + weights[0] * square
+                            value = values[k - 1, a, b] + weight * square
                             if value < best:
                                 best, parent = value, a * lines + b
                 if parent >= 0:
@@ -147,5 +148,5 @@ def spread(costs, start, weights, values, parents, centres, signatures):
                             i - centres[k, 2 * n],
                             j - centres[k, 2 * n + 1],
                         )
-                        signature += crossed * (SIDES * (n + 1) * (n + 1) + 7919 * (n + 1))
+                        signature += crossed * (SQUARE * (n + 1) * (n + 1) + LINEAR * (n + 1))
                     signatures[node] = signature
