@@ -108,12 +108,14 @@ def load(kind: str, generator: str, declaration: str, generate: Callable[[], str
 
     Args:
         kind: prefix of the module's name.
-        generator: source file of the module that generates it. The content depends on it, and on the version of SymPy.
+        generator: source file of the module that generates it. The content depends on it, on the other generators of
+            this package, which it may call, and on the version of SymPy.
         declaration: text that determines the content of the module, together with the generator.
         generate: function that returns the source.
 
     """
-    sources = (Path(file).read_text(encoding="utf-8") for file in (__file__, generator))
+    files = [*sorted(Path(__file__).parent.glob("generated_*.py")), Path(__file__), Path(generator)]
+    sources = (file.read_text(encoding="utf-8") for file in files)
     identity = "\n".join([sp.__version__, declaration, *sources])
     name = f"{kind}_{hashlib.sha256(identity.encode()).hexdigest()[:20]}"
     path = cache_root() / f"{name}.py"
