@@ -19,7 +19,7 @@ from leapnav.envs.scenarios.banks.checks import Reference
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.families import FAMILIES, register_family, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
-from leapnav.envs.scenarios.layouts import ScenarioLayout
+from leapnav.envs.scenarios.layouts.layout import ScenarioLayout
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import Disturbance, Motor

@@ -22,6 +22,7 @@ from leapnav.envs.utils.validation import (
 from leapnav.experts.hard_limits import BARRIER_TOLERANCE, fitted_weight, follow_limit, softened
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.problem.certificate import failure
+from leapnav.experts.problem.clock import with_clock
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
 from leapnav.experts.search.initial_guess import initial_guess
@@ -333,7 +334,7 @@ def _options(
 
 def _check_path(guess: Trajectory, problem: OptimalControlProblem) -> Trajectory:
     """The guess as arrays of floats."""
-    n = problem.system.n
+    n, guess = problem.system.n, with_clock(problem, guess)
     times = as_vector("guess.times", guess.times)
     states = as_matrix("guess.states", guess.states, len(times), n)
     costates = None if guess.costates is None else as_matrix("guess.costates", guess.costates, len(times), n)

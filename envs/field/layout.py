@@ -124,6 +124,19 @@ def piece_at(field, part, time):
     return low
 
 
+@kernel(types.float64(CONSTANT, types.float64))
+def time_to_knot(field, time):
+    """Return the time (s) after which a moving part reaches the next knot of its path; infinite if none does."""
+    header, parts = header_of(field), parts_in(field)
+    found = np.inf
+    for number in range(header.parts - header.moving, header.parts):
+        part = parts[number]
+        piece = piece_at(field, part, time)
+        if piece < part.knots:
+            found = min(found, knots_of(field, part)[piece].time - time)
+    return found
+
+
 @kernel(types.UniTuple(types.float64, 4)(CONSTANT, PART_TYPE, types.float64))
 def motion_of(field, part, time):
     """Return the displacement (2) (m) and the velocity (2) (m/s) of a part at a time (s)."""

@@ -13,7 +13,7 @@ import numpy as np
 from numba import float64, int64
 
 from leapnav.envs.field.distance import HASH_FACTOR, barrier_term, closest_feature, part_geometry
-from leapnav.envs.field.layout import CUTOFF, displacement_of, header_of, motion_of, parts_in, piece_at
+from leapnav.envs.field.layout import CUTOFF, displacement_of, header_of, motion_of, parts_in
 from leapnav.envs.field.rectangle import OUTLINE_ENTRIES, ROW, add_part, part_features
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, NOTHING, VECTOR, tuple_of
@@ -146,7 +146,7 @@ def moving_row_value(x, y, cos, sin, row, time, field):
 
 @kernel(int64(float64, float64, float64, float64, CONSTANT))
 def moving_disc_features(x, y, time, radius, field):
-    """Number of the closest features of moving parts and of the pieces of their paths, see `disc_features`."""
+    """Number of the closest features of moving parts, see `disc_features`."""
     number, header, parts = 0, header_of(field), parts_in(field)
     reach = CUTOFF * header.scale + radius
     for index in range(header.parts - header.moving, header.parts):
@@ -154,7 +154,7 @@ def moving_disc_features(x, y, time, radius, field):
         moved_x, moved_y = displacement_of(field, part, time)
         px, py = x - moved_x, y - moved_y
         if (px - part.x) ** 2 + (py - part.y) ** 2 < (part.rim + reach) ** 2:
-            feature = HASH_FACTOR * (index + 1) + piece_at(field, part, time)
+            feature = index + 1
             if part.edges > 0:
                 feature = HASH_FACTOR * feature + closest_feature(px, py, field, part, reach)
             number += feature * feature  # a sum does not depend on the order of the parts
@@ -182,8 +182,7 @@ def moving_footprint_features(x, y, heading, time, joint, data, first, field):
             px, py = x - moved_x, y - moved_y
             dx, dy = px + middle * cos - part.x, py + middle * sin - part.y
             if dx * dx + dy * dy < (part.rim + reach) ** 2:
-                feature = HASH_FACTOR * (index + 1) + piece_at(field, part, time)
-                feature = part_features(feature, px, py, cos, sin, row, field, part)
+                feature = part_features(index + 1, px, py, cos, sin, row, field, part)
                 features += feature * feature
         number = HASH_FACTOR * number + features
     return number

@@ -25,7 +25,9 @@ from leapnav.envs.robots import RobotModel
 from leapnav.envs.robots.footprints import sizes_of
 from leapnav.envs.scenarios.cost import Cost, cruise_speed
 from leapnav.envs.scenarios.files import read_scenarios
-from leapnav.envs.scenarios.layouts import ARENA, LAYOUTS, Area, ScenarioLayout, rounded
+from leapnav.envs.scenarios.layouts.at_rest import LAYOUTS_AT_REST
+from leapnav.envs.scenarios.layouts.layout import ARENA, Area, ScenarioLayout, rounded
+from leapnav.envs.scenarios.layouts.moving import MOVING_LAYOUTS
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
 from leapnav.envs.utils.validation import check_choice, suggestion
@@ -38,6 +40,8 @@ TIME_WEIGHT = 0.5  # cost per second if the horizon is free
 RELATIVE_DURATION = 1.1
 MIN_DISTANCE = 0.4  # between start and goal, as a fraction of the shorter side of the arena
 MIN_POSE_CLEARANCE = 0.25  # m at the start and the goal
+# No obstacle comes closer to the start for this time (s) at the beginning, and to the goal at the end; checked at times.
+POSE_TIME, N_POSE_TIMES = 1.0, 11
 PASSAGE_MARGIN = 0.1  # m on either side of the robot, in the narrowest passage that a scenario may require
 GRID_SPACING = 0.25  # m, of the grid on which the shortest path is computed
 MAX_DRAWS = 10_000  # of a layout and poses, until start and goal are connected
@@ -46,7 +50,7 @@ BANK_ENDING, FILE_ENDING = ".bank", ".json"  # of names that stand for stored sc
 
 Sample = Callable[[np.random.Generator], ScenarioLayout | Scenario]
 
-FAMILIES: dict[str, Sample] = dict(LAYOUTS)
+FAMILIES: dict[str, Sample] = {**LAYOUTS_AT_REST, **MOVING_LAYOUTS}
 REGISTERED: dict[str, Sample] = {}
 ALL = "all"  # the family is sampled, too
 ALL_FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")  # those that "all" stands for, in arenas of 10 m
@@ -293,15 +297,11 @@ def _sample_task(
     sides = x_max - x_min, y_max - y_min
     if math.dist(poses[0, :2], poses[1, :2]) < MIN_DISTANCE * min(sides):
         return None
-    field = pack_field(
-        [obstacle.shape for obstacle in layout.obstacles],
-        layout.arena,
-        sizes_of(outline),
-        cost.proximity_weight,
-        cost.proximity_scale,
-        grid=False,
-    )
-    states = np.pad(poses, ((0, 0), (0, body.sizes()[0] - 3)))
+    settings = layout.arena, sizes_of(outline), cost.proximity_weight, cost.proximity_scale
+    at_rest = [one for one in layout.obstacles if not len(one.knots)]
+    field = pack_field([one.shape for one in at_rest], *settings, grid=False)
+    n = body.sizes()[0]
+    states = np.pad(poses, ((0, 0), (0, n - 3)))
     if footprint_clearances(states, outline, field).min() < MIN_POSE_CLEARANCE:
         return None
     length = _shortest_path(layout.arena, field, poses[0, :2], poses[1, :2])
@@ -309,9 +309,18 @@ def _sample_task(
         return None
     start, goal = (tuple(rounded(value) for value in pose) for pose in poses)
     longest = MAX_HORIZON * max(1.0, max(sides) / (ARENA[2] - ARENA[0]))
-    times: dict[str, Any] = {"horizon": round(min(length / REFERENCE_SPEED, longest), 1)}
+    duration = round(min(length / REFERENCE_SPEED + layout.waiting, longest), 1)
+    moving = [one for one in layout.obstacles if len(one.knots)]
+    if moving:
+        motions = [one.knots for one in moving]
+        field = pack_field([one.shape for one in moving], *settings, grid=False, motions=motions, clock=n)
+        moments = np.linspace(0.0, POSE_TIME, N_POSE_TIMES)
+        timed = [np.append(state, t) for state, first in zip(states, (0.0, duration - POSE_TIME)) for t in first + moments]
+        if footprint_clearances(np.array(timed), outline, field).min() < MIN_POSE_CLEARANCE:
+            return None
+    times: dict[str, Any] = {"horizon": duration}
     if horizon == "free":
-        limit = TIME_LIMIT_FACTOR * RELATIVE_DURATION * length / cruise_speed(body, cost)
+        limit = TIME_LIMIT_FACTOR * (RELATIVE_DURATION * length / cruise_speed(body, cost) + layout.waiting)
         times = {"horizon": None, "time_limit": round(limit, 1)}
     return {"start": start, "goal": goal, "cost": cost, **times}
 

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.families import CustomFamily, sample_scenario
-from leapnav.envs.scenarios.layouts import ScenarioLayout
+from leapnav.envs.scenarios.layouts.layout import ScenarioLayout
 from leapnav.envs.scenarios.maps import rectangle_vertices
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from leapnav.envs.field.clearance import footprint_clearances
-from leapnav.envs.scenarios.faults import ScenarioError, check_at_rest
+from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import as_vector
 from leapnav.experts.acting.barrier import barrier_integral, reference_problem
@@ -18,6 +18,7 @@ from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.optimum import Effort, find_optimum
+from leapnav.experts.problem.clock import started_at, with_clock
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, ProblemArrays, Trajectory
 from leapnav.experts.solvers.newton import CONVERGED, MARGIN
@@ -41,7 +42,7 @@ class _Solution(NamedTuple):
 
     Attributes:
         times: (K + 1,), in the episode (s).
-        nodes: (K + 1, 2n), states and costates.
+        nodes: (K + 1, 2n), states and costates; among moving obstacles, the last state is the time in the episode.
         costs: (K,), of the segments.
         problem: the problem, whose goal has the winding of the solution.
 
@@ -82,18 +83,20 @@ class Feedback:
         searches: number of searches so far.
 
     Raises:
-        ValueError: no optimum was found, or an obstacle moves.
+        ValueError: no optimum was found.
 
     """
 
     def __init__(self, scenario: Scenario, path: Trajectory | Extremal, *, effort: Effort = "medium") -> None:
-        check_at_rest(scenario.moves, "the expert in closed loop")
         self.scenario = scenario
         self._effort: Effort = effort
         self.searches = 0
         self._next_search = 0.0  # s; earliest time of the next search
         self._n, self._m = scenario.robot.sizes()
-        found = _solve_along(reference_problem(OptimalControlProblem.from_scenario(scenario), path), path, 0.0)
+        problem = OptimalControlProblem.from_scenario(scenario)
+        self._timed = problem.system.clock is not None
+        path = path if isinstance(path, Extremal) else with_clock(problem, path)
+        found = _solve_along(reference_problem(problem, path), path, 0.0)
         if found is None:
             self.searches += 1
             found = self._search(np.array(scenario.start_state), 0.0)
@@ -137,17 +140,21 @@ class Feedback:
         found, _ = self._resolve(as_vector("state", state, self._n), time, tol)
         if found is None:
             raise ValueError(f"state: no optimum was found from {list(map(float, state))} at {time:g} s")
-        return found.cost, found.nodes[0, self._n :].copy()
+        return found.cost, self._costate(found.nodes[0])
+
+    def with_time(self, state: np.ndarray, time: float) -> np.ndarray:
+        """Return the state of the optimal control problem: among moving obstacles, the time (s) is its last entry."""
+        return np.append(state, time) if self._timed else state
 
     @property
     def stored(self) -> tuple[float, np.ndarray]:
         """Cost-to-go and costate (n,) at the state and time of the stored solution."""
-        return self._stored.cost, self._stored.nodes[0, self._n :].copy()
+        return self._stored.cost, self._costate(self._stored.nodes[0])
 
     @property
     def final_costate(self) -> np.ndarray:
         """Costate (n,) at the horizon."""
-        return self._stored.nodes[-1, self._n :].copy()
+        return self._costate(self._stored.nodes[-1])
 
     def control(self, time: float) -> np.ndarray:
         """Return the controls (m,) of the stored solution at a time.
@@ -173,7 +180,7 @@ class Feedback:
         start, end = float(stored_times[0]), float(stored_times[-1])
         times = np.linspace(start, end, max(2, math.ceil((end - start) / GAIN_SAMPLING - 1e-9) + 1))
         extremal = np.array([follow(arrays.flow, stored_times, stored_nodes, time) for time in times])
-        n = self._n
+        n = stored_nodes.shape[1] // 2
         transitions = np.empty((len(times) - 1, 2 * n, 2 * n))
         for k, transition in enumerate(transitions):
             transition[:] = np.eye(2 * n)
@@ -202,9 +209,14 @@ class Feedback:
         slopes[last:] = slopes[last]
         return Gains(times, extremal, slopes, arrays.control, arrays.data, self._m)
 
-    def _resolve(self, state: np.ndarray, time: float, tol: float) -> tuple[_Solution | None, bool]:
+    def _costate(self, node: np.ndarray) -> np.ndarray:
+        """Return the costate (n,) of the robot's state at a node."""
+        first = len(node) // 2
+        return node[first : first + self._n].copy()
+
+    def _resolve(self, robot_state: np.ndarray, time: float, tol: float) -> tuple[_Solution | None, bool]:
         """Return the solution from a state and time, None without one, and whether a search was made."""
-        stored = self._stored
+        stored, state = self._stored, self.with_time(robot_state, time)
         left = stored.times[-1] - time
         if left <= 0.0 and self.scenario.horizon is not None:
             return None, False
@@ -218,7 +230,7 @@ class Feedback:
             found = None
         if found is not None or time < self._next_search:
             return found, False
-        found = self._search(state, time)
+        found = self._search(robot_state, time)
         if found is not None and tol < TOLERANCE:
             found = _solve_from(found, state, time, tol)[0]
         return found, True
@@ -246,7 +258,8 @@ class Feedback:
         optimum = find_optimum(scenario, self._effort)
         if not optimum.success:
             return None
-        return _solve_along(optimum.problem, optimum, time)
+        path = Trajectory(optimum.times, optimum.states, optimum.costates)
+        return _solve_along(*started_at(optimum.problem, path, time, self.scenario.field), time)
 
 
 def _solve_along(problem: OptimalControlProblem, path: Trajectory | Extremal, start_time: float) -> _Solution | None:

@@ -246,8 +246,9 @@ class ExpertPolicy:
         ahead = min(situation.period, left) / 2
         if robot.gains is not None:
             is_free = situation.scenario.horizon is None
-            robot.progress = robot.gains.closest(situation.state, robot.progress) if is_free else situation.time
-            control = robot.gains.control(situation.state, robot.progress, ahead)
+            point = robot.feedback.with_time(situation.state, situation.time)
+            robot.progress = robot.gains.closest(point, robot.progress) if is_free else situation.time
+            control = robot.gains.control(point, robot.progress, ahead)
         else:
             if self._feedback == "resolve":
                 robot.solved = robot.feedback.update(situation.state, situation.time)

@@ -20,7 +20,6 @@ from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank, collection_name, digest
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
 from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
-from leapnav.envs.scenarios.faults import check_at_rest
 from leapnav.envs.scenarios.files import PathLike, check_collection, read_scenarios
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
 from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
@@ -309,7 +308,6 @@ def solve_for_bank(scenario: Scenario, doubtful: bool = False) -> Arrays:
     A doubtful optimum is admitted only on request, with the reason in "doubt". The time limit of a scenario with a free
     horizon and without a limit is 3 times the duration of its optimum.
     """
-    check_at_rest(scenario.moves, "a bank")
     optimum = find_optimum(scenario)
     rejection = judge(optimum)
     if rejection is not None and not (doubtful and optimum.success):
@@ -319,6 +317,7 @@ def solve_for_bank(scenario: Scenario, doubtful: bool = False) -> Arrays:
     duration = optimum.horizon
     if scenario.horizon is None and scenario.time_limit is None:
         scenario = scenario.model_copy(update={"time_limit": round(TIME_LIMIT_FACTOR * duration, 1)})
+    n = len(scenario.robot.state_names)  # the optimum has the time as a further state if obstacles move
     states, controls, costates = (values.astype("<f4") for values in optimum.evaluate(point_times(duration)))
     return {
         "rejected": np.array(""),
@@ -330,9 +329,9 @@ def solve_for_bank(scenario: Scenario, doubtful: bool = False) -> Arrays:
         "certificate": np.array(
             [certificate.residual, certificate.defect, certificate.hamiltonian_drift, certificate.clearance]
         ),
-        "states": states,
+        "states": states[:, :n],
         "controls": controls,
-        "costates": costates,
+        "costates": costates[:, :n],
     }
 
 

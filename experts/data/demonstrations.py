@@ -108,6 +108,7 @@ def demonstrate(env: gym.Env, scenario: Scenario, extremal: Extremal) -> Demonst
     driven = _drive(env, scenario, lambda step: (actions[step], actions[step]) if step < len(actions) else None)
     times = np.minimum(inner.control_period * np.arange(len(driven["states"])), extremal.horizon)
     costates, cost_to_go = extremal.evaluate(times)[2], np.asarray(extremal.cost_to_go(times))
+    costates = costates[:, : driven["states"].shape[1]]  # without that of the time
     return Demonstration(scenario=scenario, costates=costates, cost_to_go=cost_to_go, **driven)
 
 
@@ -208,12 +209,13 @@ def recovery(
     time = rng.uniform(0.0, max(extremal.horizon - MIN_RECOVERY_TIME, 0.0))
     n = scenario.robot.sizes()[0]
     perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
-    state = extremal.evaluate(time)[0] + perturbation
-    if footprint_clearance(state, scenario.outline, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
+    state = extremal.evaluate(time)[0][:n] + perturbation
+    at_time = np.append(state, time)
+    if footprint_clearance(at_time, scenario.outline, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
     rest = scenario.from_state(state, time).model_copy(update={"name": name})
     times = np.concatenate([[0.0], extremal.times[extremal.times > time + 1e-6] - time])
-    states, _, costates = extremal.evaluate(times + time)
+    states, costates = (values[:, :n] for values in extremal.evaluate(times + time)[::2])
     times[-1] = extremal.horizon - time
     states += perturbation * np.exp(-times / PERTURBATION_DECAY)[:, None]
     problem = OptimalControlProblem.from_scenario(rest).with_barrier(extremal.problem.barrier_weight)

@@ -16,6 +16,7 @@ import numpy as np
 from numba import boolean, float64, int64
 from scipy.integrate import DOP853
 
+from leapnav.envs.field.layout import header_of, time_to_knot
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import matrix_of, part_of
 from leapnav.envs.kernels.types import MATRIX, NOTHING, VECTOR, tuple_of
@@ -38,6 +39,9 @@ MAX_STEPS = 1_000  # per interval; segments of extremals take 10 to 100
 # other steps.
 FRACTION_ACCURACY, MARGIN, BEYOND = 1e-10, 1e-4, 1e-9
 MAX_ESTIMATES = 2  # of a boundary; with 1, up to 1.03 times as many evaluations, with 3 as many
+# s before and after a knot of the path of a moving obstacle, where a step ends and the next one begins. At the knot the
+# costate of the time has a kink, whose error is about this number.
+KNOT_GAP = 1e-11
 MAX_VALUE = 1e14  # a state or costate beyond this has diverged
 MIN_STEP = 1e-13  # relative to the interval; smaller steps are at rounding level
 
@@ -241,6 +245,20 @@ def shorter_step(flow, y, new, stages, size, h, error):
     return next_step(h, error), 0.0, evaluations
 
 
+@kernel(tuple_of(float64, float64)(FLOW, VECTOR, float64))
+def before_knot(flow, y, h):
+    """Return (step size, gap) of a step from y = (z, S), flat, that would be of length h.
+
+    A step ends just before the next knot of the path of a moving obstacle, at which the flow is discontinuous. `gap` is
+    then the length (s) of the following step, which `cross` makes across the knot, otherwise 0. The step size is at
+    most 0 if y is there already.
+    """
+    if len(flow.field) == 0 or header_of(flow.field).moving == 0:
+        return h, 0.0
+    ahead = time_to_knot(flow.field, y[header_of(flow.field).clock])
+    return (h, 0.0) if h < ahead - KNOT_GAP else (ahead - KNOT_GAP, 2.0 * KNOT_GAP)
+
+
 @kernel(float64(FLOW, VECTOR, VECTOR, STAGES_TYPE, int64, float64))
 def cross(flow, y, new, stages, size, h):
     """Make a very short step of length h across the boundary of a smooth piece, and return its cost.
@@ -279,12 +297,16 @@ def propagate(flow, z, S, duration, tolerance, first_step, once):
     evaluate_stage(flow, y, stages, 0, size)
     failed, last, proposed, gap, crosses = False, False, h, 0.0, False
     while elapsed < duration:
+        if gap == 0.0:
+            proposed = h
+            h, gap = before_knot(flow, y, h)
+            if h <= 0.0:
+                crosses, h = True, proposed
         if crosses:
-            taken, error, part = gap, 0.0, cross(flow, y, new, stages, size, gap)
+            taken, error = min(gap, duration - elapsed), 0.0
+            part = cross(flow, y, new, stages, size, taken)
             evaluations += 2
         else:
-            if gap == 0.0:
-                proposed = h
             last = elapsed + h >= duration * (1 - 1e-14)
             if last:
                 h = duration - elapsed

@@ -19,6 +19,7 @@ from leapnav.experts.numerics.integrator import (
     MAX_VALUE,
     MIN_STEP,
     Stages,
+    before_knot,
     cross,
     cubic_interpolant,
     evaluate_interpolant,
@@ -96,8 +97,14 @@ def trace(flow, control, times, Z, accuracy, record):
                 out[rows, 3 + m + 2 * size] = determinant
             if finished:
                 break
+            if gap == 0.0:
+                proposed = h
+                h, gap = before_knot(flow, y, h)
+                if h <= 0.0:
+                    crosses, h = True, proposed
             if crosses:
-                taken, cost = gap, cross(flow, y, new, stages, size, gap)
+                taken, ends = min(gap, duration - elapsed), False
+                cost = cross(flow, y, new, stages, size, taken)
                 cubic_interpolant(y, new, stages, taken, cost, record.terms[rows])
             else:
                 while True:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from leapnav.envs.field.clearance import footprint_clearances
+from leapnav.envs.field.layout import read_header
 from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.robots.footprints import arm_of
 from leapnav.envs.scenarios.scenario import Scenario
@@ -178,13 +179,13 @@ def check_optimum(scenario: Scenario, reference: Reference) -> None:
             raise ValueError(f"{name}: expected finite numbers")
     states, controls, costates = (array.astype(float) for array in arrays)
     with np.errstate(all="ignore"):  # large numbers are refused, since no comparison with the result holds
-        _check_states(scenario, states, reference.certificate[3])
+        _check_states(scenario, states, reference.times, reference.certificate[3])
         _check_motion(scenario, states, controls, float(reference.times[1]))
         _check_costates(scenario, states, controls, costates)
-        _check_cost(scenario, states, controls, float(reference.times[1]), reference.cost)
+        _check_cost(scenario, np.column_stack([states, reference.times]), controls, reference.cost)
 
 
-def _check_states(scenario: Scenario, states: np.ndarray, certified: float) -> None:
+def _check_states(scenario: Scenario, states: np.ndarray, times: np.ndarray, certified: float) -> None:
     """Check start, goal and clearance of a path."""
     rounding = PRECISION * np.maximum(np.abs(states), 1.0)
     is_heading = np.isin(scenario.robot.state_names, ("heading", *scenario.robot.heading_states))
@@ -198,12 +199,13 @@ def _check_states(scenario: Scenario, states: np.ndarray, certified: float) -> N
     if not ((states[:, :2] >= (x_min, y_min)) & (states[:, :2] <= (x_max, y_max))).all():
         raise ValueError("states: expected positions in the arena")
     outline, field = scenario.outline, scenario.field
-    found = float(footprint_clearances(states, outline, field).min())
+    found = float(footprint_clearances(np.column_stack([states, times]), outline, field).min())
     # Every point of the outline is always within half of this of its position at a stored point, and so are the points
     # of the certificate.
     steps, arm, joint = np.abs(np.diff(states, axis=0)), arm_of(outline), int(outline[:, 4].max())
     turns = steps[:, 2] + (steps[:, joint] if joint else 0.0)
-    step = float((np.hypot(steps[:, 0], steps[:, 1]) + arm * turns).max())
+    moved = float(read_header(field)["top_speed"]) * float(times[1])  # by obstacles in the same time
+    step = float((np.hypot(steps[:, 0], steps[:, 1]) + arm * turns).max()) + moved
     if not abs(found - certified) <= step + float(rounding[:, :3].max()):
         raise ValueError(f"states: expected a smallest clearance of {certified:.3g} m, got {found:.3g} m")
 
@@ -239,20 +241,20 @@ def _check_costates(scenario: Scenario, states: np.ndarray, controls: np.ndarray
         raise ValueError("costates: not those of an extremal with these states and controls")
 
 
-def _check_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float, cost: float) -> None:
-    """Check that the cost is that of the path; with hard obstacles, the one without the barrier."""
-    total = _path_cost(scenario, states, controls, interval)
+def _check_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, cost: float) -> None:
+    """Check that the cost is that of the path (N, n + 1) with the time; with hard obstacles, without the barrier."""
+    total = _path_cost(scenario, states, controls)
     if not abs(cost - total) <= COST_TOLERANCE * total:
         from scipy.interpolate import CubicSpline  # imported here because that takes time, and it is rarely used
 
         at = np.arange(len(states)), np.linspace(0, len(states) - 1, INTERPOLATED * (len(states) - 1) + 1)
         fine = [CubicSpline(at[0], values)(at[1]) for values in (states, controls)]
-        total = _path_cost(scenario, fine[0], fine[1], interval / INTERPOLATED)
+        total = _path_cost(scenario, fine[0], fine[1])
     if not abs(cost - total) <= COST_TOLERANCE * total:
         raise ValueError(f"costs: expected {total:.4g}, the cost of the path, got {cost:.4g}")
 
 
-def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float) -> float:
+def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray) -> float:
     """Return the cost of a path by the trapezoidal rule."""
     robot = scenario.robot
     parameters = np.array(robot.parameters(scenario.cost), dtype=float)
@@ -261,4 +263,4 @@ def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, int
     for k, state in enumerate(states):
         running[k] += footprint_value(state, scenario.outline, scenario.field)
         running[k] += 0.0 if state_cost is None else state_cost(state, parameters)
-    return float(np.trapezoid(running, dx=interval))
+    return float(np.trapezoid(running, states[:, -1]))

@@ -1,45 +1,16 @@
-"""Layouts of the built-in families: random obstacles, and the regions of start and goal."""
+"""Layouts of the built-in families whose obstacles do not move."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from leapnav.envs.scenarios.layouts.layout import DECIMALS, ScenarioLayout, point, polygon, rectangle, rounded
 from leapnav.envs.scenarios.obstacle import Obstacle
-from leapnav.envs.shapes import Circle, Polygon
-
-ARENA = (0.0, 0.0, 10.0, 10.0)
-POSE_MARGIN = 0.5  # m between the walls and the regions of start and goal
-DECIMALS = 4  # of every sampled number, so that scenario files stay short
-
-Area = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
-
-
-@dataclass(frozen=True)
-class ScenarioLayout:
-    """The obstacles of a random scenario, and the regions in which start and goal are sampled.
-
-    Attributes:
-        obstacles: the obstacles.
-        start, goal: x_min, y_min, x_max, y_max (m) of the regions; None: the arena without a margin of 0.5 m.
-        arena: x_min, y_min, x_max, y_max (m) of the walls.
-
-    """
-
-    obstacles: Sequence[Obstacle]
-    start: Area | None = None
-    goal: Area | None = None
-    arena: Area = ARENA
-
-    @property
-    def regions(self) -> np.ndarray:
-        """The regions of start and goal (2, 4)."""
-        x_min, y_min, x_max, y_max = self.arena
-        inside = (x_min + POSE_MARGIN, y_min + POSE_MARGIN, x_max - POSE_MARGIN, y_max - POSE_MARGIN)
-        return np.array([self.start or inside, self.goal or inside])
+from leapnav.envs.shapes import Circle
 
 
 def _open(rng: np.random.Generator) -> ScenarioLayout:
@@ -51,7 +22,7 @@ def _clutter(rng: np.random.Generator) -> ScenarioLayout:
     """6 to 12 discs with radii from 0.3 to 1 m, which may overlap."""
     return ScenarioLayout(
         [
-            Obstacle(circle=Circle(center=_point(rng.uniform(1.0, 9.0, 2)), radius=rounded(rng.uniform(0.3, 1.0))))
+            Obstacle(circle=Circle(center=point(rng.uniform(1.0, 9.0, 2)), radius=rounded(rng.uniform(0.3, 1.0))))
             for _ in range(rng.integers(6, 13))
         ]
     )
@@ -66,7 +37,7 @@ def _box(rng: np.random.Generator) -> Obstacle:
     half = np.array([rng.uniform(0.2, 0.8), rng.uniform(0.2, 1.2)])
     angle = rng.uniform(-math.pi, math.pi)
     turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-    return _polygon(rng.uniform(1.0, 9.0, 2) + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ turn)
+    return polygon(rng.uniform(1.0, 9.0, 2) + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half @ turn)
 
 
 def _hull(rng: np.random.Generator) -> Obstacle:
@@ -78,7 +49,7 @@ def _hull(rng: np.random.Generator) -> Obstacle:
     # Imported here because only fresh scenarios need it: it takes a third of a second.
     from scipy.spatial import ConvexHull
 
-    return _polygon(points[ConvexHull(points).vertices])
+    return polygon(points[ConvexHull(points).vertices])
 
 
 def _rooms(rng: np.random.Generator) -> ScenarioLayout:
@@ -86,16 +57,23 @@ def _rooms(rng: np.random.Generator) -> ScenarioLayout:
 
     In 3/4 of the scenarios, one of the doors is closed.
     """
+    return ScenarioLayout(rooms_of(rng)[0])
+
+
+def rooms_of(rng: np.random.Generator) -> tuple[list[Obstacle], list[tuple[int, float, float]]]:
+    """Return the walls of `rooms`, and for each opening the axis along which its wall extends, and its ends (m)."""
     width = rng.uniform(1.0, 1.6)
     closed = rng.integers(4) if rng.random() < 0.75 else None
-    walls = []
+    walls, openings = [], []
     for index, (axis, begin) in enumerate(((1, 0.0), (1, 5.0), (0, 0.0), (0, 5.0))):
         door = rng.uniform(begin + 0.5, begin + 4.5 - width)
         ends = [(begin, begin + 5.0)] if index == closed else [(begin, door), (door + width, begin + 5.0)]
+        if index != closed:
+            openings.append((axis, door, door + width))
         for low, high in ends:
             corners = (4.9, low, 5.1, high) if axis == 1 else (low, 4.9, high, 5.1)
-            walls.append(_rectangle(*corners))
-    return ScenarioLayout(walls)
+            walls.append(rectangle(*corners))
+    return walls, openings
 
 
 def _slalom(rng: np.random.Generator) -> ScenarioLayout:
@@ -107,7 +85,7 @@ def _slalom(rng: np.random.Generator) -> ScenarioLayout:
         left = 10.0 * (number + 1) / (count + 1) - 0.15 + rng.uniform(-0.4, 0.4)
         length = 10.0 - rng.uniform(1.4, 3.5)
         low, high = (10.0 - length, 10.0) if above else (0.0, length)
-        walls.append(_rectangle(left, low, left + 0.3, high))
+        walls.append(rectangle(left, low, left + 0.3, high))
         above = not above
     return ScenarioLayout(walls, start=(0.6, 1.0, 1.2, 9.0), goal=(8.8, 1.0, 9.4, 9.0))
 
@@ -137,7 +115,7 @@ def _maze(rng: np.random.Generator) -> ScenarioLayout:
             for first, last in _runs(row):
                 low, high = max(0.0, size * first - 0.1), min(size * n, size * last + 0.1)
                 corners = (across - 0.1, low, across + 0.1, high)
-                found.append(_rectangle(*corners) if axis == 0 else _rectangle(low, corners[0], high, corners[2]))
+                found.append(rectangle(*corners) if axis == 0 else rectangle(low, corners[0], high, corners[2]))
     return ScenarioLayout(found, arena=(0.0, 0.0, size * n, size * n))
 
 
@@ -151,7 +129,7 @@ def _corridors(rng: np.random.Generator) -> ScenarioLayout:
     """Blocks between 4 or 5 corridors in each direction (0.9 to 1.5 m wide), of whose sections 1/6 are closed; 16 m."""
     size = 16.0
     columns, rows = (_divide(rng, int(rng.integers(4, 6)), size) for _ in range(2))
-    found = [_rectangle(x[0], y[0], x[1], y[1]) for x in columns.blocks for y in rows.blocks]
+    found = [rectangle(x[0], y[0], x[1], y[1]) for x in columns.blocks for y in rows.blocks]
     for corridors, blocks, is_vertical in (
         (columns.corridors, rows.blocks, True),
         (rows.corridors, columns.blocks, False),
@@ -161,7 +139,7 @@ def _corridors(rng: np.random.Generator) -> ScenarioLayout:
                 if rng.random() < 1 / 6:
                     at = rng.uniform(first, last - 0.2)
                     corners = (low, at, high, at + 0.2) if is_vertical else (at, low, at + 0.2, high)
-                    found.append(_rectangle(*corners))
+                    found.append(rectangle(*corners))
     return ScenarioLayout(found, arena=(0.0, 0.0, size, size))
 
 
@@ -184,24 +162,7 @@ def _divide(rng: np.random.Generator, count: int, size: float) -> _Cuts:
     return _Cuts(intervals[0::2], intervals[1::2])
 
 
-def rounded(value: float) -> float:
-    """Round a sampled number to `DECIMALS`."""
-    return round(float(value), DECIMALS)
-
-
-def _rectangle(x_min: float, y_min: float, x_max: float, y_max: float) -> Obstacle:
-    return _polygon(np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)]))
-
-
-def _polygon(vertices: np.ndarray) -> Obstacle:
-    return Obstacle(polygon=Polygon(vertices=tuple(_point(vertex) for vertex in vertices)))
-
-
-def _point(values: np.ndarray) -> tuple[float, float]:
-    return rounded(values[0]), rounded(values[1])
-
-
-LAYOUTS: dict[str, Callable[[np.random.Generator], ScenarioLayout]] = {
+LAYOUTS_AT_REST: dict[str, Callable[[np.random.Generator], ScenarioLayout]] = {
     "open": _open,
     "clutter": _clutter,
     "polygons": _polygons,
