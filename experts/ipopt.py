@@ -116,7 +116,7 @@ def _proximity(scenario: Scenario, q: Any, row: Sequence[float]) -> Any:
 
     Args:
         scenario: the scenario.
-        q: states (n, N).
+        q: states (n, N); among moving obstacles the time is the last one.
         row: of the outline.
 
     """
@@ -128,15 +128,25 @@ def _proximity(scenario: Scenario, q: Any, row: Sequence[float]) -> Any:
     points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in corners]
     x_min, y_min, x_max, y_max = scenario.arena
     distances = [d for px, py in points for d in (px - x_min, x_max - px, py - y_min, y_max - py)]
-    for part in (part for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
+    for obstacle, part in ((obstacle, part) for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
         vertices, rounding = part.rounded_polygon()
+        dx, dy = _displacement(obstacle.knots, q[-1, :])
         if is_disc or len(np.unique(vertices, axis=0)) > 1:
-            distances += [_polygon_distance(vertices, px, py) - rounding for px, py in points]
+            distances += [_polygon_distance(vertices, px - dx, py - dy) - rounding for px, py in points]
         if not is_disc:
             for vx, vy in np.unique(vertices, axis=0).tolist():
-                ahead, left = (vx - x) * cos + (vy - y) * sin, (vy - y) * cos - (vx - x) * sin
+                ahead = (vx + dx - x) * cos + (vy + dy - y) * sin
+                left = (vy + dy - y) * cos - (vx + dx - x) * sin
                 distances.append(_rectangle_distance(ahead, left, rear, front, half_width) - rounding)
     return sum(_barrier((distance - radius) / scenario.cost.proximity_scale) for distance in distances)
+
+
+def _displacement(knots: np.ndarray, time: Any) -> tuple[Any, Any]:
+    """The displacement (x, y) of an obstacle with knots (K, 5): a sum of ramps, one for each change of the velocity."""
+    changes = np.diff(knots[:, 3:], axis=0, prepend=0.0)
+    ramps = [casadi.fmax(time - start, 0) for start in knots[:, 0].tolist()]
+    dx, dy = (sum(change * ramp for change, ramp in zip(changes[:, i].tolist(), ramps, strict=True)) for i in (0, 1))
+    return dx, dy
 
 
 def _rectangle_distance(ahead: Any, left: Any, rear: float, front: float, half_width: float) -> Any:

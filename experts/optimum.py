@@ -342,6 +342,21 @@ def _search_in_time(
     scenario: Scenario, problem: OptimalControlProblem, effort: Effort, sharpness: float = 1.0
 ) -> tuple[LocalOptima | None, Status | None]:
     """Search paths over position and time among moving obstacles; returns the same as `_search`."""
+    optima, searches = time_searches(scenario, problem, ALTERNATIVES_BUDGET if effort == "high" else 0.0, sharpness)
+    for search in searches:
+        optima.add(search.candidates())
+    return (optima, None) if searches else (None, Status.NO_PATH)
+
+
+def time_searches(
+    scenario: Scenario, problem: OptimalControlProblem, budget: float = math.inf, sharpness: float = 1.0
+) -> tuple[LocalOptima, list[SpaceTimeSearch]]:
+    """Return an empty collection of local optima, and searches over position and time, one for each horizon tried.
+
+    Args:
+        scenario, problem, budget, sharpness: see `LocalOptima`.
+
+    """
     horizons = [problem.horizon]
     if problem.horizon is None:
         duration = max(math.dist(scenario.start[:2], scenario.goal[:2]) / scenario.cruise_speed, SHORTEST)
@@ -350,13 +365,8 @@ def _search_in_time(
     field = with_weight(problem.field, problem.proximity_weight)
     searches = [SpaceTimeSearch(scenario, field, horizon) for horizon in horizons if horizon is not None]
     searches = [search for search in searches if search.cheapest < math.inf]
-    if not searches:
-        return None, Status.NO_PATH
-    energy = min(search.cheapest / search.horizon for search in searches)
-    optima = LocalOptima(scenario, problem, energy, ALTERNATIVES_BUDGET if effort == "high" else 0.0, sharpness)
-    for search in searches:
-        optima.add(search.candidates())
-    return optima, None
+    energy = min((search.cheapest / search.horizon for search in searches), default=0.0)
+    return LocalOptima(scenario, problem, energy, budget, sharpness), searches
 
 
 def _lattices(scenario: Scenario, effort: Effort) -> Iterator[tuple[Callable[[], Lattice], bool]]:

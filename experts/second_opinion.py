@@ -13,12 +13,11 @@ import numpy as np
 from joblib import delayed
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.faults import check_at_rest
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.hard_limits import follow_best
-from leapnav.experts.optimum import find_optimum
+from leapnav.experts.optimum import find_optimum, time_searches
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch, first_energy
@@ -29,6 +28,7 @@ from leapnav.experts.solvers.initial_paths import local_minima
 
 # Refinement, maximum cost relative to the first candidate, and number of candidates of the lattices.
 LATTICES = ((1, 1.6, 80), (2, 1.4, 80))
+SPACE_TIME = 80, 160  # among moving obstacles, path classes and candidates
 N_VIA_POINTS, VIA_REACH = 100, 4.0  # number of points, maximum cost relative to the first candidate
 N_STEERED = 40  # paths along the positions of others, with random headings: all driving modes
 N_CONTROL_STARTS, CONTROL_INTERVALS = 16, 64
@@ -81,12 +81,10 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
     if cost is None:
         optimum = find_optimum(scenario)
         cost = optimum.cost if optimum.success else math.inf
-    check_at_rest(scenario.moves, "a second opinion")
     problem = OptimalControlProblem.from_scenario(scenario)
     rng = np.random.default_rng(seed)
     best, source, tried = cost, None, 0
-    first = Lattice(scenario)
-    search = LocalOptima(scenario, problem, first_energy(first))
+    search, paths, via = _lattice_paths(scenario, problem, rng)
 
     def record(source_name: str, count: int) -> None:
         nonlocal best, source, tried
@@ -96,23 +94,14 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
             if found.success and found.cost < best:
                 best, source = found.cost, source_name
 
-    paths: list[Trajectory] = []
-    for refinement, reach, count in LATTICES:
-        lattice = first if refinement == 1 else Lattice(scenario, refinement)
-        found = CandidateSearch(lattice.with_weight(search.problem.proximity_weight), reach).candidates()
-        paths += [Trajectory(candidate.times, candidate.poses) for candidate in islice(found, count)]
     search.add(paths)
     record("lattice", len(paths))
     if not paths:
         return Opinion(scenario.name, cost, best, None, 0, 0)
-    through = CandidateSearch(first.with_weight(search.problem.proximity_weight), VIA_REACH).random_candidates(
-        N_VIA_POINTS, rng
-    )
-    via = [Trajectory(candidate.times, candidate.poses) for candidate in through]
     search.add(via)
     record("via points", len(via))
     tracks = [*paths[:: max(1, len(paths) // N_STEERED)], *via]
-    steered = [_steered(tracks[k], rng) for k in rng.integers(len(tracks), size=N_STEERED)]
+    steered = [_steered(tracks[k], rng, keep_times=scenario.moves) for k in rng.integers(len(tracks), size=N_STEERED)]
     search.add(steered)
     record("driving modes", len(steered))
     timed = search.problem.with_horizon(problem.horizon_of(paths[0]))
@@ -124,6 +113,26 @@ def second_opinion(scenario: Scenario, cost: float | None = None, seed: int = 0)
         record("IPOPT", count)
     doubts = search.doubts(search.best.cost) if search.certified else ()
     return Opinion(scenario.name, cost, best, source, tried, len(doubts))
+
+
+def _lattice_paths(
+    scenario: Scenario, problem: OptimalControlProblem, rng: np.random.Generator
+) -> tuple[LocalOptima, list[Trajectory], list[Trajectory]]:
+    """Return an empty search, the candidates of fine lattices, and paths through random points."""
+    if scenario.moves:
+        search, lattices = time_searches(scenario, problem)
+        paths = [path for lattice in lattices for path in lattice.candidates(*SPACE_TIME)]
+        via = [path for lattice in lattices for path in lattice.random_candidates(N_VIA_POINTS, VIA_REACH, rng)]
+        return search, paths, via
+    first = Lattice(scenario)
+    search = LocalOptima(scenario, problem, first_energy(first))
+    weight, found = search.problem.proximity_weight, []
+    for refinement, reach, count in LATTICES:
+        lattice = first if refinement == 1 else Lattice(scenario, refinement)
+        found += islice(CandidateSearch(lattice.with_weight(weight), reach).candidates(), count)
+    through = CandidateSearch(first.with_weight(weight), VIA_REACH).random_candidates(N_VIA_POINTS, rng) if found else ()
+    paths, via = ([Trajectory(one.times, one.poses) for one in candidates] for candidates in (found, through))
+    return search, paths, via
 
 
 def verify_bank(
@@ -158,10 +167,13 @@ def verify_bank(
     return opinions
 
 
-def _steered(track: Trajectory, rng: np.random.Generator) -> Trajectory:
-    """A path along the positions of another, with random driving modes, up to two cusps and a random winding."""
+def _steered(track: Trajectory, rng: np.random.Generator, keep_times: bool) -> Trajectory:
+    """A path along the positions of another, with random driving modes, up to two cusps and a random winding.
+
+    It has a constant speed unless it keeps the times.
+    """
     distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track.states[:, :2], axis=0).T))])
-    fraction = distance / max(distance[-1], 1e-9)
+    fraction = track.times / track.times[-1] if keep_times else distance / max(distance[-1], 1e-9)
     even = np.linspace(0.0, 1.0, len(fraction))
     x, y = (np.interp(even, fraction, column) for column in track.states[:, :2].T)
     tangent = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))

@@ -94,7 +94,7 @@ class Feedback:
         self._next_search = 0.0  # s; earliest time of the next search
         self._n, self._m = scenario.robot.sizes()
         problem = OptimalControlProblem.from_scenario(scenario)
-        self._timed = problem.system.clock is not None
+        self._timed = problem.clock >= 0
         path = path if isinstance(path, Extremal) else with_clock(problem, path)
         found = _solve_along(reference_problem(problem, path), path, 0.0)
         if found is None:

@@ -12,7 +12,12 @@ from scipy.integrate import solve_ivp
 from leapnav.envs.utils.validation import as_matrix, as_vector
 from leapnav.experts.numerics.integrator import DENSE_TERMS
 from leapnav.experts.numerics.state_bounds import state_margin
-from leapnav.experts.problem.conjugate_points import conjugate_time, first_even_conjugate_time, first_focal_time
+from leapnav.experts.problem.conjugate_points import (
+    conjugate_time,
+    first_even_conjugate_time,
+    first_focal_time,
+    smallest_singular_value,
+)
 from leapnav.experts.problem.extremal import Certificate, Extremal, Iteration, Status
 from leapnav.experts.problem.frames import MIN_DETERMINANT
 from leapnav.experts.problem.problem import OptimalControlProblem
@@ -64,7 +69,7 @@ def certify(
     while True:
         out, terms = np.empty((capacity, 4 + m + 4 * n)), np.empty((capacity, DENSE_TERMS, 2 * n + 1))
         record = TraceRecord(out, terms, sensitivity, final)
-        n_rows, defect, conjugate_step = trace(arrays.flow, arrays.control, times, nodes, accuracy, record)
+        n_rows, defect, conjugate_step = trace(arrays.flow, arrays.control, times, nodes, problem.clock, accuracy, record)
         if n_rows != FULL or capacity > MAX_ROWS:
             break
         capacity *= 4
@@ -90,8 +95,10 @@ def certify(
         n_nodes=len(times),
         n_evaluations=evaluations,
     )
+    # The time is free at the end, but no control changes it.
+    has_free_end = arrays.free.sum() > (problem.clock >= 0)
     try:
-        if arrays.free.any():
+        if has_free_end:
             conjugate_point = first_focal_time(extremal, arrays.free)
         else:
             conjugate_point = first_even_conjugate_time(extremal, out[:, -1])
@@ -124,7 +131,7 @@ def certify(
         time_curvature=curvature,
         horizon_error=horizon_error,
         state_margin=margin,
-        controllability=None if arrays.free.any() or at_bounds else _controllability(extremal, final),
+        controllability=None if has_free_end or at_bounds else _controllability(extremal, final),
     )
     status = certificate.status() if converged is Status.SUCCESS else converged
     if clearance is not None and clearance <= 0:  # an extremal has positive clearance; the path explains the failure
@@ -147,7 +154,8 @@ def _saturates(controls: np.ndarray, bounds: Sequence[tuple[float, float]]) -> b
 
 def _controllability(extremal: Extremal, frame: np.ndarray) -> float:
     """Return the larger of the smallest singular values at the final time and, if that is small, at half of it."""
-    largest = _smallest_singular_value(frame)
+    clock = extremal.problem.clock
+    largest = _smallest_singular_value(frame, clock)
     if not largest > Certificate.MIN_CONTROLLABILITY:
         arrays, (size, n) = extremal.problem.arrays, frame.shape
         times = np.array([0.0, 0.5 * extremal.times[-1]])
@@ -155,16 +163,16 @@ def _controllability(extremal: Extremal, frame: np.ndarray) -> float:
         terms = np.empty((len(rows), DENSE_TERMS, size + 1))
         middle = np.empty((size, n))
         record = TraceRecord(rows, terms, np.empty((size, n)), middle)
-        trace(arrays.flow, arrays.control, times, extremal.interpolate(times), ACCURACY, record)
-        largest = max(largest, _smallest_singular_value(middle))
+        trace(arrays.flow, arrays.control, times, extremal.interpolate(times), clock, ACCURACY, record)
+        largest = max(largest, _smallest_singular_value(middle, clock))
     return largest
 
 
-def _smallest_singular_value(frame: np.ndarray) -> float:
+def _smallest_singular_value(frame: np.ndarray, clock: int) -> float:
     """Return that of the upper half of an orthonormal basis of the columns (2n, n); NaN if these have diverged."""
     if not np.isfinite(frame).all():
         return math.nan
-    return float(np.linalg.svd(np.linalg.qr(frame).Q[: frame.shape[1]], compute_uv=False)[-1])
+    return smallest_singular_value(np.linalg.qr(frame).Q, clock)
 
 
 def _time_curvature(frame: np.ndarray, rates: np.ndarray, free: np.ndarray) -> float:

@@ -24,7 +24,7 @@ def with_clock(problem: OptimalControlProblem, path: Trajectory) -> Trajectory:
 
     """
     n = problem.system.n
-    if problem.system.clock is None or np.ndim(path.states) != 2 or path.states.shape[1] != n - 1:
+    if problem.clock < 0 or np.ndim(path.states) != 2 or path.states.shape[1] != n - 1:
         return path
     times = as_vector("times", path.times)
     states = np.column_stack([as_matrix("states", path.states, len(times), n - 1), problem.start[-1] + times])
@@ -48,7 +48,7 @@ def started_at(
         field: the packed field of the episode.
 
     """
-    if problem.system.clock is None:
+    if problem.clock < 0:
         return problem, path
     states = path.states.copy()
     states[:, -1] += time

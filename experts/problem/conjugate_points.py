@@ -55,7 +55,7 @@ def conjugate_time(extremal: Extremal, k: int, sensitivity: np.ndarray) -> float
         S = sensitivity.copy()
         if duration > 0.0:
             _transport(extremal, z, S, duration)
-        return orthonormalise(S)
+        return orthonormalise(S, extremal.problem.clock)
 
     step = float(extremal.times[k + 1] - extremal.times[k])
     time = float(extremal.times[k]) + _zero(determinant, step)
@@ -72,7 +72,7 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
     """
     if not _dips(extremal.times, determinants, check_parabola=True):
         return None
-    n = extremal.problem.system.n
+    n, clock = extremal.problem.system.n, extremal.problem.clock
     z = np.concatenate([extremal.states, extremal.costates], axis=1)
     S = np.concatenate([np.zeros((n, n)), np.eye(n)])
     frames = [S.copy()]
@@ -81,7 +81,7 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
         S, duration = S.copy(), time - float(extremal.times[k])
         if duration > 0.0:
             _transport(extremal, z[k].copy(), S, duration)
-            orthonormalise(S)
+            orthonormalise(S, clock)
         return S
 
     for k in range(len(z) - 1):
@@ -91,7 +91,7 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
         k = min(int(np.searchsorted(extremal.times, time, side="right")) - 1, len(frames) - 1)
         return advance(k, frames[k], time)
 
-    return _first_rank_loss(extremal.times, determinants, frame, check_parabola=True)
+    return _first_rank_loss(extremal.times, determinants, frame, clock=clock, check_parabola=True)
 
 
 def _transport(extremal: Extremal, z: np.ndarray, S: np.ndarray, duration: float) -> None:
@@ -122,26 +122,33 @@ def _dips(times: np.ndarray, determinants: np.ndarray, check_parabola: bool) -> 
 
 
 def _first_rank_loss(
-    times: np.ndarray, determinants: np.ndarray, frame: Callable[[float], np.ndarray], check_parabola: bool
+    times: np.ndarray,
+    determinants: np.ndarray,
+    frame: Callable[[float], np.ndarray],
+    *,
+    clock: int,
+    check_parabola: bool,
 ) -> float | None:
     """Return the first time, in the order of `times`, at which the upper block of the frame loses rank, or None."""
     for i in _dips(times, determinants, check_parabola):
         low, high = sorted((float(times[i - 1]), float(times[i + 1])))
         found: Any = minimize_scalar(
-            lambda t: _smallest_singular_value(frame(t)),
+            lambda t: smallest_singular_value(frame(t), clock),
             bounds=(low, high),
             method="bounded",
             options={"xatol": 1e-9 * (high - low)},
         )
-        around = max(_smallest_singular_value(frame(t)) for t in (low, high))
+        around = max(smallest_singular_value(frame(t), clock) for t in (low, high))
         if found.fun < min(ZERO_SINGULAR_VALUE, ZERO_FRACTION * around):
             return float(found.x)
     return None
 
 
-def _smallest_singular_value(frame: np.ndarray) -> float:
-    """Return the smallest singular value of the upper block of a frame (2n, n)."""
-    return float(np.linalg.svd(frame[: frame.shape[1]], compute_uv=False)[-1])
+def smallest_singular_value(frame: np.ndarray, clock: int) -> float:
+    """Return the smallest singular value of the upper block of a frame (2n, n); see `orthonormalise` for `clock`."""
+    n = frame.shape[1]
+    rows = np.arange(n) + np.where(np.arange(n) == clock, n, 0)
+    return float(np.linalg.svd(frame[rows], compute_uv=False)[-1])
 
 
 def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
@@ -173,7 +180,7 @@ def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
             z, S = extremal.interpolate(np.array([time]))[0], np.eye(2 * n)
             _transport(extremal, z, S, duration)
             pull_back(S, basis)
-        return basis, orthonormalise(basis)
+        return basis, orthonormalise(basis, -1)
 
     crossing = None
     if step >= 0:
@@ -184,7 +191,7 @@ def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
     def frame(time: float) -> np.ndarray:
         return back(max(int(np.searchsorted(-times, -time, side="left")) - 1, 0), time)[0]
 
-    even = _first_rank_loss(times, determinants, frame, check_parabola=False)
+    even = _first_rank_loss(times, determinants, frame, clock=-1, check_parabola=False)
     return max((t for t in (even, crossing) if t is not None), default=None)
 
 

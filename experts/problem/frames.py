@@ -18,9 +18,12 @@ MIN_DETERMINANT = 1e-9  # below this, rounding decides the sign of a determinant
 NO_CHANGE, DIVERGED = -1, -2  # results of `carry_back` other than the index of a step
 
 
-@kernel(float64(MATRIX))
-def orthonormalise(S):
-    """Orthonormalise the columns of S (2n, n) by modified Gram-Schmidt; return the determinant of the upper block."""
+@kernel(float64(MATRIX, int64))
+def orthonormalise(S, clock):
+    """Orthonormalise the columns of S (2n, n) by modified Gram-Schmidt; return the determinant of the upper block.
+
+    In the row `clock` of the block, that of a state which no control changes, is that of its costate; -1 for no state.
+    """
     size, n = S.shape
     for j in range(n):
         for i in range(j):
@@ -38,7 +41,7 @@ def orthonormalise(S):
     block = np.empty((n, n))
     for i in range(n):
         for j in range(n):
-            block[i, j] = S[i, j]
+            block[i, j] = S[n + i if i == clock else i, j]
     determinant = eliminate(block, True, 0.0)
     for k in range(n):
         determinant *= block[k, k]
@@ -88,7 +91,7 @@ def carry_back(flow, times, z, frames, determinants):
             for j in range(frames.shape[2]):
                 frames[k + 1, i, j] = frames[k, i, j]
         pull_back(S, frames[k + 1])
-        determinants[k + 1] = orthonormalise(frames[k + 1])
+        determinants[k + 1] = orthonormalise(frames[k + 1], -1)
         if abs(determinants[k + 1]) > MIN_DETERMINANT:
             if sign * determinants[k + 1] < 0.0:
                 return k

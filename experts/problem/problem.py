@@ -222,6 +222,11 @@ class OptimalControlProblem:
         return tuple(i for i in at if self.state_bounds is None or self.state_bounds[i] is None)
 
     @property
+    def clock(self) -> int:
+        """Index of the time in the state; -1 if it is no state."""
+        return -1 if self.system.clock is None else self.system.state.index(self.system.clock)
+
+    @property
     def starts_at_goal(self) -> bool:
         """Whether the start is the goal, up to multiples of 2 pi of the angles."""
         goal = self.wound_goal(np.array([self.start], dtype=float))

@@ -55,9 +55,11 @@ class TraceRecord(NamedTuple):
 TRACE_RECORD = record_type(TraceRecord, rows=MATRIX, terms=CUBE, sensitivity=MATRIX, final=MATRIX)
 
 
-@kernel(tuple_of(int64, float64, int64)(FLOW, CONTROL_FUNCTION, VECTOR, MATRIX, float64, TRACE_RECORD))
-def trace(flow, control, times, Z, accuracy, record):
+@kernel(tuple_of(int64, float64, int64)(FLOW, CONTROL_FUNCTION, VECTOR, MATRIX, int64, float64, TRACE_RECORD))
+def trace(flow, control, times, Z, clock, accuracy, record):
     """Integrate each segment from its node and record every accepted step.
+
+    The index `clock` is that of the time in the state, -1 without it, see `orthonormalise`.
 
     Returns (n_rows, defect, conjugate): the number of rows, FULL if the record is too short or DIVERGED; the largest
     defect at a node; the index of the step with the first conjugate point, or -1.
@@ -135,7 +137,7 @@ def trace(flow, control, times, Z, accuracy, record):
                     return DIVERGED, np.inf, conjugate
             # Only the span of S matters. Gram-Schmidt keeps it numerically independent over any horizon, and its
             # positive scaling leaves the sign of det dq/dlambda(0) unchanged.
-            determinant = orthonormalise(matrix_of(y, size, size, n))
+            determinant = orthonormalise(matrix_of(y, size, size, n), clock)
             # Orthonormalisation changed S, so the last stage of the step cannot serve as the first of the next one.
             evaluate_stage(flow, y, stages, 0, size)
             crosses = gap > 0.0 and not crosses

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -13,14 +12,13 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.experts.spacetime.lattice import grid_of, sample_layers, spread
 
-MAX_CLASSES = 8  # path classes of which the cheapest path is a candidate
+# Largest number of path classes, and of candidates. Of 50 scenarios each of `crossing`, `traffic` and `crowd`, 3 optima are
+# missed, compared with 300 candidates; with 24 candidates 4, and with the same 8 driving modes of each of 4 classes 7.
+MAX_CLASSES, MAX_CANDIDATES = 16, 32
 MAX_EXCESS = 1.0  # relative to the cheapest path, of a class
 SLOW = 0.2  # fraction of the mean speed below which a path has no direction
 CUSPS = 0.15, 0.5, 0.85  # fractions of the path at which the driving direction may change
 BOTH_SIDES = math.pi / 2  # rad, of a turn above which the turn to the other side is considered, too
-# Driving modes of a path, and the turns (rad) that they have more than the best one. Of 50 static scenarios each, 1, 1
-# and 2 optima of `open`, `clutter` and `polygons` are missed; with 0.7 pi, 5, 6 and 5.
-MAX_MODES, MAX_TURN = 6, math.pi
 OFFSET = 1e-6  # cells
 
 
@@ -64,17 +62,45 @@ class SpaceTimeSearch:
         self._totals = self._before + self._after - np.where(np.isfinite(costs), costs, 0.0)
         self._signatures = signed - unsigned
         self.cheapest = float(self._totals.min())
+        # At the mean power of the cheapest path, a turn of one radian takes this cost.
+        turn_weight = scenario.robot.metric(scenario.cost)[1]
+        self._turn_cost = math.sqrt(2.0 * turn_weight * self.cheapest / horizon) if self.cheapest < math.inf else 0.0
 
-    def candidates(self) -> Iterator[Trajectory]:
-        """Yield the cheapest path of each class in order of cost, in the best driving modes."""
+    def candidates(self, classes: int = MAX_CLASSES, count: int = MAX_CANDIDATES) -> list[Trajectory]:
+        """Return the paths that probably cost least: the cheapest one of each class in its driving modes.
+
+        Args:
+            classes: largest number of path classes.
+            count: largest number of paths.
+
+        """
         totals = self._totals
         order = np.argsort(totals, axis=None, kind="stable")
         flat, signatures = totals.ravel()[order], self._signatures.ravel()[order]
-        count = int(np.searchsorted(flat, self.cheapest * (1.0 + MAX_EXCESS)))
-        _, first = np.unique(signatures[:count], return_index=True)
-        for index in np.sort(first)[:MAX_CLASSES].tolist():
-            positions = self._positions(int(order[index]))
-            yield from self._lifted(positions)
+        end = int(np.searchsorted(flat, self.cheapest * (1.0 + MAX_EXCESS)))
+        _, first = np.unique(signatures[:end], return_index=True)
+        found: list[tuple[float, Trajectory]] = []
+        for index in np.sort(first)[:classes].tolist():
+            modes = self._lifted(self._positions(int(order[index])))
+            found += [(float(flat[index]) + self._turn_cost * turn, path) for turn, path in modes]
+        found.sort(key=lambda entry: entry[0])
+        return [path for _, path in found[:count]]
+
+    def random_candidates(self, count: int, reach: float, rng: np.random.Generator) -> list[Trajectory]:
+        """Return the cheapest paths through random cells, in random driving modes.
+
+        Args:
+            count: number of paths.
+            reach: largest cost of a path, relative to the cheapest one.
+            rng: generator of the cells and of the modes.
+
+        """
+        nodes = np.flatnonzero(self._totals <= reach * self.cheapest)
+        found = []
+        for node in rng.choice(nodes, count).tolist():
+            modes = self._lifted(self._positions(node))
+            found.append(modes[rng.integers(len(modes))][1])
+        return found
 
     def _positions(self, node: int) -> np.ndarray:
         """Return the positions (layers + 1, 2) (m) of the cheapest path through a cell of a layer."""
@@ -92,11 +118,11 @@ class SpaceTimeSearch:
             positions[1:-1] = 0.25 * positions[:-2] + 0.5 * positions[1:-1] + 0.25 * positions[2:]
         return positions
 
-    def _lifted(self, positions: np.ndarray) -> list[Trajectory]:
-        """Return the path in the best driving modes, as poses (N, 3).
+    def _lifted(self, positions: np.ndarray) -> list[tuple[float, Trajectory]]:
+        """Return the path in its driving modes, as poses (N, 3), each with the turns (rad) besides those of the path.
 
         The headings are along the path or against it, and change once at most. The robot turns at the start and at the
-        goal, to the one or to the other side. The modes with the smallest turns are the best.
+        goal, to the one or to the other side.
         """
         times = np.linspace(0.0, self.horizon, len(positions))
         rates = np.gradient(positions, times, axis=0)
@@ -105,7 +131,7 @@ class SpaceTimeSearch:
         start, goal = self._scenario.start[2], self._scenario.goal[2]
         if not moves.any():
             ends = np.linspace(start, start if goal is None else goal, len(times))
-            return [Trajectory(times, np.column_stack([positions, ends]))]
+            return [(0.0, Trajectory(times, np.column_stack([positions, ends])))]
         along = np.interp(times, times[moves], np.unwrap(np.arctan2(rates[moves, 1], rates[moves, 0])))
         fractions = np.cumsum(np.append(0.0, np.hypot(*np.diff(positions, axis=0).T)))
         fractions /= fractions[-1]
@@ -118,9 +144,9 @@ class SpaceTimeSearch:
                     poses = headings + (start + before - headings[0])
                     ends = np.concatenate([[start], poses[1:-1], [poses[-1] + after]])
                     states = np.column_stack([positions, ends])
-                    found.append((abs(before) + abs(after), Trajectory(times, states)))
-        found.sort(key=lambda entry: entry[0])
-        return [path for turns, path in found[:MAX_MODES] if turns <= found[0][0] + MAX_TURN]
+                    turn = abs(before) + abs(after) + abs(last - first)
+                    found.append((turn, Trajectory(times, states)))
+        return found
 
 
 def _turns(heading: float, other: float) -> list[float]:

@@ -23,7 +23,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 CELL = 0.25  # m, side of a cell, unless the arena is larger than MAX_CELLS cells
 MAX_CELLS = 64  # cells per side
 MIN_LAYERS, MAX_LAYERS = 40, 160
-MAX_SPEED_FACTOR = 4.0  # largest speed of a move, in units of that on the straight line
+MAX_SPEED_FACTOR = 4.0  # largest speed of a move, in units of the mean speed of a long path
 REACH = 3  # cells that a move at the largest speed is long, if the number of layers permits
 MAX_DEPTH = 0.5  # cells by which the centre of a cell may be too close to an obstacle
 # Factors of the crossings of an obstacle in a signature, so that different crossings have different sums.
@@ -60,7 +60,8 @@ def grid_of(scenario: Scenario, horizon: float) -> SpaceTimeGrid:
     columns, lines = (max(round((high - low) / cell), 1) for low, high in ((x_min, x_max), (y_min, y_max)))
     x0 = 0.5 * (x_min + x_max - (columns - 1) * cell)
     y0 = 0.5 * (y_min + y_max - (lines - 1) * cell)
-    mean = np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2])) / horizon
+    distance = np.hypot(*np.subtract(scenario.goal[:2], scenario.start[:2]))
+    mean = max(distance, 0.5 * (x_max - x_min + y_max - y_min)) / horizon  # the path may lead through several rooms
     fastest = min(scenario.robot.speed_limits()[0], MAX_SPEED_FACTOR * mean) * horizon / cell  # cells
     layers = int(np.clip(np.ceil(fastest / REACH), MIN_LAYERS, MAX_LAYERS))
     reach = min(max(int(np.ceil(fastest / layers)), 1), 2 * REACH)
