@@ -19,6 +19,7 @@ from numba import float32, float64, from_dtype
 
 from leapnav.envs.field.clearance import clearance
 from leapnav.envs.field.layout import header_of, read_header
+from leapnav.envs.field.packing import field_parts, replace_parts
 from leapnav.envs.field.proximity import proximity_value
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import records_of
@@ -45,6 +46,8 @@ MAP_ENTRIES = MAP_HEADER.itemsize // 4
 def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
     """Return the distances to a goal on a grid over the arena, as a packed map for the kernels of this module, float32.
 
+    Moving obstacles are left out: they may be elsewhere when the robot arrives.
+
     The most recently used maps are kept, so that the episodes of a scenario share one.
 
     Args:
@@ -52,6 +55,8 @@ def geodesic_map(field: np.ndarray, goal_x: float, goal_y: float) -> np.ndarray:
         goal_x, goal_y: position of the goal (m).
 
     """
+    if read_header(field)["moving"]:
+        field = replace_parts(field, [part for part in field_parts(field) if not len(part.knots)])
     return _solve(field.tobytes(), goal_x, goal_y)
 
 

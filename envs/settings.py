@@ -25,13 +25,14 @@ from leapnav.envs.utils.validation import (
 )
 
 OBSERVATIONS = "lidar", "state", "map", "geodesic"
+WITH_VELOCITIES = "map", "geodesic"  # observations that can contain the velocities of obstacles
 REWARDS, ACTUATIONS = ("cost", "shaped"), ("velocity", "motor")
 GOAL_REWARDS, HORIZONS = ("sparse", "cost"), ("fixed", "free")
 OBSTACLE_KINDS = "cost", "hard"  # see `Cost.obstacles`
 # Arguments that determine what is observed.
 SENSORS = (
     *("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices"),
-    *("history", "previous_action"),
+    *("velocities", "history", "previous_action"),
 )
 MIN_PERIOD = 1e-4  # s
 MAX_COUNT = 10_000  # beams, obstacles in the map, vertices of each, or control periods of the history
@@ -124,6 +125,7 @@ class EnvironmentSettings:
     lidar_range: float = 10.0
     map_obstacles: int = 8
     map_vertices: int = 8
+    velocities: bool = False
     history: tuple[float, ...] = ()
     previous_action: bool = False
     goal_conditioned: bool = False
@@ -142,8 +144,10 @@ class EnvironmentSettings:
         check_fraction("discount", self.discount, zero=False)
         for name, minimum in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
             check_integer(name, getattr(self, name), minimum, MAX_COUNT)
-        for name in ("terminate_on_collision", "dict_observation", "previous_action"):
+        for name in ("terminate_on_collision", "dict_observation", "previous_action", "velocities"):
             check_flag(name, getattr(self, name))
+        if self.velocities and self.observation not in WITH_VELOCITIES:
+            raise ValueError(f"velocities: expected False for the observation {self.observation!r}, got True")
         if self.motors and self.robot != "unicycle":
             raise ValueError(f"actuation: 'motor' needs the robot 'unicycle', got {self.robot!r}")
         if self.goal_conditioned and any(value is not None for value in self.model.goal_motion):
@@ -199,7 +203,8 @@ class EnvironmentSettings:
 
         Args:
             env: the environment, whose class is named in errors and has `_goal_conditioned`.
-            source: its `ScenarioSource`, which determines the robot and the kind of the horizon.
+            source: its `ScenarioSource`, which determines the robot and the kind of the horizon, and whether velocities
+                are observed unless they are given.
             arguments: the other arguments.
 
         Raises:
@@ -211,8 +216,11 @@ class EnvironmentSettings:
             if name not in ARGUMENTS:
                 near = suggestion(name, ARGUMENTS)
                 raise TypeError(f"{type(env).__name__}: unexpected argument {name!r}{near}")
+        given = dict(arguments)
+        if given.get("observation") in WITH_VELOCITIES:
+            given.setdefault("velocities", source.moves)
         kinds = {"robot": source.robot.model, "horizon": source.horizon}
-        return cls(**kinds, **arguments, goal_conditioned=env._goal_conditioned)
+        return cls(**kinds, **given, goal_conditioned=env._goal_conditioned)
 
     @property
     def model(self) -> type[RobotModel]:

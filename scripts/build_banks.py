@@ -24,6 +24,7 @@ from leapnav.envs import Scenario, ScenarioBank
 from leapnav.envs.scenarios.bank import collection_name
 from leapnav.envs.scenarios.bank_writing import add_datasets
 from leapnav.envs.scenarios.families import ALL_FAMILIES
+from leapnav.envs.scenarios.layouts.moving import MOVING_LAYOUTS
 from leapnav.experts import build_bank
 from leapnav.experts.data.bank_shortest import find_shortest
 
@@ -47,6 +48,9 @@ def build(directory: Path, workers: int) -> None:
     for family in LARGE_FAMILIES:
         for split, (_, seed) in SPLITS.items():
             build_bank(family, LARGE_COUNT, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
+    for family in MOVING_LAYOUTS:  # fixed horizon only
+        for split, (count, seed) in SPLITS.items():
+            build_bank(family, count, directory / f"{family}-{split}.bank", seed=seed, workers=workers)
     count, seed = SPLITS["test"]
     for family in HARD_FAMILIES:
         path = directory / f"{collection_name(family, obstacles='hard')}-test.bank"

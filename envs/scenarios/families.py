@@ -205,6 +205,11 @@ def is_built_in(family: str) -> bool:
     return family in FAMILIES
 
 
+def has_moving_obstacles(family: str) -> bool:
+    """Return whether a family is built in, and its obstacles move."""
+    return family in MOVING_LAYOUTS
+
+
 def families_of(family: str) -> tuple[str, ...]:
     """Return the families that a name stands for: several for "all"."""
     return ALL_FAMILIES if family == ALL else (family,)

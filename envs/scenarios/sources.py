@@ -14,7 +14,7 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
+from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, has_moving_obstacles, sample_scenario
 from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS, Disturbance, Motor
@@ -142,6 +142,16 @@ class ScenarioSource:
                 if kind not in (None, known):
                     raise ValueError(f"{name}: expected that of the {place}, {known!r}, got {kind!r}")
         self.horizon, self.obstacles = kinds or (horizon or "fixed", obstacles or "cost")
+
+    @property
+    def moves(self) -> bool:
+        """Whether obstacles move by themselves: those of the fixed scenario, of the bank's first one or of the family.
+
+        Of a family that is not built in it is not known, and False.
+        """
+        if self.scenario is not None:
+            return self.scenario.moves
+        return has_moving_obstacles(self.family) if self.bank is None else self.bank[0].moves
 
     def select(self, scenario: Any = None, index: Any = None) -> Scenario | int | None:
         """Return the scenario that the options of a reset select, or its index in the bank; None without a selection.

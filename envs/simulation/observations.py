@@ -16,7 +16,7 @@ from leapnav.envs.geodesics import MAX_DETOUR, geodesic_detours, geodesic_distan
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.sensing import map_surroundings, scan
+from leapnav.envs.simulation.sensing import beam_velocities, map_surroundings, scan
 from leapnav.envs.simulation.state import PACKED, Simulation, field_of, row_of
 from leapnav.envs.simulation.stepping import wrapped
 from leapnav.envs.utils.records import MAX_MAGNITUDE
@@ -88,6 +88,9 @@ def _parts(settings: EnvironmentSettings) -> Iterator[tuple[str, list[Entry]]]:
     if settings.observation == "geodesic":
         yield "detours", [Entry(f"detours[{k}], {at}", "m", 0.0, MAX_DETOUR) for k, at in enumerate(angles)]
         yield "distance", [Entry("distance", "m", 0.0, MAX_GEODESIC)]
+        if settings.velocities:
+            sides = ("ahead", "left")
+            yield "velocities", [Entry(f"velocities.{side}[{k}]", "m/s", *_RATE) for side in sides for k in range(beams)]
     elif settings.observation == "map":
         sides = [Entry(f"walls.{side}", *_DISTANCE) for side in ("left", "bottom", "right", "top")]
         yield "walls", [*sides, Entry("walls.cos_heading", *_COSINE), Entry("walls.sin_heading", *_COSINE)]
@@ -99,6 +102,9 @@ def _parts(settings: EnvironmentSettings) -> Iterator[tuple[str, list[Entry]]]:
                 name = f"obstacles[{k}].vertices[{vertex}]"
                 obstacles += [Entry(f"{name}.{side}", *_DISTANCE) for side in ("ahead", "left")]
         yield "obstacles", obstacles
+        if settings.velocities:
+            names = [f"velocities[{k}].{side}" for k in range(settings.map_obstacles) for side in ("ahead", "left")]
+            yield "velocities", [Entry(name, "m/s", *_RATE) for name in names]
 
 
 def observation_entries(settings: EnvironmentSettings) -> list[Entry]:
@@ -137,6 +143,11 @@ def parts_of(space: spaces.Box) -> dict[str, slice]:
         end += 1
     if end > first:
         parts["action"] = slice(first, end)
+    last = len(bounds)
+    while last > end and bounds[last - 1] == _RATE:
+        last -= 1
+    if last < len(bounds):
+        parts["velocities"], bounds = slice(last, len(bounds)), bounds[:last]
     beams = len(bounds) - end
     if bounds[-1:] == [(0.0, MAX_GEODESIC)]:
         middle = end + beams // 2
@@ -168,7 +179,7 @@ OFFSETS = np.dtype(
         (name, "i8")
         for name in (
             *("achieved_goal", "desired_goal", "time", "goal", "motion", "action"),
-            *("lidar", "detours", "distance", "walls", "obstacles"),
+            *("lidar", "detours", "distance", "walls", "obstacles", "velocities"),
         )
     ]
 )
@@ -374,7 +385,10 @@ def observe_robots(robots, packed, packed_buffers, out):
         if at.walls >= 0:
             surroundings = row[at.walls :]
             obstacles, vertices = settings.map_obstacles, settings.map_vertices
-            map_surroundings(x, y, heading, episode.time, field, obstacles, vertices, surroundings)
+            velocities = row[at.velocities :] if at.velocities >= 0 else row[:0]
+            map_surroundings(x, y, heading, episode.time, field, obstacles, vertices, surroundings, velocities)
+        elif at.velocities >= 0:
+            beam_velocities(sim.states[i], episode.time, field, beams, scratch, row[at.velocities :])
         for k in range(len(row)):
             value = np.float32(row[k])
             value = bounds[0, k] if value < bounds[0, k] else value

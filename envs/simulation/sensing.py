@@ -8,12 +8,13 @@ import numpy as np
 from numba import float64, int64, types
 
 from leapnav.envs.field.distance import part_geometry
-from leapnav.envs.field.layout import PART_TYPE, displacement_of, edges_of, header_of, parts_in
+from leapnav.envs.field.layout import PART_TYPE, displacement_of, edges_of, header_of, motion_of, parts_in
 from leapnav.envs.field.packing import field_parts
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
 
+ROUNDING = 1e-9  # m, of two computations of the same range
 WALL_ENTRIES = 6  # of a map, before the obstacles
 # Up to this number of beams it takes less time to intersect a circle with all of them, in vector instructions, than to
 # find those that may meet it.
@@ -158,6 +159,40 @@ def scan(x, y, heading, time, field, reach, beams, scratch):
         nearest[k] = hit if hit > 0.0 else 0.0
 
 
+@kernel(NOTHING(VECTOR, float64, CONSTANT, MATRIX, MATRIX, VECTOR))
+def beam_velocities(state, time, field, beams, scratch, out):
+    """Compute the velocity of the obstacle that each beam of a lidar meets, in the lidar's frame.
+
+    Args:
+        state: x, y (m) and heading (rad) of the lidar, and further entries.
+        time: of the episode (s).
+        field: the packed field of the scenario.
+        beams (2, n): see `scan`.
+        scratch (3, 2 n): the working memory after `scan`.
+        out (2 n or more,): overwritten by the components ahead of all beams, then those to the left (m/s); 0 where a
+            beam meets nothing that moves.
+
+    """
+    count, x, y, cos, sin = beams.shape[1], state[0], state[1], math.cos(state[2]), math.sin(state[2])
+    dxs, dys, ranges = scratch[0], scratch[1], scratch[2]
+    out[: 2 * count] = 0.0
+    header, parts = header_of(field), parts_in(field)
+    for number in range(header.parts - header.moving, header.parts):
+        part = parts[number]
+        moved_x, moved_y, vx, vy = motion_of(field, part, time)
+        px, py = x - moved_x, y - moved_y
+        cx, cy = part.x - px, part.y - py
+        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, part.rim, count)
+        for beam in range(first, last):
+            k = beam % count
+            if part.edges == 0:
+                hit = _range_to_circle(dxs[k], dys[k], cx, cy, part.rim)
+            else:
+                hit = _range_to_polygon(px, py, dxs[k], dys[k], field, part)
+            if hit <= ranges[k] + ROUNDING:
+                out[k], out[count + k] = cos * vx + sin * vy, cos * vy - sin * vx
+
+
 def check_map(field: np.ndarray, map_vertices: int) -> None:
     """Raise ValueError if an obstacle in the field has more vertices than each row of the map."""
     vertices = max((len(part.vertices) for part in field_parts(field)), default=0)
@@ -169,9 +204,9 @@ def check_map(field: np.ndarray, map_vertices: int) -> None:
 
 
 @kernel(
-    NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR),
+    NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR, VECTOR),
 )
-def map_surroundings(x, y, heading, time, field, obstacles, vertices, out):
+def map_surroundings(x, y, heading, time, field, obstacles, vertices, out, velocities):
     """Describe the walls and the nearest parts of obstacles in the robot's frame, in order of distance.
 
     Each part of an obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the
@@ -184,12 +219,16 @@ def map_surroundings(x, y, heading, time, field, obstacles, vertices, out):
         field: the packed field of the scenario.
         obstacles, vertices: number of rows, and of vertices in each.
         out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten.
+        velocities (2 obstacles or more,): overwritten by the velocities (m/s) of the parts, ahead and to the left; or
+            of length 0.
 
     """
     parts, arena, cos, sin = parts_in(field), header_of(field).arena, math.cos(heading), math.sin(heading)
     out[0], out[1], out[2], out[3] = x - arena[0], y - arena[1], arena[2] - x, arena[3] - y
     out[4], out[5] = cos, sin
     out[WALL_ENTRIES:] = 0.0
+    if len(velocities) > 0:
+        velocities[: 2 * obstacles] = 0.0
     # Insertion sort into a list of the nearest shapes.
     distances = np.full(obstacles, np.inf)
     numbers = np.zeros(obstacles, np.int64)
@@ -208,6 +247,9 @@ def map_surroundings(x, y, heading, time, field, obstacles, vertices, out):
         moved_x, moved_y = displacement_of(field, part, time)
         px, py = x - moved_x, y - moved_y
         edges = edges_of(field, part)
+        if len(velocities) > 0 and part.knots > 0:
+            _, _, vx, vy = motion_of(field, part, time)
+            velocities[2 * k], velocities[2 * k + 1] = cos * vx + sin * vy, cos * vy - sin * vx
         row = WALL_ENTRIES + k * (2 + 2 * vertices)
         out[row], out[row + 1] = 1.0, part.rounding
         for j in range(vertices):

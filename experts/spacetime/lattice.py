@@ -8,11 +8,13 @@ on which they pass each obstacle as it moves, which includes the order: before o
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64
 
+from leapnav.envs.field.barrier import CONTACT
 from leapnav.envs.field.clearance import obstacle_distance
 from leapnav.envs.field.layout import header_of
 from leapnav.envs.field.proximity import footprint_value
@@ -20,7 +22,9 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, NOTHING, VECTOR
 from leapnav.envs.scenarios.scenario import Scenario
 
-CELL = 0.25  # m, side of a cell, unless the arena is larger than MAX_CELLS cells
+# Side of a cell (m), unless the arena is larger than MAX_CELLS cells. In 140 scenarios of `crowd`, 1 optimum is missed,
+# compared with 400 candidates; with 0.25 m, 4, in 0.74 of the time.
+CELL = 1 / 6
 MAX_CELLS = 64  # cells per side
 MIN_LAYERS, MAX_LAYERS = 40, 160
 MAX_SPEED_FACTOR = 4.0  # largest speed of a move, in units of the mean speed of a long path
@@ -81,15 +85,16 @@ def sample_layers(field, outline, places, costs):
     """
     q = np.zeros(max(header_of(field).clock + 1, 3))
     cell, step, radius = places[2], places[3], places[4]
+    touching = step * header_of(field).weight / math.expm1(CONTACT)  # at least, in contact
     for k in range(costs.shape[0]):
         q[len(q) - 1] = k * step
         for i in range(costs.shape[1]):
             for j in range(costs.shape[2]):
                 q[0], q[1] = places[0] + i * cell, places[1] + j * cell
-                distance = obstacle_distance(q[0], q[1], k * step, field)[0] - radius
-                costs[k, i, j] = np.inf
-                if distance > -MAX_DEPTH * cell:
-                    costs[k, i, j] = step * footprint_value(q, outline, field)
+                cost = step * footprint_value(q, outline, field)
+                if cost >= touching and obstacle_distance(q[0], q[1], k * step, field)[0] < radius - MAX_DEPTH * cell:
+                    cost = np.inf
+                costs[k, i, j] = cost
 
 
 @kernel(int64(float64, float64, float64, float64), inline="always")

@@ -97,6 +97,10 @@ def _transformed(
     moved: Callable[[th.Tensor], th.Tensor],
 ) -> tuple[th.Tensor, th.Tensor]:
     """Return observations with other signs of goal and motion and moved values of the beams, and the actions."""
+    def velocities(values: th.Tensor) -> th.Tensor:
+        ahead, left = (moved(half) for half in values.chunk(2, dim=1))  # the velocity of what each beam meets
+        return th.cat([float(signs[0]) * ahead, float(signs[1]) * left], dim=1)
+
     matrix = th.tensor(symmetry.controls, dtype=actions.dtype, device=actions.device)
     changes: dict[str, Callable[[th.Tensor], th.Tensor]] = {
         "goal": lambda values: values * signs[: values.shape[1]].to(values),
@@ -105,6 +109,7 @@ def _transformed(
         "lidar": moved,
         "detours": moved,
         "distance": lambda values: values,
+        "velocities": velocities,
     }
     layout = _layout(settings)
     frames = observations.reshape(-1, layout.frame)  # those of the history are transformed like the current one

@@ -140,6 +140,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         if description["kind"] not in KINDS:
             raise ValueError(f"{path}: kind: expected one of {', '.join(KINDS)}, got {description['kind']!r}")
         description["environment"]["history"] = tuple(description["environment"]["history"])
+        description["environment"].setdefault("velocities", False)  # of a policy that is older than the setting
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
     return description

@@ -53,6 +53,9 @@ class NavigationFeatures(BaseFeaturesExtractor):
             features += self.DISTANCE_FEATURES if self._is_timed else self.FREE_DISTANCE_FEATURES
             beams *= 2  # the detours
         features += self.BEAM_FEATURES * beams
+        self._velocities = parts.get("velocities")
+        if self._velocities is not None:
+            features += self._velocities.stop - self._velocities.start
         self._frames = observation_space.shape[0] // frame_size(observation_space)
         super().__init__(observation_space, self._frames * features + (self._frames - 1) * self.DISPLACEMENT_FEATURES)
 
@@ -80,6 +83,8 @@ class NavigationFeatures(BaseFeaturesExtractor):
         if self._detours is not None and self._distance is not None:
             parts += _detour_features(observations[:, self._detours])
             parts += self._distance_features(observations, observations[:, self._distance])
+        if self._velocities is not None:
+            parts.append(observations[:, self._velocities])
         return th.cat(parts, dim=1)
 
     def _distance_features(self, observations: th.Tensor, distance: th.Tensor) -> list[th.Tensor]:
