@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from leapnav.envs.field.packing import obstacle_centres
+from leapnav.envs.field.packing import field_parts, obstacle_centres, replace_parts
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.experts.spacetime.lattice import grid_of, sample_layers, spread
@@ -44,7 +44,9 @@ class SpaceTimeSearch:
         self._grid = grid = grid_of(scenario, horizon)
         costs = np.empty((grid.layers + 1, grid.columns, grid.lines))
         radius = float(scenario.outline[:, 2:4].sum(axis=1).min())
-        sample_layers(field, scenario.outline, np.array([grid.x0, grid.y0, grid.cell, grid.step, radius]), costs)
+        at_rest = replace_parts(field, [part for part in field_parts(field) if not len(part.knots)])
+        places = np.array([grid.x0, grid.y0, grid.cell, grid.step, radius])
+        sample_layers(field, at_rest, scenario.outline, places, costs)
         speed_weight = scenario.robot.metric(scenario.cost)[0]
         weight = 0.5 * speed_weight * grid.cell**2 / grid.step
         times = grid.step * np.arange(grid.layers + 1)
@@ -55,10 +57,10 @@ class SpaceTimeSearch:
         for pose, order in ((scenario.start, 1), (scenario.goal, -1)):
             cell = [round((pose[0] - grid.x0) / grid.cell), round((pose[1] - grid.y0) / grid.cell)]
             cell = np.clip(cell, 0, [grid.columns - 1, grid.lines - 1]).tolist()
-            layers, places = np.ascontiguousarray(costs[::order]), np.ascontiguousarray(centres[::order])
+            layers, ordered = np.ascontiguousarray(costs[::order]), np.ascontiguousarray(centres[::order])
             values, parents = np.empty_like(costs), np.empty(costs.size, np.int64)
             signatures = np.empty(costs.size, np.int64)
-            spread(layers, np.array([*cell, grid.reach]), weight, values, parents, places, signatures)
+            spread(layers, np.array([*cell, grid.reach]), weight, values, parents, ordered, signatures)
             shape = costs.shape
             found.append([array.reshape(shape)[::order] for array in (values, parents, signatures)])
         (self._before, self._parents, signed), (self._after, self._children, unsigned) = found

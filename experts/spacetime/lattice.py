@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import float64, int64
 
-from leapnav.envs.field.barrier import CONTACT
+from leapnav.envs.field.barrier import CONTACT, barrier
 from leapnav.envs.field.clearance import obstacle_distance
-from leapnav.envs.field.layout import header_of
+from leapnav.envs.field.distance import part_geometry
+from leapnav.envs.field.layout import displacement_of, header_of, parts_in
 from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, CUBE, INTEGERS, MATRIX, NOTHING, VECTOR
@@ -29,6 +30,7 @@ MAX_CELLS = 64  # cells per side
 MIN_LAYERS, MAX_LAYERS = 40, 160
 MAX_SPEED_FACTOR = 4.0  # largest speed of a move, in units of the mean speed of a long path
 REACH = 3  # cells that a move at the largest speed is long, if the number of layers permits
+NEAR = 10.0  # scales; a moving obstacle costs nothing at a larger distance
 MAX_DEPTH = 0.5  # cells by which the centre of a cell may be too close to an obstacle
 # Factors of the crossings of an obstacle in a signature, so that different crossings have different sums.
 SQUARE, LINEAR = 1 << 20, 7919
@@ -72,29 +74,53 @@ def grid_of(scenario: Scenario, horizon: float) -> SpaceTimeGrid:
     return SpaceTimeGrid(x0, y0, cell, columns, lines, horizon / layers, layers, reach)
 
 
-@kernel(NOTHING(CONSTANT, CONSTANT_MATRIX, VECTOR, CUBE))
-def sample_layers(field, outline, places, costs):
+@kernel(NOTHING(CONSTANT, CONSTANT, CONSTANT_MATRIX, VECTOR, CUBE))
+def sample_layers(field, at_rest, outline, places, costs):
     """Fill costs (layers + 1, columns, lines) with the proximity cost of a step; infinite in obstacles.
 
     Args:
         field: packed obstacle field.
-        outline (K, 5): of the robot, with its heading at 0.
+        at_rest: the same without moving parts.
+        outline (K, 5): of the robot, with its heading at 0. Its rectangles are discs for moving parts.
         places (5,): x0, y0, cell (m), step (s), and the robot's radius (m).
         costs: overwritten.
 
     """
-    q = np.zeros(max(header_of(field).clock + 1, 3))
-    cell, step, radius = places[2], places[3], places[4]
-    touching = step * header_of(field).weight / math.expm1(CONTACT)  # at least, in contact
-    for k in range(costs.shape[0]):
-        q[len(q) - 1] = k * step
-        for i in range(costs.shape[1]):
-            for j in range(costs.shape[2]):
-                q[0], q[1] = places[0] + i * cell, places[1] + j * cell
-                cost = step * footprint_value(q, outline, field)
-                if cost >= touching and obstacle_distance(q[0], q[1], k * step, field)[0] < radius - MAX_DEPTH * cell:
-                    cost = np.inf
-                costs[k, i, j] = cost
+    header, parts = header_of(field), parts_in(field)
+    x0, y0, cell, step, radius = places[0], places[1], places[2], places[3], places[4]
+    deepest = radius - MAX_DEPTH * cell
+    touching = header.weight / math.expm1(CONTACT)  # at least, in contact
+    layers, columns, lines = costs.shape
+    q = np.zeros(3)
+    for i in range(columns):
+        for j in range(lines):
+            q[0], q[1] = x0 + i * cell, y0 + j * cell
+            cost = footprint_value(q, outline, at_rest)
+            if cost >= touching and obstacle_distance(q[0], q[1], 0.0, at_rest)[0] < deepest:
+                cost = np.inf
+            costs[0, i, j] = step * cost
+    for k in range(1, layers):
+        costs[k] = costs[0]
+    for number in range(header.parts - header.moving, header.parts):
+        part = parts[number]
+        reach = part.rim + header.extent + header.radius + NEAR * header.scale
+        for k in range(layers):
+            moved_x, moved_y = displacement_of(field, part, k * step)
+            middle_x, middle_y = (part.x + moved_x - x0) / cell, (part.y + moved_y - y0) / cell
+            # Limited before the conversion to integers, since an obstacle may be anywhere.
+            left, right = max(middle_x - reach / cell, 0.0), min(middle_x + reach / cell + 1.0, float(columns))
+            low, high = max(middle_y - reach / cell, 0.0), min(middle_y + reach / cell + 1.0, float(lines))
+            for i in range(int(left), int(max(right, 0.0))):
+                for j in range(int(low), int(max(high, 0.0))):
+                    x, y = x0 + i * cell - moved_x, y0 + j * cell - moved_y
+                    if part_geometry(x, y, 0.0, field, part)[0] < deepest:
+                        costs[k, i, j] = np.inf
+                    for row in range(len(outline)):
+                        middle = (outline[row, 0] + outline[row, 1]) / 2.0
+                        rim = outline[row, 2] + outline[row, 3]
+                        distance = part_geometry(x + middle, y, rim, field, part)[0]
+                        value = barrier(distance / header.scale, header.least_distance)[0]
+                        costs[k, i, j] += step * header.weight * value
 
 
 @kernel(int64(float64, float64, float64, float64), inline="always")
