@@ -19,14 +19,16 @@ from leapnav.training.policies.files import SHIPPED, read_description
 
 ROBOTS = ("car", "dynamic_unicycle")
 FREE = collection_name("clutter", horizon="free")
+MOVING = "crossing", "crowd"
 OPEN = {"observation": "lidar", "lidar_beams": 32, "hidden": (128, 128), "scenarios": 2000}
 SETTINGS: dict[str, dict[str, Any]] = {
     "open": {**OPEN, "dagger": DAggerConfig(rounds=2)},
     "polygons": {"scenarios": 8000},
     "rooms": {"scenarios": 8000},
     "slalom": {"scenarios": 4000, "dagger": DAggerConfig(max_episodes=6000)},
+    **dict.fromkeys(MOVING, {"scenarios": 5000}),
 }
-NAMES = (*ALL_FAMILIES, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
+NAMES = (*ALL_FAMILIES, *MOVING, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
 
 
 def ship(name: str, runs: Path) -> None:

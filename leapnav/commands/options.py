@@ -11,7 +11,11 @@ from typing import Any, Literal
 from leapnav.training.config import FamilyName, HorizonName, ObstaclesName, RobotName
 
 # Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
-Family = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"] | str
+Family = (
+    Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
+    | Literal["crossing", "traffic", "crowd", "doors"]
+    | str
+)
 FamilyOrAll = FamilyName
 Robot = RobotName
 Horizon = HorizonName
@@ -26,6 +30,8 @@ PolicyName = (
         "polygons",
         "rooms",
         "slalom",
+        "crossing",
+        "crowd",
         "car-clutter",
         "dynamic_unicycle-clutter",
         "all",

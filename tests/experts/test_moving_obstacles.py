@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers import scenario_fields
 
-from leapnav.envs import NavigateEnv, Scenario
+from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.field.packing import displacements
+from leapnav.envs.scenarios.layouts.moving import MOVING_LAYOUTS
 from leapnav.experts import (
     ExpertPolicy,
-    NoOptimumError,
     OptimalControlProblem,
     build_bank_of,
     find_optimum,
@@ -20,6 +20,10 @@ from leapnav.experts import (
     solve,
     verify,
 )
+from leapnav.experts.acting.feedback import Feedback
+from leapnav.experts.problem.clock import with_clock
+from leapnav.experts.problem.frames import orthonormalise
+from leapnav.experts.problem.problem import Trajectory
 from leapnav.experts.search.path_class import path_sides
 from leapnav.experts.second_opinion import second_opinion
 
@@ -155,18 +159,108 @@ def test_the_sides_of_a_moving_obstacle_are_those_where_it_is():
     assert path_sides(times, late, field) == ("left",)
 
 
-def test_what_considers_obstacles_at_rest_only_refuses_others(tmp_path):
+def test_what_considers_obstacles_at_rest_only_refuses_others():
     scenario = crossing(0.8)
-    for call in (
-        lambda: minimum_length(scenario),
-        lambda: lower_bound(scenario),
-        lambda: second_opinion(scenario),
-        lambda: build_bank_of([scenario], tmp_path / "moving.bank", progress=False),
-    ):
+    for call in (lambda: minimum_length(scenario), lambda: lower_bound(scenario)):
         with pytest.raises(ValueError, match="expected obstacles at rest, but one has a velocity or a path"):
             call()
+
+
+@pytest.mark.parametrize("family", MOVING_LAYOUTS)
+def test_scenarios_of_families_are_certified_and_no_second_search_finds_better(family):
+    for seed in (0, 1):
+        opinion = second_opinion(sample_scenario(family, seed))
+        assert math.isfinite(opinion.cost) and opinion.doubts == 0
+        assert opinion.improvement < 1e-3
+        assert opinion.tried > 150
+
+
+@pytest.mark.parametrize("horizon", ["fixed", "free"])
+@pytest.mark.parametrize("feedback", ["resolve", "gains"])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_the_expert_reaches_the_goal_in_closed_loop(horizon, feedback, noise):
+    env = NavigateEnv("crossing", split="fresh", horizon=horizon)
+    expert = ExpertPolicy(env, feedback=feedback)
+    rng = np.random.default_rng(0)
+    scenario = sample_scenario("crossing", 5, horizon=horizon)
+    observation, info = env.reset(options={"scenario": scenario})
+    done = False
+    while not done:
+        action, _ = expert.predict(observation)
+        action = np.clip(action + noise * rng.standard_normal(2), -1, 1).astype(np.float32)
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+    assert info["is_success"]
+    if noise == 0.0:  # with a free horizon, the episode ends within the tolerances of the goal
+        assert info["cost"] == pytest.approx(find_optimum(scenario).cost, rel=1e-3 if horizon == "fixed" else 0.02)
+
+
+def test_value_and_costate_of_the_expert_are_those_of_the_rest_of_the_episode():
+    scenario = sample_scenario("crowd", 3)
+    optimum = find_optimum(scenario)
     env = NavigateEnv(scenario=scenario)
+    env.reset(seed=0)
     expert = ExpertPolicy(env)
-    observation, _ = env.reset(seed=0)
-    with pytest.raises(NoOptimumError, match="expected obstacles at rest"):
-        expert.predict(observation)
+    time = 2.0
+    state = optimum.interpolate(np.array([time]))[0]
+    assert expert.value(state[:3], time) == pytest.approx(optimum.cost_to_go(time), rel=1e-6)
+    assert expert.costate(state[:3], time) == pytest.approx(state[4:7], abs=1e-5)
+    rest = find_optimum(scenario.from_state(state[:3], time))
+    assert rest.cost == pytest.approx(optimum.cost_to_go(time), rel=1e-6)
+
+
+def test_a_new_search_on_the_way_continues_in_the_time_of_the_episode():
+    scenario = crossing(0.8)
+    optimum = find_optimum(scenario)
+    feedback = Feedback(scenario, optimum)
+    found = feedback._search(optimum.interpolate(np.array([1.5]))[0, :3], 1.5)
+    assert found.times[0] == 1.5 and found.nodes[0, 3] == pytest.approx(1.5, abs=1e-12)
+    assert found.cost == pytest.approx(optimum.cost_to_go(1.5), rel=1e-5)  # nodes to 1e-6
+
+
+def test_a_bank_stores_the_states_of_the_robot_and_the_expert_reads_them(tmp_path):
+    scenarios = [sample_scenario(family, 1) for family in ("crossing", "traffic", "crowd", "doors")]
+    named = [one.model_copy(update={"name": f"moving-{k}"}) for k, one in enumerate(scenarios)]
+    bank = build_bank_of(named, tmp_path / "moving.bank", progress=False)
+    assert len(bank) == 4
+    for index, scenario in enumerate(bank):
+        reference = bank.reference(index)
+        assert reference.states.shape[1] == reference.costates.shape[1] == 3
+        path = Trajectory(reference.times, reference.states.astype(float), reference.costates.astype(float))
+        again = solve(scenario, "multiple_shooting", guess=path)
+        assert again.success and again.cost == pytest.approx(bank.costs[index], rel=1e-9)
+        assert again.states.shape[1] == 4
+        timed = with_clock(OptimalControlProblem.from_scenario(scenario), path)
+        at = again.evaluate(reference.times)
+        np.testing.assert_allclose(timed.costates[:, 3], at[2][:, 3], atol=1e-4)  # that of the time, from H
+    env = NavigateEnv(bank=bank)
+    observation, info = env.reset(options={"index": 0})
+    assert info["reference_cost"] == bank.costs[0]
+    assert np.abs(ExpertPolicy(env).predict(observation)[0]).max() <= 1.0
+
+
+def test_steps_end_at_the_knots_of_a_path():
+    """Without that, the costate of the time is not accurate enough for a certificate."""
+    times = np.arange(0.0, 9.0, 0.4)
+    points = np.column_stack([5.0 + 0.3 * (-1.0) ** np.arange(len(times)), 1.0 + 0.9 * times])
+    path = {"times": times.tolist(), "points": points.tolist()}
+    obstacle = {"circle": {"center": points[0].tolist(), "radius": 0.5}, "path": path}
+    scenario = crossing(0.5, obstacles=[obstacle])
+    optimum = find_optimum(scenario)
+    assert optimum.success and optimum.certificate.defect < 1e-9
+    assert optimum.certificate.hamiltonian_drift < 1e-8
+    assert verify(optimum) < 1e-6  # SciPy's integrator does not know the knots
+    assert (np.abs(optimum.times[:, None] - times) < 1e-9).any(axis=0)[1:].sum() >= 15
+
+
+def test_the_certificate_excludes_the_time_from_conjugate_points():
+    """No control changes the time, so that its costate takes its place in the determinant."""
+    problem = OptimalControlProblem.from_scenario(crossing(0.8))
+    frame = np.random.default_rng(0).normal(size=(8, 4))
+    rows = [0, 1, 2, 7]
+    expected = np.linalg.det(np.linalg.qr(frame).Q[rows])
+    assert problem.clock == 3
+    assert abs(orthonormalise(frame.copy(), 3)) == pytest.approx(abs(expected), rel=1e-9)
+    found = solve(crossing(0.8), "multiple_shooting")
+    assert found.success and found.certificate.conjugate_point is None
+    assert found.certificate.controllability is not None

@@ -75,7 +75,8 @@ class Labeller:
         period = self._settings.control_period
         actions = plan_actions(optimum, scenario, period)[: max(1, round(self._lead / period))]
         times = np.minimum(period * np.arange(len(actions) + 1), optimum.horizon)
-        states, _, costates = optimum.evaluate(times[:-1])
+        n = len(scenario.robot.state_names)  # among moving obstacles, the time is a further state of the optimum
+        states, costates = (values[:, :n] for values in optimum.evaluate(times[:-1])[::2])
         costs = np.asarray(optimum.cost_to_go(times))
         # The history of the observations begins with the states of the learner.
         before = 0 if states_before is None else min(len(states_before), 1 + max(self._settings.lags, default=0))

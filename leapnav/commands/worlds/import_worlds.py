@@ -61,6 +61,32 @@ class ImportMovingAI:
 
 
 @dataclass(frozen=True)
+class ImportPedestrians(TaskOptions):
+    """Sample poses among recorded pedestrians (text files of the ETH and UCY datasets: frame, pedestrian, x, y)."""
+
+    file: tyro.conf.Positional[Path]
+    """Text file of the recording, with positions in metres."""
+    out: Path
+    """Output directory of the scenario files."""
+    count: int = 100
+    """Number of scenarios."""
+    seed: int = 0
+    """First seed: scenario i has seed SEED + i."""
+    frames_per_second: float = 25.0
+    """Of the numbers of the frames."""
+    radius: float = 0.25
+    """Radius of a pedestrian (m)."""
+
+    def run(self) -> int:
+        """Write the scenario files."""
+        from leapnav.envs.worlds.pedestrians import read_pedestrians, sample_among_pedestrians
+
+        recording = read_pedestrians(self.file, frames_per_second=self.frames_per_second)
+        found = sample_among_pedestrians(recording, self.count, seed=self.seed, radius=self.radius, **self.task)
+        return _write(found, self.out)
+
+
+@dataclass(frozen=True)
 class ImportRosMap(TaskOptions):
     """Sample poses on an occupancy grid of ROS (map server, Nav2)."""
 
@@ -134,6 +160,7 @@ class Import:
         Annotated[ImportBarn, tyro.conf.subcommand("barn")]
         | Annotated[ImportDynobench, tyro.conf.subcommand("dynobench")]
         | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
+        | Annotated[ImportPedestrians, tyro.conf.subcommand("pedestrians")]
         | Annotated[ImportRosMap, tyro.conf.subcommand("ros-map")]
         | Annotated[ImportTpcap, tyro.conf.subcommand("tpcap")]
     ]
