@@ -2,7 +2,7 @@
 // server (`play.colors`).
 
 import { byId, play, shownScenario } from "./state.js";
-import { frontOf, halfWidthOf, hasHeading, partsOf, robotParts } from "./shapes.js";
+import { centerOf, frontOf, halfWidthOf, hasHeading, motionOf, moves, partsAt, robotParts } from "./shapes.js";
 
 export const canvas = byId("view");
 export let context = canvas.getContext("2d");
@@ -116,7 +116,21 @@ function addPart({ circle, capsule, polygon }) {
   context.closePath();
 }
 
-export function drawScenario(scenario, selected = null) {
+const ARROW_TIME = 1; // s; the arrow of an obstacle is as long as its way in this time
+
+// The velocity of an obstacle as an arrow from where it is.
+function drawVelocity(obstacle, time) {
+  const { displacement: [dx, dy], velocity: [vx, vy] } = motionOf(obstacle, time), [x, y] = centerOf(obstacle);
+  if (!vx && !vy) return;
+  const start = [x + dx, y + dy], end = [x + dx + ARROW_TIME * vx, y + dy + ARROW_TIME * vy];
+  const angle = Math.atan2(vy, vx), length = (7 * unit) / view.scale;
+  const head = [2.6, -2.6].map((turn) => [end[0] + length * Math.cos(angle + turn), end[1] + length * Math.sin(angle + turn)]);
+  drawLine([start, end], play.colors.wall, 1.4);
+  drawLine([head[0], end, head[1]], play.colors.wall, 1.4);
+}
+
+// Obstacles are drawn where they are at a time (s).
+export function drawScenario(scenario, selected = null, time = 0) {
   const [x0, y0, x1, y1] = scenario.arena, [left, top] = toScreen([x0, y1]), colors = play.colors;
   context.strokeStyle = colors.wall;
   context.lineWidth = 2 * unit;
@@ -127,13 +141,14 @@ export function drawScenario(scenario, selected = null) {
     context.strokeStyle = isSelected ? colors.wall : colors.edge;
     context.lineWidth = (isSelected ? 3 : 1) * unit;
     context.setLineDash(isSelected ? [6 * unit, 3 * unit] : []);
-    for (const part of partsOf(obstacle)) {
+    for (const part of partsAt(obstacle, time)) {
       context.beginPath();
       addPart(part);
       context.fill();
       context.stroke();
     }
     context.setLineDash([]);
+    if (moves(obstacle)) drawVelocity(obstacle, time);
   });
 }
 

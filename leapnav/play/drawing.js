@@ -1,6 +1,6 @@
 // Drawing of what the page shows: the plane, and the plots below it.
 
-import { byId, durationOf, play } from "./state.js";
+import { byId, durationOf, play, shownTime } from "./state.js";
 import {
   alternativeColor, canvas, drawLine, drawPoints, drawPoses, drawRobot, drawScenario, fitView, poseAt, prepareCanvas,
   unit, updateUnit,
@@ -29,7 +29,7 @@ function drawPlane(width, height) {
     drawLesson();
     return;
   }
-  drawScenario(scenario, driving ? null : play.selected);
+  drawScenario(scenario, driving ? null : play.selected, shownTime());
   if (solution && solution.path && (!driving || byId("show-optimum").checked)) drawSolution(solution);
   const episodeColor = episode && (episode.success ? colors.policy : colors.failure);
   if (episode) drawLine(episode.states, episodeColor, 2.2);
@@ -38,13 +38,13 @@ function drawPlane(width, height) {
     drawLine(driving.states, colors.policy, 2.2);
     drawRobot(driving.states[driving.states.length - 1], colors.policy, false);
   }
-  if (play.time === null) return;
+  if (shownTime() === 0 || driving) return;
   if (solution && solution.path) {
-    drawRobot(poseAt(solution.path.states, play.time, durationOf(solution.path)), colors.optimum, false);
+    drawRobot(poseAt(solution.path.states, shownTime(), durationOf(solution.path)), colors.optimum, false);
   }
   if (episode) {
     const duration = episode.period * (episode.states.length - 1);
-    drawRobot(poseAt(episode.states, play.time, Math.min(duration, scenario.horizon ?? duration)), episodeColor, false);
+    drawRobot(poseAt(episode.states, shownTime(), Math.min(duration, scenario.horizon ?? duration)), episodeColor, false);
   }
 }
 
@@ -56,7 +56,7 @@ export function draw() {
   const [width, height] = prepareCanvas(canvas);
   if (!play.scenario || !play.colors) return;
   drawPlane(width, height);
-  const { lesson, driving, time, searched, highlighted } = play, plots = byId("plots");
+  const { lesson, driving, searched, highlighted } = play, time = shownTime(), plots = byId("plots");
   const shown = [shownPath(), lesson && lesson.content, lesson && lesson.step, driving !== null, time, searched,
     highlighted, byId("show-optimum").checked, unit, plots.clientWidth, plots.clientHeight, window.devicePixelRatio];
   if (shown.length === plotted.length && shown.every((value, i) => value === plotted[i])) return;

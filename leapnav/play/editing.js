@@ -1,7 +1,7 @@
 // Editing of the scenario by mouse, touch and keyboard.
 
 import { byId, canEdit, edit, isFree, play, redo, scheduleSearch, setText, show, undo } from "./state.js";
-import { canRotate, centerOf, hasHeading, isInside, isInsidePart, moved, robotParts, transformed } from "./shapes.js";
+import { canRotate, centerOf, hasHeading, isInside, isInsidePart, motionOf, moved, robotParts, transformed } from "./shapes.js";
 import { arrowTip, canvas, toPlane, view } from "./canvas.js";
 
 const STEP = 0.05, FINE_STEP = 0.01; // m per key press
@@ -88,7 +88,8 @@ function describeSelection() {
     const pose = poseOf(selected), heading = hasHeading(pose) ? `${((180 / Math.PI) * pose[2]).toFixed(0)}°` : "free";
     return `${selected} ${at(pose)}, heading ${heading}`;
   }
-  const obstacle = obstaclesOf()[selected], position = at(centerOf(obstacle));
+  const obstacle = obstaclesOf()[selected], { displacement } = motionOf(obstacle, play.clock);
+  const position = at(centerOf(obstacle).map((value, i) => value + displacement[i]));
   if (obstacle.circle) return `disc ${selected} ${position}, radius ${obstacle.circle.radius.toFixed(2)} m`;
   return `${Object.keys(obstacle)[0]} ${selected} ${position}`;
 }
@@ -106,7 +107,7 @@ function findHandle(point, pointerType = "mouse") {
     if (isOnRobot || isWithin(pose, point, size)) return { kind: "position", name };
   }
   const obstacles = obstaclesOf();
-  for (let i = obstacles.length - 1; i >= 0; i -= 1) if (isInside(obstacles[i], point)) return { kind: "obstacle", i };
+  for (let i = obstacles.length - 1; i >= 0; i -= 1) if (isInside(obstacles[i], point, play.clock)) return { kind: "obstacle", i };
   return null;
 }
 

@@ -2,12 +2,13 @@
 
 import {
   byId, canEdit, changeScenario, closeLesson, drivePolicy, durationOf, edit, format, isFree, loadSweeps, modelOf,
-  play, request, robotOf, setDisplay, setScenario, setText, show, showError,
+  play, request, robotOf, setDisplay, setScenario, setText, show, showError, shownTime,
 } from "./state.js";
 import { alternativeColor, canvas } from "./canvas.js";
 import { showLesson } from "./lessons.js";
 import { draw, resize } from "./drawing.js";
 import { showSelection } from "./editing.js";
+import { moves } from "./shapes.js";
 import { openLink } from "./link.js";
 import { describeEpisode } from "./driving.js";
 
@@ -44,6 +45,7 @@ function display() {
   if (episode) byId("episode").style.color = episode.success ? play.colors.policy : play.colors.failure;
   byId("drive-box").hidden = play.driving === null;
   document.body.classList.toggle("is-driving", play.driving !== null);
+  showTime();
   showSelection();
   showSettings();
   showLesson();
@@ -113,6 +115,17 @@ function showSettings() {
   }
 }
 
+// The slider of the time, if an obstacle moves.
+function showTime() {
+  const { scenario, solution, lesson } = play, path = solution && solution.path;
+  byId("time-box").hidden = !scenario || lesson !== null || !(scenario.obstacles || []).some(moves);
+  if (!scenario) return;
+  const end = scenario.horizon ?? (path ? durationOf(path) : play.clock), slider = byId("time-slider");
+  if (end > 0) slider.max = end;
+  slider.value = shownTime();
+  setText("time-shown", `${shownTime().toFixed(1)}\u00a0s`);
+}
+
 let shownFields = null; // the names of the robot's numbers that have inputs, as one text
 
 // A robot with a footprint has no radius; footprints are not edited.
@@ -173,6 +186,10 @@ byId("use-horizon").addEventListener("click", () => {
 
 byId("sweeps").addEventListener("click", loadSweeps);
 byId("sweep-slider").addEventListener("input", show);
+byId("time-slider").addEventListener("input", () => {
+  play.clock = Number(byId("time-slider").value);
+  show();
+});
 byId("policy").addEventListener("change", drivePolicy);
 
 let loads = 0; // number of clicks on Load; only the response to the last one counts
@@ -221,6 +238,7 @@ byId("play").addEventListener("click", () => {
     const path = play.solution && play.solution.path, duration = play.scenario.horizon ?? (path ? durationOf(path) : 0);
     play.time = time <= duration && canEdit() ? time : null;
     draw();
+    showTime();
     if (play.time !== null) requestAnimationFrame(frame);
   }
   requestAnimationFrame(frame);

@@ -1,6 +1,6 @@
 // Plots: the optimum or an alternative over time, or the curves of a lesson.
 
-import { byId, durationOf, modelOf, play, robotOf } from "./state.js";
+import { byId, durationOf, modelOf, play, robotOf, shownTime } from "./state.js";
 import { alternativeColor, context, unit } from "./canvas.js";
 
 // The local optimum whose curves are plotted: the optimum or the highlighted alternative.
@@ -135,7 +135,7 @@ export function drawPlots(width, height) {
   context.textAlign = "left";
   context.fillStyle = shownPathColor();
   context.fillText(shownPathName(), boxes[0].left, headingHeight - 2 * unit);
-  const marks = play.time === null ? [] : [[play.time, play.colors.optimum]];
+  const marks = shownTime() === 0 ? [] : [[shownTime(), play.colors.optimum]];
   const at = (box, title, lines, options) => drawPlot(box, title, lines, path.times, { marks, ...options });
   const { controls, states } = robotOf(play.scenario), isUnicycle = modelOf(play.scenario) === "unicycle";
   const controlNames = isUnicycle ? ["v (m/s)", "ω (rad/s)"] : controls;

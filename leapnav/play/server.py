@@ -18,7 +18,7 @@ from starlette.routing import Route
 
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.families import FAMILIES
-from leapnav.envs.scenarios.faults import check_at_rest, check_headings
+from leapnav.envs.scenarios.faults import check_headings
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils import colors
@@ -206,5 +206,4 @@ def _scenario(content: dict[str, Any]) -> Scenario:
     scenario = Scenario.from_dict(content.get("scenario"))
     if not scenario.name.isprintable():
         raise ValueError(f"Scenario: name: expected printable characters, got {ascii(scenario.name)[:80]}")
-    check_at_rest(scenario.moves, "this page")
     return scenario

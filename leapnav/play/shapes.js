@@ -65,8 +65,28 @@ export function partsOf(obstacle) {
   return unions.get(key);
 }
 
-// Whether a point is inside an obstacle.
-export const isInside = (obstacle, point) => partsOf(obstacle).some((part) => isInsidePart(part, point));
+// Whether an obstacle moves by itself.
+export const moves = ({ velocity, path }) => Boolean(path || (velocity && (velocity[0] || velocity[1])));
+
+// The displacement (m) of an obstacle at a time (s), and its velocity (m/s).
+export function motionOf({ velocity, path }, time) {
+  if (velocity) return { displacement: velocity.map((v) => v * time), velocity };
+  const k = path ? path.times.filter((t) => t <= time).length - 1 : -1;
+  if (k < 0) return { displacement: [0, 0], velocity: [0, 0] };
+  const { times, points } = path, [x0, y0] = points[0], from = points[k], to = points[k + 1] || from;
+  const span = k + 1 < times.length ? times[k + 1] - times[k] : 1;
+  const rate = [0, 1].map((i) => (to[i] - from[i]) / span), elapsed = time - times[k];
+  return { displacement: [from[0] - x0 + rate[0] * elapsed, from[1] - y0 + rate[1] * elapsed], velocity: rate };
+}
+
+// The parts of an obstacle where it is at a time (s).
+export function partsAt(obstacle, time) {
+  const [dx, dy] = motionOf(obstacle, time).displacement;
+  return dx || dy ? partsOf(obstacle).map((part) => moved(part, dx, dy)) : partsOf(obstacle);
+}
+
+// Whether a point is inside an obstacle at a time (s).
+export const isInside = (obstacle, point, time) => partsAt(obstacle, time).some((part) => isInsidePart(part, point));
 
 export function isInsidePart(part, point) {
   if (part.circle) {
@@ -89,16 +109,21 @@ export function centerOf(obstacle) {
   return [0, 1].map((i) => points.reduce((sum, point) => sum + point[i], 0) / (points.length || 1));
 }
 
-// An obstacle after a map of its points and a factor of its size.
+// An obstacle after a map of its points and a factor of its size, with the same mass and motion.
 function mapped(obstacle, map, factor = 1) {
-  const { circle, polygon, capsule } = obstacle;
-  if (circle) return { circle: { center: map(circle.center), radius: circle.radius * factor } };
-  if (polygon) return { polygon: { vertices: polygon.vertices.map(map) } };
-  if (capsule) return { capsule: { start: map(capsule.start), end: map(capsule.end), radius: capsule.radius * factor } };
+  const { circle, polygon, capsule, ...others } = obstacle;
+  if (circle) return { circle: { center: map(circle.center), radius: circle.radius * factor }, ...others };
+  if (polygon) return { polygon: { vertices: polygon.vertices.map(map) }, ...others };
+  if (capsule) {
+    return { capsule: { start: map(capsule.start), end: map(capsule.end), radius: capsule.radius * factor }, ...others };
+  }
   return obstacle;
 }
 
-export const moved = (obstacle, dx, dy) => mapped(obstacle, ([x, y]) => [x + dx, y + dy]);
+export function moved(obstacle, dx, dy) {
+  const shift = ([x, y]) => [x + dx, y + dy], result = mapped(obstacle, shift);
+  return result.path ? { ...result, path: { ...result.path, points: result.path.points.map(shift) } } : result;
+}
 
 // Scaled and rotated about its centre.
 export function transformed(obstacle, factor, angle) {

@@ -79,11 +79,12 @@ class PlaySolver:
     def sweeps(self, scenario: Scenario) -> dict[str, Any]:
         """Return Leapfrog's feasible paths to the extremal.
 
-        The first is the best path of the lattice search, or for a robot with further states the initial guess of
-        `solve`.
+        The first is the best path of the lattice search, or for a robot with further states or among moving obstacles
+        the initial guess of `solve`.
         """
         with self._lock:
-            guess = best_path(scenario) if scenario.robot.sizes()[0] == 3 else None
+            has_path = scenario.robot.sizes()[0] == 3 and not scenario.moves
+            guess = best_path(scenario) if has_path else None
             extremal = solve(scenario, method="leapfrog", guess=guess, polish=False)
         rows = [row for row in extremal.history if row.times is not None]
         sweeps = []
@@ -178,6 +179,7 @@ def _path(scenario: Scenario, optimum: Optimum, points: int = OPTIMUM_POINTS) ->
     """A local optimum over time, for the plots."""
     times = np.linspace(0.0, optimum.horizon, points)
     _, controls, costates = optimum.evaluate(times)
+    costates = costates[:, : len(scenario.robot.state_names)]  # without that of the time
     certificate = optimum.certificate
     return {
         **_summary(optimum, points),
@@ -197,7 +199,8 @@ def _clearances(scenario: Scenario, values: np.ndarray) -> np.ndarray:
 
 
 def _summary(optimum: Optimum, points: int) -> dict[str, Any]:
-    states = optimum.interpolate(np.linspace(0.0, optimum.horizon, points))[:, : optimum.problem.system.n]
+    n = optimum.problem.system.n - (optimum.problem.clock >= 0)
+    states = optimum.interpolate(np.linspace(0.0, optimum.horizon, points))[:, :n]
     certificate = optimum.certificate
     return {
         "cost": optimum.cost,

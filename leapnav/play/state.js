@@ -20,6 +20,7 @@ export const play = (window.play = {
   episode: null, // response of /drive or /replay
   selected: null, // "start", "goal" or the index of an obstacle
   time: null, // s, during an animation
+  clock: 0, // s, of the slider: where moving obstacles are drawn and edited
   pending: 0, // number of open requests
   searched: false, // whether the solution is that of the full search
   error: null,
@@ -47,6 +48,13 @@ export const modelOf = (scenario) => (scenario.robot || {}).model || "unicycle";
 export const lessonStep = () => play.lesson.content.steps[play.lesson.step];
 export const lessonScenario = () => lessonStep().scenario || play.lesson.content.scenario;
 export const shownScenario = () => (play.lesson && play.lesson.content ? lessonScenario() : play.scenario);
+
+// The time (s) that is drawn: of the animation, of the person's episode, or of the slider.
+export function shownTime() {
+  const { driving, time, clock } = play;
+  if (driving) return driving.id ? driving.period * (driving.states.length - 1) : 0;
+  return time === null ? clock : time;
+}
 
 export const canEdit = () => play.scenario !== null && !play.lesson && !play.driving;
 
@@ -227,6 +235,7 @@ function replaceScenario(scenario) {
   play.previousId = null;
   play.solution = null;
   play.time = null;
+  play.clock = 0;
   scenarioChanged();
 }
 

@@ -140,7 +140,6 @@ def read_description(folder: str | Path) -> dict[str, Any]:
         if description["kind"] not in KINDS:
             raise ValueError(f"{path}: kind: expected one of {', '.join(KINDS)}, got {description['kind']!r}")
         description["environment"]["history"] = tuple(description["environment"]["history"])
-        description["environment"].setdefault("velocities", False)  # of a policy that is older than the setting
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the description of a policy: {error!r}") from None
     return description
@@ -160,8 +159,14 @@ def policy_environment(folder: str | Path) -> dict[str, Any]:
     """
     if is_zip(folder):
         return load_zip(folder)[1]
-    environment = read_description(folder)["environment"]
-    return {name: environment[name] for name in OBSERVED if name in environment}
+    return _observed(read_description(folder))
+
+
+def _observed(description: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of the environment in the description of a policy that determine the observation."""
+    environment = description["environment"]
+    # A policy that is older than the setting observes no velocities, in whichever scenario.
+    return {"velocities": False, **{name: environment[name] for name in OBSERVED if name in environment}}
 
 
 def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
@@ -239,7 +244,7 @@ def _n_controls(environment: Mapping[str, Any]) -> int:
 
 def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
     """Check that an environment has the observations that the policy was trained with."""
-    trained = description["environment"]
+    trained = _observed(description)
     for inner in unwrap(env):
         settings = _as_dict(inner.settings)
         differing = [
