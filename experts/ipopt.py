@@ -128,7 +128,7 @@ def _proximity(scenario: Scenario, q: Any, row: Sequence[float]) -> Any:
     points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in corners]
     x_min, y_min, x_max, y_max = scenario.arena
     distances = [d for px, py in points for d in (px - x_min, x_max - px, py - y_min, y_max - py)]
-    for obstacle, part in ((obstacle, part) for obstacle in scenario.obstacles for part in obstacle.shape.parts()):
+    for obstacle, part in ((one, part) for one in scenario.obstacles for part in one.shape.parts()):
         vertices, rounding = part.rounded_polygon()
         dx, dy = _displacement(obstacle.knots, q[-1, :])
         if is_disc or len(np.unique(vertices, axis=0)) > 1:

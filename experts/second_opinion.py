@@ -130,7 +130,9 @@ def _lattice_paths(
     for refinement, reach, count in LATTICES:
         lattice = first if refinement == 1 else Lattice(scenario, refinement)
         found += islice(CandidateSearch(lattice.with_weight(weight), reach).candidates(), count)
-    through = CandidateSearch(first.with_weight(weight), VIA_REACH).random_candidates(N_VIA_POINTS, rng) if found else ()
+    through = (
+        CandidateSearch(first.with_weight(weight), VIA_REACH).random_candidates(N_VIA_POINTS, rng) if found else ()
+    )
     paths, via = ([Trajectory(one.times, one.poses) for one in candidates] for candidates in (found, through))
     return search, paths, via
 

@@ -26,7 +26,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "polygons": {"scenarios": 8000},
     "rooms": {"scenarios": 8000},
     "slalom": {"scenarios": 4000, "dagger": DAggerConfig(max_episodes=6000)},
-    **dict.fromkeys(MOVING, {"scenarios": 5000}),
+    **{family: {"scenarios": 5000} for family in MOVING},
 }
 NAMES = (*ALL_FAMILIES, *MOVING, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
 

@@ -40,7 +40,7 @@ TIME_WEIGHT = 0.5  # cost per second if the horizon is free
 RELATIVE_DURATION = 1.1
 MIN_DISTANCE = 0.4  # between start and goal, as a fraction of the shorter side of the arena
 MIN_POSE_CLEARANCE = 0.25  # m at the start and the goal
-# No obstacle comes closer to the start for this time (s) at the beginning, and to the goal at the end; checked at times.
+# Time (s) at the beginning in which no obstacle comes closer to the start, and at the end to the goal, and checks in it.
 POSE_TIME, N_POSE_TIMES = 1.0, 11
 PASSAGE_MARGIN = 0.1  # m on either side of the robot, in the narrowest passage that a scenario may require
 GRID_SPACING = 0.25  # m, of the grid on which the shortest path is computed
@@ -320,7 +320,11 @@ def _sample_task(
         motions = [one.knots for one in moving]
         field = pack_field([one.shape for one in moving], *settings, grid=False, motions=motions, clock=n)
         moments = np.linspace(0.0, POSE_TIME, N_POSE_TIMES)
-        timed = [np.append(state, t) for state, first in zip(states, (0.0, duration - POSE_TIME)) for t in first + moments]
+        timed = [
+            np.append(state, t)
+            for state, first in zip(states, (0.0, duration - POSE_TIME), strict=True)
+            for t in first + moments
+        ]
         if footprint_clearances(np.array(timed), outline, field).min() < MIN_POSE_CLEARANCE:
             return None
     times: dict[str, Any] = {"horizon": duration}

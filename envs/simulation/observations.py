@@ -90,7 +90,10 @@ def _parts(settings: EnvironmentSettings) -> Iterator[tuple[str, list[Entry]]]:
         yield "distance", [Entry("distance", "m", 0.0, MAX_GEODESIC)]
         if settings.velocities:
             sides = ("ahead", "left")
-            yield "velocities", [Entry(f"velocities.{side}[{k}]", "m/s", *_RATE) for side in sides for k in range(beams)]
+            yield (
+                "velocities",
+                [Entry(f"velocities.{side}[{k}]", "m/s", *_RATE) for side in sides for k in range(beams)],
+            )
     elif settings.observation == "map":
         sides = [Entry(f"walls.{side}", *_DISTANCE) for side in ("left", "bottom", "right", "top")]
         yield "walls", [*sides, Entry("walls.cos_heading", *_COSINE), Entry("walls.sin_heading", *_COSINE)]

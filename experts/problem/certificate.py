@@ -69,7 +69,9 @@ def certify(
     while True:
         out, terms = np.empty((capacity, 4 + m + 4 * n)), np.empty((capacity, DENSE_TERMS, 2 * n + 1))
         record = TraceRecord(out, terms, sensitivity, final)
-        n_rows, defect, conjugate_step = trace(arrays.flow, arrays.control, times, nodes, problem.clock, accuracy, record)
+        n_rows, defect, conjugate_step = trace(
+            arrays.flow, arrays.control, times, nodes, problem.clock, accuracy, record
+        )
         if n_rows != FULL or capacity > MAX_ROWS:
             break
         capacity *= 4

@@ -97,6 +97,7 @@ def _transformed(
     moved: Callable[[th.Tensor], th.Tensor],
 ) -> tuple[th.Tensor, th.Tensor]:
     """Return observations with other signs of goal and motion and moved values of the beams, and the actions."""
+
     def velocities(values: th.Tensor) -> th.Tensor:
         ahead, left = (moved(half) for half in values.chunk(2, dim=1))  # the velocity of what each beam meets
         return th.cat([float(signs[0]) * ahead, float(signs[1]) * left], dim=1)

@@ -28,7 +28,9 @@ def _crossing(rng: np.random.Generator) -> ScenarioLayout:
         speed, angle, time = rng.uniform(0.3, 1.2), rng.uniform(-math.pi, math.pi), rng.uniform(1.0, 10.0)
         velocity = point(speed * np.array([math.cos(angle), math.sin(angle)]))
         center = point(rng.uniform((2.5, 2.0), (7.5, 8.0)) - time * np.array(velocity))
-        obstacles.append(Obstacle(circle=Circle(center=center, radius=rounded(rng.uniform(0.25, 0.6))), velocity=velocity))
+        obstacles.append(
+            Obstacle(circle=Circle(center=center, radius=rounded(rng.uniform(0.25, 0.6))), velocity=velocity)
+        )
     return ScenarioLayout(obstacles, *ACROSS)
 
 
@@ -51,7 +53,7 @@ def _traffic(rng: np.random.Generator) -> ScenarioLayout:
 
 
 def _doors(rng: np.random.Generator) -> ScenarioLayout:
-    """The rooms of `rooms` with a sliding door in each opening, which is open for 2.5 to 4 s, then closed for 1 to 3 s."""
+    """The rooms of `rooms` with sliding doors, which are open for 2.5 to 4 s, then closed for 1 to 3 s, and so on."""
     walls, openings = rooms_of(rng)
     doors = []
     for axis, low, high in openings:
