@@ -9,7 +9,6 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
-from leapnav.envs.field.packing import with_weight
 from leapnav.envs.kernels import prepare
 from leapnav.envs.kernels.compilation import GENERATED
 from leapnav.envs.kernels.decorator import kernels_of
@@ -35,7 +34,7 @@ from leapnav.experts.search.manoeuvres import manoeuvres
 from leapnav.experts.search.path_class import Mode, Side, driving_modes, heading_winding, path_sides
 from leapnav.experts.search.plane_paths import PlaneSearch, plane_lattice
 from leapnav.experts.solve import local_optima, solve
-from leapnav.experts.spacetime.candidates import SpaceTimeSearch
+from leapnav.experts.spacetime.searches import time_searches
 from leapnav.experts.transcription.direct import generated_functions
 
 # Factor of the number of candidates for a robot that cannot rotate in place: the costs of its lattice paths differ from
@@ -60,9 +59,6 @@ ALTERNATIVES_BUDGET = 240_000
 # Of a second search with hard limits, see `LocalOptima`: with 1, a box of 0.5 x 0.25 m does not pass through a gap
 # of 0.26 m from the side.
 SHARPNESS = 4.0
-# Horizons of the paths among moving obstacles if it is free, in units of the time of a straight line (s), at least
-# `SHORTEST`.
-HORIZON_FACTORS, SHORTEST = (1.0, 1.4, 2.0), 1.0
 # `shortest_horizon`: relative tolerance, and largest multiple of the scenario's horizon.
 HORIZON_TOLERANCE, MAX_HORIZON_FACTOR = 0.02, 1000.0
 
@@ -346,27 +342,6 @@ def _search_in_time(
     for search in searches:
         optima.add(search.candidates())
     return (optima, None) if searches else (None, Status.NO_PATH)
-
-
-def time_searches(
-    scenario: Scenario, problem: OptimalControlProblem, budget: float = math.inf, sharpness: float = 1.0
-) -> tuple[LocalOptima, list[SpaceTimeSearch]]:
-    """Return an empty collection of local optima, and searches over position and time, one for each horizon tried.
-
-    Args:
-        scenario, problem, budget, sharpness: see `LocalOptima`.
-
-    """
-    horizons = [problem.horizon]
-    if problem.horizon is None:
-        duration = max(math.dist(scenario.start[:2], scenario.goal[:2]) / scenario.cruise_speed, SHORTEST)
-        horizons = [factor * duration for factor in HORIZON_FACTORS]
-    assert problem.field is not None
-    field = with_weight(problem.field, problem.proximity_weight)
-    searches = [SpaceTimeSearch(scenario, field, horizon) for horizon in horizons if horizon is not None]
-    searches = [search for search in searches if search.cheapest < math.inf]
-    energy = min((search.cheapest / search.horizon for search in searches), default=0.0)
-    return LocalOptima(scenario, problem, energy, budget, sharpness), searches
 
 
 def _lattices(scenario: Scenario, effort: Effort) -> Iterator[tuple[Callable[[], Lattice], bool]]:

@@ -17,7 +17,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.hard_limits import follow_best
-from leapnav.experts.optimum import find_optimum, time_searches
+from leapnav.experts.optimum import find_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.candidates import CandidateSearch, first_energy
@@ -25,6 +25,7 @@ from leapnav.experts.search.lattice import Lattice
 from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.search.local_optima import LocalOptima
 from leapnav.experts.solvers.initial_paths import local_minima
+from leapnav.experts.spacetime.searches import time_searches
 
 # Refinement, maximum cost relative to the first candidate, and number of candidates of the lattices.
 LATTICES = ((1, 1.6, 80), (2, 1.4, 80))

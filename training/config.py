@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self, cast, get_args
 
 _FOLDER = files("leapnav.training")
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
@@ -16,11 +16,9 @@ PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_
 
 # Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
 # robots of the user are text as well.
-FamilyName = (
-    Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
-    | Literal["crossing", "traffic", "crowd", "doors", "all"]
-    | str
-)
+_AtRest = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
+_Moving = Literal["crossing", "traffic", "crowd", "doors"]
+FamilyName = _AtRest | _Moving | Literal["all"] | str
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
@@ -132,8 +130,7 @@ class RunConfig:
     32 beams, narrow passages cannot be distinguished from wide ones. Demonstrations are observed again with these
     beams; a policy to start from must have the same number."""
     velocities: bool | None = None
-    """Whether the geodesic observation contains the velocity of the obstacle that each beam meets; by default if the
-    obstacles of the family move."""
+    """Whether the geodesic observation has the velocities of obstacles; by default if those of the family move."""
     history: tuple[float, ...] = ()
     """Ages of earlier observations that are part of the observation, such as 0.4, 1.2 and 2.8 (s)."""
     previous_action: bool | None = None
@@ -156,16 +153,9 @@ class RunConfig:
         history = {"history": self.history} if self.history else {}
         previous = {} if self.effort_weights is None else {"previous_action": True}
         beams = (64 if self.observation == "geodesic" else 128) if self.lidar_beams is None else self.lidar_beams
-        velocities = {"velocities": True} if self._observes_velocities else {}
+        is_default = self.observation == "geodesic" and self.family in get_args(_Moving)
+        velocities = {"velocities": True} if self.velocities or (self.velocities is None and is_default) else {}
         return {**observation, **velocities, "lidar_beams": beams, **robot, **horizon, **history, **previous}
-
-    @property
-    def _observes_velocities(self) -> bool:
-        if self.velocities is not None or self.observation != "geodesic":
-            return bool(self.velocities)
-        from leapnav.envs.scenarios.families import has_moving_obstacles
-
-        return has_moving_obstacles(self.family)
 
     @property
     def effort_weights(self) -> tuple[float, ...] | None:
@@ -410,8 +400,8 @@ def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
                 description = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))
                 environment = description["environment"]
                 sensors = {name: environment[name] for name in ("observation", "lidar_beams", "previous_action")}
-                velocities = environment.get("velocities", False)
-                return {**sensors, "velocities": velocities, "history": tuple(environment["history"])}
+                sensors["velocities"] = environment.get("velocities", False)
+                return {**sensors, "history": tuple(environment["history"])}
             except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
                 continue
     return {}

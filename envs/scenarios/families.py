@@ -40,7 +40,7 @@ TIME_WEIGHT = 0.5  # cost per second if the horizon is free
 RELATIVE_DURATION = 1.1
 MIN_DISTANCE = 0.4  # between start and goal, as a fraction of the shorter side of the arena
 MIN_POSE_CLEARANCE = 0.25  # m at the start and the goal
-# Time (s) at the beginning in which no obstacle comes closer to the start, and at the end to the goal, and checks in it.
+# Time (s) in which no obstacle comes closer to the start at first, and to the goal at the end; number of checks.
 POSE_TIME, N_POSE_TIMES = 1.0, 11
 PASSAGE_MARGIN = 0.1  # m on either side of the robot, in the narrowest passage that a scenario may require
 GRID_SPACING = 0.25  # m, of the grid on which the shortest path is computed

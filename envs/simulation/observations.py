@@ -388,8 +388,7 @@ def observe_robots(robots, packed, packed_buffers, out):
         if at.walls >= 0:
             surroundings = row[at.walls :]
             obstacles, vertices = settings.map_obstacles, settings.map_vertices
-            velocities = row[at.velocities :] if at.velocities >= 0 else row[:0]
-            map_surroundings(x, y, heading, episode.time, field, obstacles, vertices, surroundings, velocities)
+            map_surroundings(x, y, heading, episode.time, field, obstacles, vertices, surroundings)
         elif at.velocities >= 0:
             beam_velocities(sim.states[i], episode.time, field, beams, scratch, row[at.velocities :])
         for k in range(len(row)):

@@ -204,9 +204,9 @@ def check_map(field: np.ndarray, map_vertices: int) -> None:
 
 
 @kernel(
-    NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR, VECTOR),
+    NOTHING(float64, float64, float64, float64, CONSTANT, int64, int64, VECTOR),
 )
-def map_surroundings(x, y, heading, time, field, obstacles, vertices, out, velocities):
+def map_surroundings(x, y, heading, time, field, obstacles, vertices, out):
     """Describe the walls and the nearest parts of obstacles in the robot's frame, in order of distance.
 
     Each part of an obstacle is a polygon rounded by a radius; a disc has one vertex, a capsule two, a polygon the
@@ -218,17 +218,15 @@ def map_surroundings(x, y, heading, time, field, obstacles, vertices, out, veloc
         time: of the episode (s), for the positions of moving obstacles.
         field: the packed field of the scenario.
         obstacles, vertices: number of rows, and of vertices in each.
-        out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten.
-        velocities (2 obstacles or more,): overwritten by the velocities (m/s) of the parts, ahead and to the left; or
-            of length 0.
+        out (WALL_ENTRIES + obstacles (2 + 2 vertices),): overwritten. With 2 more entries for each obstacle, these are
+            the velocities (m/s) of the parts, ahead and to the left.
 
     """
     parts, arena, cos, sin = parts_in(field), header_of(field).arena, math.cos(heading), math.sin(heading)
     out[0], out[1], out[2], out[3] = x - arena[0], y - arena[1], arena[2] - x, arena[3] - y
     out[4], out[5] = cos, sin
+    end = WALL_ENTRIES + obstacles * (2 + 2 * vertices)
     out[WALL_ENTRIES:] = 0.0
-    if len(velocities) > 0:
-        velocities[: 2 * obstacles] = 0.0
     # Insertion sort into a list of the nearest shapes.
     distances = np.full(obstacles, np.inf)
     numbers = np.zeros(obstacles, np.int64)
@@ -247,9 +245,9 @@ def map_surroundings(x, y, heading, time, field, obstacles, vertices, out, veloc
         moved_x, moved_y = displacement_of(field, part, time)
         px, py = x - moved_x, y - moved_y
         edges = edges_of(field, part)
-        if len(velocities) > 0 and part.knots > 0:
+        if part.knots > 0 and end + 2 * obstacles <= len(out):
             _, _, vx, vy = motion_of(field, part, time)
-            velocities[2 * k], velocities[2 * k + 1] = cos * vx + sin * vy, cos * vy - sin * vx
+            out[end + 2 * k], out[end + 2 * k + 1] = cos * vx + sin * vy, cos * vy - sin * vx
         row = WALL_ENTRIES + k * (2 + 2 * vertices)
         out[row], out[row + 1] = 1.0, part.rounding
         for j in range(vertices):

@@ -177,10 +177,7 @@ class OptimalControlProblem:
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> OptimalControlProblem:
-        """Return the problem of a scenario, with the robot's limits as control bounds.
-
-        Among moving obstacles, the time is the last state: H + lambda_t is constant, and lambda_t(T) = 0.
-        """
+        """Return the problem of a scenario, whose last state is the time t if obstacles move, with lambda_t(T) = 0."""
         robot, cost, timed, bounds = scenario.robot, scenario.cost, scenario.moves, scenario.robot.state_bounds()
         return cls(
             system=system_of(type(robot), True) if timed else system_of(type(robot)),
