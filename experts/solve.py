@@ -22,7 +22,6 @@ from leapnav.envs.utils.validation import (
 from leapnav.experts.hard_limits import BARRIER_TOLERANCE, fitted_weight, follow_limit, softened
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.problem.certificate import failure
-from leapnav.experts.problem.clock import with_clock
 from leapnav.experts.problem.extremal import Extremal, SolveError, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory, as_problem
 from leapnav.experts.search.initial_guess import initial_guess
@@ -32,6 +31,7 @@ from leapnav.experts.solvers.leapfrog import leapfrog
 from leapnav.experts.solvers.multiple_shooting import multiple_shooting
 from leapnav.experts.solvers.nodes import SolverOptions, path_of
 from leapnav.experts.solvers.single_shooting import single_shooting
+from leapnav.experts.spacetime.clock import with_clock
 from leapnav.experts.transcription.direct import mean_running_cost
 
 Method = Literal["single_shooting", "multiple_shooting", "leapfrog", "collocation"]

@@ -223,8 +223,7 @@ class _ImitationConfig(RunConfig):
     """Settings shared by the runs of imitation learning."""
 
     observation: ObservationName = "geodesic"
-    """With the geodesic distance to the goal and the detour along each beam, from the complete map, or lidar alone,
-    which does not contain what is behind an obstacle."""
+    """With the geodesic distance to the goal and the detour along each beam, from the complete map, or lidar alone."""
     demos: tuple[Path, ...] = ()
     """Directories written by `leapnav rollout`; if none is given, demonstrations are generated in the run directory."""
     scenarios: int = 10_000

@@ -18,11 +18,11 @@ from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.numerics.shooting import hamiltonian
 from leapnav.experts.numerics.step_halving import step_halving
 from leapnav.experts.optimum import Effort, find_optimum
-from leapnav.experts.problem.clock import started_at, with_clock
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, ProblemArrays, Trajectory
 from leapnav.experts.solvers.newton import CONVERGED, MARGIN
 from leapnav.experts.solvers.nodes import start_nodes
+from leapnav.experts.spacetime.clock import started_at, with_clock
 
 # Maximum time (s) between nodes, tried in this order. Fewer nodes are faster, but the flow close to an obstacle can be
 # too sensitive for long segments, and so can that along a limit of the speed.

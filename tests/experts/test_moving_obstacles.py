@@ -21,11 +21,11 @@ from leapnav.experts import (
     verify,
 )
 from leapnav.experts.acting.feedback import Feedback
-from leapnav.experts.problem.clock import with_clock
 from leapnav.experts.problem.frames import orthonormalise
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.experts.search.path_class import path_sides
 from leapnav.experts.second_opinion import second_opinion
+from leapnav.experts.spacetime.clock import with_clock
 
 
 def crossing(velocity, **changes):
