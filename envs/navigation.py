@@ -82,11 +82,13 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `lidar` (`"lidar"` and `"geodesic"`) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
     | `detours` (`"geodesic"` only) | k | how much longer than the shortest path to the goal a path is that starts along beam k, for 0.25 m or more, or as far as there is room | m | 0 to 3 |
     | `distance` (`"geodesic"` only) | 0 | geodesic distance: length of the shortest path among the obstacles to the goal position | m | 0 to 2000 |
+    | `velocities` (`"geodesic"` with `velocities=True`) | k | velocity of the obstacle that beam k meets, in the robot's frame: all components ahead, then all to the left; 0 if it does not move | m/s | -20 to 20 |
     | `walls` (`"map"` only) | 0 to 3 | distances to the left, bottom, right and top wall of the arena | m | -1000 to 1000 |
     | | 4, 5 | cosine and sine of the heading | 1 | -1 to 1 |
     | `obstacles` (`"map"` only) | per obstacle: 0 | 1; in a row without an obstacle, all entries are 0 | 1 | 0 to 1 |
     | | 1 | radius of a disc or a capsule, 0 for a polygon | m | 0 to 1000 |
     | | 2 ... | vertices in the robot's frame: ahead, to the left; for a disc, its centre; for a capsule, its ends; repeated to fill the row | m | -1000 to 1000 |
+    | `velocities` (`"map"` with `velocities=True`) | 2k, 2k + 1 | velocity of obstacle k in the robot's frame: ahead, to the left | m/s | -20 to 20 |
 
     With `history=(0.4, 1.2)`, the observations 0.4 s and 1.2 s before follow in this order, each with all parts; before
     the start of an episode, its first observation is used.
@@ -170,6 +172,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `obstacles` | None | `"cost"` or `"hard"`, for scenarios with the proximity weight 0; None for that of the scenario or the bank, otherwise `"cost"`. Included banks with `"hard"` have the split `"test"` only |
     | `robot` | None | name of the robot's model, a dict of its fields with `model`, or a `RobotModel`; None for that of the scenario or the bank, otherwise the unicycle. Without an included bank for the robot, scenarios are fresh |
     | `observation` | `"lidar"` | `"lidar"`, `"state"`, `"map"` or `"geodesic"` |
+    | `velocities` | | whether `"map"` and `"geodesic"` contain the velocities of obstacles; by default if obstacles of the family, the bank or the scenario move. Lidar alone has none, see `history` |
     | `reward` | `"cost"` | `"cost"` or `"shaped"` |
     | `actuation` | `"velocity"` | `"velocity"` or `"motor"` |
     | `disturbance` | None | noise on actuation and sensing: a `Disturbance` or a dict of its attributes; a number d means `actuation` d, `slip` d and `sensing` d / 10 |

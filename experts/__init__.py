@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from leapnav.experts.data.demonstrations import load_demonstrations
     from leapnav.experts.data.optima import find_optima
     from leapnav.experts.data.rollouts import rollout
-    from leapnav.experts.plotting import plot_extremal
+    from leapnav.experts.plotting.extremals import plot_extremal
 
 __all__ = [
     "Certificate",
@@ -67,7 +67,7 @@ _LAZY = {
     "build_bank_of": "leapnav.experts.data.banks",
     "find_optima": "leapnav.experts.data.optima",
     "load_demonstrations": "leapnav.experts.data.demonstrations",
-    "plot_extremal": "leapnav.experts.plotting",
+    "plot_extremal": "leapnav.experts.plotting.extremals",
     "rollout": "leapnav.experts.data.rollouts",
 }
 

@@ -10,10 +10,13 @@ from matplotlib.figure import Figure
 
 from leapnav.envs import (
     Car,
+    Circle,
     DifferentialDrive,
     DynamicCar,
     DynamicUnicycle,
     NavigateEnv,
+    Obstacle,
+    Scenario,
     ScenarioBank,
     Trailer,
     Unicycle,
@@ -23,7 +26,8 @@ from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.utils.colors import OPTIMUM
 from leapnav.experts import ExpertPolicy, find_optimum, lower_bound, plot_extremal, solve
 from leapnav.experts.bounds.plotting import plot_tube
-from leapnav.experts.plotting import draw_robot, draw_scenario
+from leapnav.experts.plotting.animation import plot_moments
+from leapnav.experts.plotting.scenes import draw_robot, draw_scenario
 from leapnav.training import evaluate, load_policy, plot_episodes, policy_environment
 
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
@@ -62,6 +66,19 @@ def draw_robots() -> None:
         figure.savefig(IMAGES / f"robot_{model.name()}.png", dpi=100)
 
 
+def draw_before_or_behind() -> None:
+    """Draw the two optima of a disc that crosses the way, over time."""
+    disc = Obstacle(circle=Circle(center=(5.0, 1.4), radius=0.6), velocity=(0.0, 0.8))
+    street = Scenario(name="street", arena=(0, 2, 10, 8), start=(1, 5, 0), goal=(9, 5, 0), horizon=8, obstacles=(disc,))
+    best = find_optimum(street)
+    other = next(one for one in best.alternatives if one.path_class != best.path_class)
+    by_side = {one.path_class[0]: one for one in (best, other)}
+    # In front of the disc, which comes from the right: it passes on the right.
+    plots = {"before": by_side["right"], "behind": by_side["left"]}
+    titles = [f"{name}: J = {one.cost:.2f}" for name, one in plots.items()]
+    plot_moments(street, list(plots.values()), IMAGES / "before_or_behind.png", titles=titles)
+
+
 def draw_frames() -> None:
     """Draw frames of three episodes of the expert in progress."""
     frames = []
@@ -87,6 +104,7 @@ def main() -> None:
     scenario = sample_scenario("clutter", 910065)
     plot_extremal(find_optimum(scenario), IMAGES / "solution.png", scenario)
     scenario = sample_scenario("clutter", 9)
+    draw_before_or_behind()
     plot_extremal(solve(scenario, method="leapfrog", polish=False), IMAGES / "leapfrog.png", scenario)
     bank = ScenarioBank.shipped("clutter", "test")
     optimum = find_optimum(bank[TUBE])

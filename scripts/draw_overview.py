@@ -14,7 +14,7 @@ from leapnav.envs import NavigateEnv, Scenario, ScenarioBank
 from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.utils.colors import OPTIMUM, POLICY
 from leapnav.experts import Trajectory, find_optimum, solve
-from leapnav.experts.plotting import draw_robot, draw_scenario
+from leapnav.experts.plotting.scenes import draw_robot, draw_scenario
 from leapnav.experts.solvers.feasible_path import dense_path
 from leapnav.training import load_policy, policy_environment
 

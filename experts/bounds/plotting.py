@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from leapnav.envs.utils.colors import ALTERNATIVES, OPTIMUM
 from leapnav.experts.bounds.lower_bound import LowerBound
 from leapnav.experts.optimum import Optimum
-from leapnav.experts.plotting import draw_scenario
+from leapnav.experts.plotting.scenes import draw_scenario
 from leapnav.experts.proofs.cells import BLOCK, CellSet
 
 TUBE = LinearSegmentedColormap.from_list("tube", ["#d7e8f7", "#2f6fab"])

@@ -95,7 +95,7 @@ class Show:
         bank = _checked(self.file)
         _print_summary(bank)
         if self.plot is not None:
-            from leapnav.experts.plotting import plot_bank
+            from leapnav.experts.plotting.extremals import plot_bank
 
             plot_bank(bank, self.plot, self.count)
             print(f"wrote {self.plot}")

@@ -65,7 +65,7 @@ def test_a_method_that_fails_advises_and_the_cheapest_success_is_drawn(tmp_path,
     scenario, cost = next((scenario, cost) for scenario, cost in best_known() if scenario.name == "clutter-9")
     path, out, drawn = tmp_path / "scenario.json", tmp_path / "out.json", []
     scenario.to_json(path)
-    monkeypatch.setattr("leapnav.experts.plotting.plot_extremal", lambda extremal, *_: drawn.append(extremal))
+    monkeypatch.setattr("leapnav.experts.plotting.extremals.plot_extremal", lambda extremal, *_: drawn.append(extremal))
     arguments = ["solve", str(path), "--method", "all", "--plot", str(tmp_path / "path.png"), "--json", str(out)]
     assert main(arguments) == 0
     printed = capsys.readouterr().out

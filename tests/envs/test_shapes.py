@@ -26,7 +26,7 @@ from leapnav.envs.simulation.sensing import scan
 from leapnav.envs.utils.colors import OBSTACLE
 from leapnav.envs.utils.records import Point, Positive
 from leapnav.experts import find_optimum
-from leapnav.experts.plotting import draw_scenario
+from leapnav.experts.plotting.scenes import draw_scenario
 from leapnav.experts.search.path_class import path_sides
 
 

@@ -19,7 +19,7 @@ from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
 from leapnav.experts.hard_limits import barrier_integrals
 from leapnav.experts.optimum import find_reached_optimum
-from leapnav.experts.plotting import plot_extremal
+from leapnav.experts.plotting.extremals import plot_extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.play.solving import PlaySolver
 from leapnav.training import Dataset, evaluate

@@ -11,7 +11,7 @@ from leapnav.envs import Scenario, sample_scenario
 from leapnav.envs.robots import Box, Car, DifferentialDrive, Unicycle
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.experts import SolveError, Status, minimum_length
-from leapnav.experts.plotting import plot_pieces
+from leapnav.experts.plotting.extremals import plot_pieces
 
 RADIUS = 0.25
 

@@ -9,7 +9,7 @@ from helpers import best_known, published_problems
 from matplotlib.image import imread
 
 from leapnav.experts import ControlAffineSystem, OptimalControlProblem, solve
-from leapnav.experts.plotting import MAX_SWEEPS, plot_extremal, plot_solution
+from leapnav.experts.plotting.extremals import MAX_SWEEPS, plot_extremal, plot_solution
 from leapnav.experts.problem.certificate import failure
 from leapnav.experts.problem.extremal import Status
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.utils.colors import FAILURE, OPTIMUM
 from leapnav.envs.utils.tables import print_table
-from leapnav.experts.plotting import draw_scenario
+from leapnav.experts.plotting.scenes import draw_scenario
 from leapnav.training.scoring.decisions import Decisions, decisions_of, level_regrets
 from leapnav.training.scoring.results import Evaluation, bank_identity, bank_of
 

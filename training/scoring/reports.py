@@ -19,7 +19,7 @@ from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.envs.utils.tables import print_table
 from leapnav.experts.data.demonstrations import ENVIRONMENT
-from leapnav.experts.plotting import draw_scenario
+from leapnav.experts.plotting.scenes import draw_scenario
 from leapnav.training.scoring.barn import BarnScore
 from leapnav.training.scoring.comparison import Comparison
 from leapnav.training.scoring.results import Episode, bank_identity, bank_of

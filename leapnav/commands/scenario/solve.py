@@ -31,7 +31,8 @@ class Solve:
     """Method: "optimum" searches globally; the others solve from the best path of the lattice search, improved by
     direct transcription; "all" compares them."""
     plot: Path | None = None
-    """Picture of the solution (.png, .pdf or .svg); with "all", of the certified one of lowest cost."""
+    """Picture of the solution (.png, .pdf or .svg), or an animation (.gif); with "all", of the certified one of lowest
+    cost."""
     json: Path | None = None
     """JSON file of the solution (cost, certificate, states, controls, costates, history), with "all" of one per method;
     "-" for standard output."""
@@ -41,7 +42,7 @@ class Solve:
         from leapnav.envs.scenarios.scenario import Scenario
 
         scenario = Scenario.from_json(self.scenario)
-        check_outputs(self.json, self.plot)
+        check_outputs(self.json, **{"video" if self._is_animated else "plot": self.plot})
         return self._compare(scenario) if self.method == "all" else self._solve(scenario)
 
     def _solve(self, scenario: Scenario) -> int:
@@ -72,6 +73,10 @@ class Solve:
         self._write(scenario, extremal, extremal.to_dict())
         return 0 if extremal.success else FAILED
 
+    @property
+    def _is_animated(self) -> bool:
+        return self.plot is not None and self.plot.suffix == ".gif"
+
     def _compare(self, scenario: Scenario) -> int:
         extremals = _solve_by_all_methods(scenario)
         best = min(extremals.values(), key=lambda extremal: (not extremal.success, extremal.cost))
@@ -80,11 +85,13 @@ class Solve:
         return 0 if best.success else FAILED
 
     def _write(self, scenario: Scenario, extremal: Extremal | None, content: dict[str, Any]) -> None:
-        from leapnav.experts.plotting import plot_extremal
+        from leapnav.experts.plotting.animation import animate_extremal
+        from leapnav.experts.plotting.extremals import plot_extremal
 
         write_json(content, self.json)
         if self.plot is not None and extremal is not None and len(extremal.times):
-            plot_extremal(extremal, self.plot, scenario)
+            draw = animate_extremal if self._is_animated else plot_extremal
+            draw(extremal, self.plot, scenario)
             print(f"wrote {self.plot}")
 
 

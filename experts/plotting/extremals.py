@@ -1,4 +1,4 @@
-"""Plots of scenarios, paths and extremals with Matplotlib."""
+"""Plots of paths, extremals and banks with Matplotlib."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.colors import ALTERNATIVES, CURVES, EDGE, GOAL, OBSTACLE, OPTIMUM, START, WALL
 from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.optimum import Optimum
+from leapnav.experts.plotting.scenes import draw_robot, draw_scenario
 from leapnav.experts.problem.extremal import Extremal, Iteration
 from leapnav.experts.problem.problem import OptimalControlProblem
 from leapnav.experts.problem.system import ControlAffineSystem
@@ -34,7 +35,6 @@ PIECES = {"straight": OPTIMUM, "turn": CURVES[4], "contact": WALL}  # colors of 
 MAX_ALTERNATIVES = len(ALTERNATIVES)
 N_ROBOTS = 9  # robot outlines along a path, evenly spaced in time
 N_POINTS = 400  # points of a dense path
-N_POSITIONS = 6  # of a moving obstacle, evenly spaced in time
 N_FIELD_POINTS = 200  # sample points per side of an obstacle field
 MAX_BOUND = 3.0  # control bounds up to this multiple of the largest control are within the axes
 MIN_DRIFT = 1e-9  # smallest half-height of the Hamiltonian's axes, so that rounding errors do not fill them
@@ -42,47 +42,6 @@ SWEEPS = ("sweep", "reduce")  # Leapfrog's phases, whose iterates have a feasibl
 MAX_SWEEPS, N_FIRST_SWEEPS = 12, 4
 MIN_DISTANCE = 1e-10  # relative distance of costs: the end error that Leapfrog allows an arc
 MAX_LINEAR_SPREAD = 100.0  # in units of the smallest distance; a larger spread of costs is drawn on a logarithmic axis
-
-
-def draw_scenario(axes: Axes, scenario: Scenario) -> None:
-    """Draw arena, obstacles, start and goal to scale, in metres; moving obstacles at several times, ever fainter."""
-    x_min, y_min, x_max, y_max = scenario.arena
-    for obstacle in scenario.obstacles:
-        times = np.linspace(0.0, scenario.episode_limit, N_POSITIONS if len(obstacle.knots) else 1)
-        moved = displacements(obstacle.knots, times) if len(times) > 1 else np.zeros((1, 2))
-        for part in obstacle.shape.parts():
-            for k in range(len(times)):
-                fill = {"facecolor": OBSTACLE, "edgecolor": EDGE, "alpha": 0.7**k}
-                axes.add_patch(Polygon(part.outline() + moved[k], clip_on=True, **fill))
-    axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
-    for state, color in ((scenario.start_state, START), (scenario.goal_state, GOAL)):
-        draw_robot(axes, state, scenario.outline, color)
-    margin = 0.02 * (x_max - x_min)
-    axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - margin, y_max + margin), aspect="equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def draw_robot(axes: Axes, state: Sequence[float | None], outline: np.ndarray, color: str, **style: Any) -> None:
-    """Draw the outline (K, 5) of a robot, and a line along its heading unless that is None."""
-    q, heading = [value or 0.0 for value in state], state[2]
-    x, y = q[:2]
-    lines = {"fill": False, "edgecolor": color, "linewidth": 1.4, **style}
-    for row in outline.tolist():
-        (rear, front, _, radius, joint), axis = row, axis_of(row, q)
-        cos, sin = math.cos(axis), math.sin(axis)
-        if front > rear:
-            axes.add_patch(Polygon(corners_of(row, q), **lines))
-        else:
-            axes.add_patch(Circle((x + rear * cos, y + rear * sin), radius, **lines))
-        if joint:  # the drawbar
-            axes.plot([x, x + front * cos], [y, y + front * sin], color=color, **{"linewidth": 1.4, **style})
-    if heading is not None:
-        cos, sin = math.cos(heading), math.sin(heading)
-        reach = float((outline[:, 1] + 0.6 * outline[:, 2] + 1.6 * outline[:, 3]).max())
-        axes.plot([x, x + reach * cos], [y, y + reach * sin], color=color, **{"linewidth": 1.8, **style})
 
 
 def plot_solution(scenario: Scenario, extremal: Extremal, path: str | os.PathLike[str]) -> None:

@@ -1,0 +1,1 @@
+"""Plots of scenarios, extremals and banks with Matplotlib."""
