@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 FAILED = 1  # exit code of a command that ran to its end with a negative result
-PICTURES, VIDEOS, PAGES = (".png", ".pdf", ".svg"), (".mp4",), (".html",)
+PICTURES, ANIMATIONS, VIDEOS, PAGES = (".png", ".pdf", ".svg"), (".gif",), (".mp4",), (".html",)
 STDOUT = Path("-")
 _json_stream: ContextVar[TextIO | None] = ContextVar("json_stream", default=None)
 
@@ -21,6 +21,7 @@ def check_outputs(
     video: Path | None = None,
     page: Path | None = None,
     onnx: Path | None = None,
+    animation: Path | None = None,
 ) -> None:
     """Check that the output files of a command can be written, before its work begins.
 
@@ -30,6 +31,7 @@ def check_outputs(
         video: video.
         page: HTML page.
         onnx: ONNX file.
+        animation: animation.
 
     Raises:
         FileNotFoundError: the directory of a file does not exist.
@@ -37,12 +39,13 @@ def check_outputs(
         ValueError: the suffix of a file is not one of the supported formats.
 
     """
-    for path in (None if json == STDOUT else json, plot, video, page, onnx):
+    for path in (None if json == STDOUT else json, plot, video, page, onnx, animation):
         if path is not None and not path.parent.is_dir():
             raise FileNotFoundError(f"{path}: the directory does not exist")
         if path is not None and path.is_dir():
             raise IsADirectoryError(f"{path}: is a directory")
-    for path, formats in ((plot, PICTURES), (video, VIDEOS), (page, PAGES), (onnx, (".onnx",))):
+    kinds = (plot, PICTURES), (animation, ANIMATIONS), (video, VIDEOS), (page, PAGES), (onnx, (".onnx",))
+    for path, formats in kinds:
         if path is not None and path.suffix not in formats:
             raise ValueError(f"{path}: expected a name that ends in {', '.join(formats)}")
 

@@ -12,12 +12,9 @@ import sympy as sp
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from leapnav.envs.field.clearance import clearance
-from leapnav.envs.field.packing import displacements
-from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.colors import ALTERNATIVES, CURVES, EDGE, GOAL, OBSTACLE, OPTIMUM, START, WALL

@@ -1,5 +1,7 @@
 """Small multiples and animations of optima among moving obstacles."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -31,7 +33,7 @@ def test_an_animation_takes_as_long_as_the_path_and_shows_the_motion(scenario, o
             durations.append(image.info["duration"])
             frames.append(np.asarray(image.convert("RGB")).copy())
     assert sum(durations[:-1]) == pytest.approx(1000 * scenario.horizon, abs=300) and durations[-1] == 1000
-    assert all((a != b).any() for a, b in zip(frames, frames[1:], strict=False))
+    assert all((a != b).any() for a, b in pairwise(frames))
 
 
 def test_small_multiples_have_a_row_for_each_optimum(scenario, optimum, tmp_path):

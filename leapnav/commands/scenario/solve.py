@@ -42,7 +42,7 @@ class Solve:
         from leapnav.envs.scenarios.scenario import Scenario
 
         scenario = Scenario.from_json(self.scenario)
-        check_outputs(self.json, **{"video" if self._is_animated else "plot": self.plot})
+        check_outputs(self.json, **{"animation" if self._is_animated else "plot": self.plot})
         return self._compare(scenario) if self.method == "all" else self._solve(scenario)
 
     def _solve(self, scenario: Scenario) -> int:
