@@ -54,6 +54,7 @@ bench: .venv/installed
 	$(BIN)/python benchmarks/stages.py
 	$(BIN)/python benchmarks/lower_bounds.py
 	$(BIN)/python benchmarks/labels.py
+	$(BIN)/python benchmarks/moving.py
 
 coverage: compile
 	$(PYTEST) --cov=envs --cov=experts --cov=training --cov=leapnav --cov-report=term

@@ -52,9 +52,8 @@ def main() -> None:
     """Print both."""
     for observation in ("state", "lidar", "map", "geodesic"):
         at_rest, moving = step_times(observation)
-        print(
-            f"{observation:9} step of a robot: at rest {at_rest:.2f} us, moving {moving:.2f} us, rate {at_rest / moving:.2f}"
-        )
+        ratio = at_rest / moving
+        print(f"{observation:9} step of a robot: at rest {at_rest:.2f} us, moving {moving:.2f} us, rate {ratio:.2f}")
     for family in MOVING_LAYOUTS:
         scenarios = [sample_scenario(family, FIRST_SEED + k) for k in range(SCENARIOS)]
         for effort in EFFORTS:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import scenario_fields
 
-from leapnav.envs import NavigateEnv, Scenario, ScenarioError
+from leapnav.envs import NavigateEnv, NavigateVectorEnv, Scenario, ScenarioError
 from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.field.layout import read_header
 from leapnav.envs.field.moving import moving_disc_proximity, moving_footprint_proximity
@@ -194,3 +194,86 @@ def test_the_cost_of_standing_beside_a_passing_obstacle_is_its_integral():
     values = [footprint_value(np.array([1.0, 1.0, 0.0, t]), scenario.outline, scenario.field) for t in times]
     assert infos[-1]["cost"] == pytest.approx(np.trapezoid(values, times), rel=2e-4)
     assert math.isclose(end, 20 * infos[0]["time"])
+
+
+SCENE = [
+    {"circle": {"center": [3.0, 1.0], "radius": 0.5}, "velocity": [0.0, 0.5]},
+    {"polygon": {"vertices": [[1.0, 3.0], [2.0, 3.0], [1.5, 4.0]]}},
+    {"capsule": {"start": [-1.0, 0.5], "end": [-1.0, 1.5], "radius": 0.3}, "velocity": [-0.2, 0.1]},
+]
+
+
+def observed(observation, heading, **options):
+    scenario = task(SCENE, start=[1.0, 1.0, heading], goal=[7.0, 7.0, 0.0], arena=[-5, -5, 10, 10])
+    env = NavigateEnv(scenario=scenario, observation=observation, lidar_beams=64, **options)
+    flat, _ = env.reset(seed=0)
+    return {name: flat[part] for name, part in env._simulator.layout.parts.items()}, env
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_beams_have_the_velocity_of_what_they_meet(heading):
+    parts, _ = observed("geodesic", heading)
+    ahead, left = parts["velocities"].reshape(2, 64)
+    angles = heading + 2 * math.pi * np.arange(64) / 64
+    found = ahead * np.exp(1j * heading) + left * np.exp(1j * (heading + math.pi / 2))
+    hits = np.array([1.0 + 1.0j]) + parts["lidar"] * np.exp(1j * angles)
+    expected = np.zeros(64, complex)
+    expected[np.abs(np.abs(hits - (3.0 + 1.0j)) - 0.5) < 1e-5] = 0.5j
+    on_capsule = np.abs(np.abs(hits.real + 1.0) - 0.3) < 1e-5
+    expected[on_capsule & (hits.imag > 0.5) & (hits.imag < 1.5)] = -0.2 + 0.1j
+    met = expected != 0
+    assert met.sum() > 8
+    np.testing.assert_allclose(found[met], expected[met], atol=1e-6)
+    assert (found[(np.abs(hits.real) > 4) | (hits.imag > 2.5)] == 0).all()  # walls, and what is at rest
+
+
+def test_the_map_has_the_velocities_in_its_order():
+    parts, _ = observed("map", math.pi / 2)
+    rows = parts["obstacles"].reshape(8, 18)
+    velocities = parts["velocities"].reshape(8, 2)
+    assert rows[:3, 0].all() and not rows[3:].any() and not velocities[3:].any()
+    by_radius = {round(float(radius), 3): velocity for radius, velocity in zip(rows[:3, 1], velocities, strict=False)}
+    np.testing.assert_allclose(by_radius[0.5], [0.5, 0.0], atol=1e-6)  # upwards is ahead
+    np.testing.assert_allclose(by_radius[0.3], [0.1, 0.2], atol=1e-6)
+    np.testing.assert_allclose(by_radius[0.0], [0.0, 0.0])
+
+
+def test_velocities_are_observed_where_obstacles_move_unless_it_is_said():
+    assert observed("map", 0.0)[1].settings.velocities and observed("geodesic", 0.0)[1].settings.velocities
+    assert "velocities" not in observed("map", 0.0, velocities=False)[0]
+    assert "velocities" not in observed("lidar", 0.0)[0]
+    at_rest = NavigateEnv("clutter", observation="map")
+    assert not at_rest.settings.velocities
+    assert (
+        NavigateEnv("clutter", observation="map", velocities=True).observation_space.shape[0]
+        == 16 + (at_rest.observation_space.shape[0])
+    )
+    assert NavigateEnv("crossing", observation="geodesic").settings.velocities
+    with pytest.raises(ValueError, match="velocities: expected False for the observation 'lidar', got True"):
+        NavigateEnv("crossing", velocities=True)
+
+
+def test_the_geodesic_distance_is_that_among_obstacles_at_rest():
+    parts, _ = observed("geodesic", 0.0)
+    still = task([SCENE[1]], start=[1.0, 1.0, 0.0], goal=[7.0, 7.0, 0.0], arena=[-5, -5, 10, 10])
+    flat, _ = NavigateEnv(scenario=still, observation="geodesic", lidar_beams=64).reset(seed=0)
+    assert parts["distance"][0] == flat[-1]
+
+
+@pytest.mark.parametrize("observation", ["lidar", "map", "geodesic"])
+def test_vector_episodes_are_bitwise_those_of_single_environments(observation):
+    options = {"family": "crowd", "split": "test", "observation": observation}
+    venv = NavigateVectorEnv(4, **options)
+    batch, _ = venv.reset(options={"index": [0, 1, 2, 3]})
+    singles = [NavigateEnv(**options) for _ in range(4)]
+    for k, env in enumerate(singles):
+        assert (env.reset(options={"index": k})[0] == batch[k]).all()
+    actions = np.random.default_rng(0).uniform(-1, 1, (25, 4, 2)).astype(np.float32)
+    ended = np.zeros(4, bool)
+    for action in actions:
+        batch, rewards, terminated, truncated, _ = venv.step(action)
+        for k, env in enumerate(singles):
+            if not ended[k]:
+                observation, reward, *_ = env.step(action[k])
+                assert (observation == batch[k]).all() and reward == rewards[k]
+        ended |= terminated | truncated
