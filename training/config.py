@@ -16,9 +16,9 @@ PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_
 
 # Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
 # robots of the user are text as well.
-_AtRest = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
-_Moving = Literal["crossing", "traffic", "crowd", "doors"]
-FamilyName = _AtRest | _Moving | Literal["all"] | str
+AtRest = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
+Moving = Literal["crossing", "traffic", "crowd", "doors"]
+FamilyName = Literal[AtRest, Moving, "all"] | str
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_car", "dynamic_unicycle"] | str
 HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
@@ -153,7 +153,7 @@ class RunConfig:
         history = {"history": self.history} if self.history else {}
         previous = {} if self.effort_weights is None else {"previous_action": True}
         beams = (64 if self.observation == "geodesic" else 128) if self.lidar_beams is None else self.lidar_beams
-        is_default = self.observation == "geodesic" and self.family in get_args(_Moving)
+        is_default = self.observation == "geodesic" and self.family in get_args(Moving)
         velocities = {"velocities": True} if self.velocities or (self.velocities is None and is_default) else {}
         return {**observation, **velocities, "lidar_beams": beams, **robot, **horizon, **history, **previous}
 

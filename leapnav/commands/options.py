@@ -8,14 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from leapnav.training.config import FamilyName, HorizonName, ObstaclesName, RobotName
+from leapnav.training.config import AtRest, FamilyName, HorizonName, Moving, ObstaclesName, RobotName
 
 # Literals, so that the help texts show the choices and shells complete them; a test compares them with the packages.
-Family = (
-    Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
-    | Literal["crossing", "traffic", "crowd", "doors"]
-    | str
-)
+Family = Literal[AtRest, Moving] | str
 FamilyOrAll = FamilyName
 Robot = RobotName
 Horizon = HorizonName

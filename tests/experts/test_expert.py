@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank
-from leapnav.envs.field.clearance import clearance
+from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.experts import ExpertPolicy, NoOptimumError, Trajectory, find_optimum
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.training import make_vec_env
@@ -64,13 +64,11 @@ def test_the_expert_continues_after_a_push():
             direction = rng.uniform(-np.pi, np.pi)
             push = [0.5 * np.cos(direction), 0.5 * np.sin(direction), rng.choice([-0.5, 0.5])]
             state, time = reference.states[k] + push, float(reference.times[k])
-            if clearance(state[0], state[1], scenario.field)[0] < 0.1:
+            if footprint_clearance(np.append(state, time), scenario.outline, scenario.field)[0] < 0.1:
                 continue
             tried += 1
             assert feedback.update(state, time)
-            best = find_optimum(
-                scenario.model_copy(update={"start": tuple(state.tolist()), "horizon": scenario.horizon - time})
-            )
+            best = find_optimum(scenario.from_state(state, time))
             cost, _ = feedback.value(state, time)
             assert cost >= best.cost - 1e-6
             assert cost <= 1.5 * best.cost + 0.5

@@ -96,6 +96,36 @@ def test_mirroring_and_time_reversal_are_symmetries_of_the_environment():
             assert other_reward == pytest.approx(reward, rel=1e-6)
 
 
+def test_the_velocities_of_obstacles_have_the_symmetries_too():
+    fields = sample_scenario("crossing", 5).to_dict()
+    (x, y, heading), (goal_x, goal_y, goal_heading) = fields["start"], fields["goal"]
+
+    def reflected(obstacle):
+        circle, (vx, vy) = obstacle["circle"], obstacle["velocity"]
+        return {
+            "circle": {**circle, "center": [10.0 - circle["center"][0], circle["center"][1]]},
+            "velocity": [-vx, vy],
+        }
+
+    ends = {"start": [10.0 - x, y, math.pi - heading], "goal": [10.0 - goal_x, goal_y, math.pi - goal_heading]}
+    turned = {"start": [x, y, heading + math.pi], "goal": [goal_x, goal_y, goal_heading + math.pi]}
+    transformed = {mirror: {**ends, "obstacles": list(map(reflected, fields["obstacles"]))}, time_reverse: turned}
+    for transform, changes in transformed.items():
+        env, other = (
+            NavigateEnv(scenario=Scenario.from_dict(one), observation="geodesic", lidar_beams=64)
+            for one in (fields, {**fields, **changes})
+        )
+        observation, expected = env.reset()[0], other.reset()[0]
+        for _ in range(20):
+            action = np.array([0.2, 0.1], np.float32)
+            inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None], env.settings)
+            found, part = inputs[0].numpy(), env._simulator.layout.parts["velocities"]
+            assert np.abs(expected[part]).max() > 0.0
+            close = np.abs(found - expected) < 1e-3
+            assert close[:9].all() and close.mean() > 0.97  # a beam along the rim of a disc may miss it
+            observation, expected = env.step(action)[0], other.step(targets[0].numpy())[0]
+
+
 def test_time_reversal_needs_an_even_number_of_beams():
     with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
         time_reverse(th.zeros(1, 12), th.zeros(1, 2), EnvironmentSettings(lidar_beams=3))

@@ -13,6 +13,8 @@ SOC = {
     "all": 0.986,
     "car-clutter": 0.967,
     "clutter": 0.992,
+    "crossing": 0.869,
+    "crowd": 0.8,
     "dynamic_unicycle-clutter": 0.938,
     "free-clutter": 0.901,
     "open": 0.997,
@@ -23,7 +25,7 @@ SOC = {
 
 
 def test_the_policies_that_ship_are_small():
-    assert sum(file.stat().st_size for file in SHIPPED.glob("*/*")) < 4_000_000
+    assert sum(file.stat().st_size for file in SHIPPED.glob("*/*")) < 5_500_000
     assert {folder.name for folder in SHIPPED.iterdir()} == set(shipped_policies()) == set(SOC)
 
 
