@@ -77,7 +77,10 @@ def certify(
         capacity *= 4
     if n_rows < 0:
         return failure(problem, Status.DIVERGED if converged is Status.SUCCESS else converged, history, evaluations)
-    out, terms = out[:n_rows].copy(), terms[: n_rows - 1].copy()
+    # The step across a knot of a path at the end of a segment may be shorter than the rounding error of the time.
+    lasting = np.diff(out[:n_rows, 0]) > 0.0
+    out, terms = out[:n_rows][np.append(lasting, True)], terms[: n_rows - 1][lasting]
+    conjugate_step -= int((~lasting[: max(conjugate_step, 0)]).sum())
     z = np.ascontiguousarray(out[:, 3 + m : 3 + m + 2 * n])
     states, costates = z[:, :n], z[:, n:]
     hamiltonian = out[:, 2] + np.sum(costates * out[:, 3 + m + 2 * n : 3 + m + 3 * n], axis=1)

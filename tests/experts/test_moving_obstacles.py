@@ -255,6 +255,7 @@ def test_steps_end_at_the_knots_of_a_path():
     optimum = find_optimum(scenario)
     assert optimum.success and optimum.certificate.defect < 1e-9
     assert optimum.certificate.hamiltonian_drift < 1e-8
+    assert np.diff(optimum.times).min() > 0.0
     assert verify(optimum) < 1e-6  # SciPy's integrator does not know the knots
     assert (np.abs(optimum.times[:, None] - times) < 1e-9).any(axis=0)[1:].sum() >= 15
 
