@@ -15,8 +15,8 @@ from leapnav.experts.spacetime.lattice import grid_of, sample_layers, spread
 # Largest numbers of path classes and of candidates. Of 40 scenarios of each family with moving obstacles, 2 optima are
 # missed, compared with 400 candidates; with 16 classes and 32 candidates the same, in 1.3 times the time.
 MAX_CLASSES, MAX_CANDIDATES = 24, 20
-# Cost of a turn, as a fraction of that at the mean power of the cheapest path. In each family with moving obstacles, 95 %
-# of 40 to 60 scenarios have their optimum among the first 8 candidates; with 0, among the first 44.
+# Cost of a turn, as a fraction of that at the mean power of the cheapest path. In each family with moving obstacles,
+# 95 % of 40 to 60 scenarios have their optimum among the first 8 candidates; with 0, among the first 44.
 TURN_SHARE = 0.35
 MAX_EXCESS = 1.0  # relative to the cheapest path, of a class
 SLOW = 0.2  # fraction of the mean speed below which a path has no direction
