@@ -20,7 +20,7 @@ EFFORTS = "high", "medium"
 
 
 def scene(moving: bool) -> Scenario:
-    """A scenario with discs that circle the robot's way at a distance, or stand there."""
+    """A scenario with discs at a distance from the robot, which move at right angles to its direction, or stand."""
     rng = np.random.default_rng(0)
     obstacles = []
     for _ in range(DISCS):
