@@ -26,7 +26,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "polygons": {"scenarios": 8000},
     "rooms": {"scenarios": 8000},
     "slalom": {"scenarios": 4000, "dagger": DAggerConfig(max_episodes=6000)},
-    **{family: {"scenarios": 5000} for family in MOVING},
+    "crossing": {"scenarios": 5000},
+    "crowd": {"scenarios": 5000, "dagger": DAggerConfig(rounds=6, max_failures=300)},
 }
 NAMES = (*ALL_FAMILIES, *MOVING, ALL, *(collection_name("clutter", robot) for robot in ROBOTS), FREE)
 

@@ -36,6 +36,9 @@ MIN_GRID_CELLS, MAX_GRID_CELLS, REACHES_PER_CELL = 16, 128, 2.0
 _NO_EDGES = np.empty((0, EDGE_SIZE))
 NO_KNOTS = np.empty((0, KNOT_SIZE))
 
+# Fields that were packed here with their grids, by their identity; to check a field takes as long as a short search.
+_checked: WeakValueDictionary[int, np.ndarray] = WeakValueDictionary()
+
 
 class FieldPart(NamedTuple):
     """A disc or a rounded convex polygon of a packed field.
@@ -120,6 +123,8 @@ def _pack(
     whole = (header, np.array(rows, PART), np.concatenate([_NO_EDGES, *edges]), knots, numbers)
     field = np.concatenate([np.ascontiguousarray(one).view(np.float64).ravel() for one in whole])
     field.flags.writeable = False
+    if grid:
+        _checked[id(field)] = field
     return field
 
 
@@ -261,10 +266,6 @@ def with_weight(packed: np.ndarray, weight: float, least_distance: float | None 
     return field
 
 
-# Fields that `check_field` has accepted, by their identity; the check takes as long as a short search.
-_checked: WeakValueDictionary[int, np.ndarray] = WeakValueDictionary()
-
-
 def check_field(packed: np.ndarray) -> np.ndarray:
     """Check that kernels can read a packed field, and return it, read-only and with its grid.
 
@@ -286,7 +287,6 @@ def check_field(packed: np.ndarray) -> np.ndarray:
         raise ValueError(f"field: not a packed field (Scenario.field): {error}") from None
     if not any(_equals(packed, field) for field in fields):
         raise ValueError("field: not a packed field (Scenario.field): its entries contradict each other")
-    _checked[id(fields[0])] = fields[0]
     return fields[0]
 
 

@@ -24,6 +24,10 @@ class Observer:
     def __init__(self, settings: EnvironmentSettings | None = None) -> None:
         self._simulator = BatchSimulator(BATCH, settings or EnvironmentSettings())
 
+    def __reduce__(self) -> tuple[type[Observer], tuple[EnvironmentSettings]]:
+        """Leave out the arrays: those of a history are large enough that joblib would share them, read-only."""
+        return Observer, (self._simulator.settings,)
+
     def observe(
         self,
         scenarios: Sequence[Scenario],

@@ -7,8 +7,10 @@ import numpy as np
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, NOTHING
 from leapnav.experts.numerics.flow import AFFINE_FUNCTION
+from leapnav.experts.numerics.linear import eliminate, substitute
 
 RELATIVE_SHIFT = 1e-12  # of the diagonal of B'B, relative to its trace
+TINY = float(np.finfo(float).tiny)
 
 
 @kernel(NOTHING(AFFINE_FUNCTION, CONSTANT, MATRIX, MATRIX, CUBE))
@@ -28,9 +30,26 @@ def least_norm_costates(fields: np.ndarray, switching: np.ndarray) -> np.ndarray
     return np.einsum("kij,kj->ki", fields, _solve_gram(fields, switching))
 
 
-def _solve_gram(fields: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve B'B x = right, where B'B is kept regular if fields are linearly dependent."""
-    with np.errstate(all="ignore"):  # the dynamics may be infinite somewhere
-        gram = np.einsum("kij,kil->kjl", fields, fields)
-        shift = RELATIVE_SHIFT * np.einsum("kjj->k", gram) + np.finfo(float).tiny
-        return np.linalg.solve(gram + shift[:, None, None] * np.eye(gram.shape[1]), right[:, :, None])[:, :, 0]
+@kernel(MATRIX(CUBE, MATRIX))
+def _solve_gram(fields, right):
+    """Solve B'B x = right (N, m), where B'B is kept regular if fields B (N, n, m) are linearly dependent.
+
+    The solution is not finite where the dynamics are not.
+    """
+    count, n, m = fields.shape
+    result, system = np.empty((count, m)), np.empty((m, m + 1))
+    for k in range(count):
+        trace = 0.0
+        for i in range(m):
+            for j in range(m):
+                system[i, j] = 0.0
+                for r in range(n):
+                    system[i, j] += fields[k, r, i] * fields[k, r, j]
+            trace += system[i, i]
+            system[i, m] = right[k, i]
+        for i in range(m):
+            system[i, i] += RELATIVE_SHIFT * trace + TINY
+        if eliminate(system, False, 0.0) == 0.0:
+            system[:] = np.nan
+        substitute(system, result[k])
+    return result

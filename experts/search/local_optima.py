@@ -149,7 +149,8 @@ class LocalOptima:
             1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE
         )
         self._wound: dict[tuple[float | None, ...], OptimalControlProblem] = {}  # by the goal
-        self._seen: list[np.ndarray] = []
+        self._found: list[tuple[Extremal, np.ndarray]] = []  # the distinct extremals, with their shapes
+        self._seen = np.empty((0, len(COMPARED_FRACTIONS), 3))
 
     @property
     def certified(self) -> list[Extremal]:
@@ -309,7 +310,7 @@ class LocalOptima:
         refined = self.refine(problem, direct)
         refined_shape = _shape(refined.times, refined.states)
         is_duplicate = self._is_seen(refined_shape)
-        self._seen += [shape, refined_shape]
+        self._seen = np.concatenate([self._seen, [shape, refined_shape]])
         if is_duplicate:
             return Verdict(Outcome.DUPLICATE, problem, refined)
         if self._is_discarded(refined, REFINED_ERROR):
@@ -331,7 +332,7 @@ class LocalOptima:
         is_expensive = self._is_expensive(refined, REFINED_ERROR)
         extremal, evaluations = None, 0
         if is_feasible or not self.certified:
-            extremal, evaluations = self._extremal(problem, self._attempts(problem, refined), self._extremals())
+            extremal, evaluations = self._extremal(problem, self._attempts(problem, refined), self._found)
         if is_expensive:
             self._budget -= evaluations
         return self._verdict(problem, refined, extremal)
@@ -340,9 +341,11 @@ class LocalOptima:
         """Return the end of a path with its extremal."""
         if extremal is None:
             return Verdict(Outcome.STALLED, problem, path)
-        if self._is_known(extremal):
+        shape = _shape(extremal.times, extremal.states)
+        if self._is_known(extremal, shape):
             return Verdict(Outcome.DUPLICATE, problem, path, extremal)
-        self._seen.append(_shape(extremal.times, extremal.states))
+        self._found.append((extremal, shape))
+        self._seen = np.concatenate([self._seen, shape[None]])
         if not extremal.success:
             return Verdict(Outcome.REFUSED, problem, path, extremal)
         return Verdict(Outcome.CERTIFIED, problem, path, extremal, expected_limit(without_barrier(extremal)))
@@ -364,7 +367,7 @@ class LocalOptima:
         self,
         problem: OptimalControlProblem,
         attempts: Iterable[tuple[int, DirectPath]],
-        known: Sequence[Extremal] = (),
+        known: Sequence[tuple[Extremal, np.ndarray]] = (),
         max_iterations: int = NEWTON_ITERATIONS,
     ) -> tuple[Extremal | None, int]:
         """Apply multiple shooting in several attempts, until one succeeds or a path is close to a known extremal.
@@ -374,8 +377,8 @@ class LocalOptima:
         history: tuple[Iteration, ...] = ()
         total, refused = 0, None
         for segments, direct in attempts:
-            for extremal in known:
-                if self._is_close(_shape(direct.times, direct.states), _shape(extremal.times, extremal.states)):
+            for extremal, shape in known:
+                if self._is_close(_shape(direct.times, direct.states), shape):
                     return extremal, total
             times, nodes = direct.nodes(problem, segments)
             status, rows, evaluations = polish_in_stages(problem, times, nodes, TOLERANCE, max_iterations)
@@ -389,11 +392,6 @@ class LocalOptima:
                 elif len(found.times):  # otherwise re-integration diverged
                     return found, total
         return refused, total
-
-    def _extremals(self) -> list[Extremal]:
-        """Return the distinct extremals."""
-        found = (Outcome.CERTIFIED, Outcome.REFUSED)
-        return [v.extremal for v in self.verdicts if v.outcome in found and v.extremal is not None]
 
     def _pieces(self, path: DirectPath) -> np.ndarray:
         """Return the numbers of parts (N,), at least 2, into which the intervals of a path are divided.
@@ -428,14 +426,13 @@ class LocalOptima:
 
     def _is_seen(self, shape: np.ndarray) -> bool:
         """Return whether a path, given by its `_shape`, is a duplicate of an earlier one."""
-        return any(self._is_close(shape, other) for other in self._seen)
+        return bool((np.abs(self._seen - shape).max(axis=(1, 2)) < self._duplicate_distance).any())
 
-    def _is_known(self, extremal: Extremal) -> bool:
+    def _is_known(self, extremal: Extremal, shape: np.ndarray) -> bool:
         """Return whether an extremal is a duplicate of an earlier one."""
-        shape = _shape(extremal.times, extremal.states)
-        for other in self._extremals():
+        for other, other_shape in self._found:
             is_same_cost = abs(extremal.cost - other.cost) <= DUPLICATE_COST_TOLERANCE * abs(other.cost)
-            if is_same_cost and self._is_close(shape, _shape(other.times, other.states)):
+            if is_same_cost and self._is_close(shape, other_shape):
                 return True
         return False
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from itertools import product
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice, product
 
 import numpy as np
 
 from leapnav.envs.field.packing import field_parts, obstacle_centres, replace_parts
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.problem.problem import Trajectory
-from leapnav.experts.spacetime.lattice import grid_of, sample_layers, spread
+from leapnav.experts.spacetime.lattice import add_crossings, grid_of, sample_layers, spread
 
 # Largest numbers of path classes and of candidates. Of 40 scenarios of each family with moving obstacles, 2 optima are
 # missed, compared with 400 candidates; with 16 classes and 32 candidates the same, in 1.3 times the time.
@@ -23,6 +25,7 @@ SLOW = 0.2  # fraction of the mean speed below which a path has no direction
 CUSPS = 0.15, 0.5, 0.85  # fractions of the path at which the driving direction may change
 BOTH_SIDES = math.pi / 2  # rad, of a turn above which the turn to the other side is considered, too
 OFFSET = 1e-6  # cells
+SIMILAR = 1.5  # m within which two paths of a class are similar
 
 
 class SpaceTimeSearch:
@@ -57,16 +60,17 @@ class SpaceTimeSearch:
         for pose, order in ((scenario.start, 1), (scenario.goal, -1)):
             cell = [round((pose[0] - grid.x0) / grid.cell), round((pose[1] - grid.y0) / grid.cell)]
             cell = np.clip(cell, 0, [grid.columns - 1, grid.lines - 1]).tolist()
-            layers, ordered = np.ascontiguousarray(costs[::order]), np.ascontiguousarray(centres[::order])
-            values, parents = np.empty_like(costs), np.empty(costs.size, np.int64)
-            signatures = np.empty(costs.size, np.int64)
-            spread(layers, np.array([*cell, grid.reach]), weight, values, parents, ordered, signatures)
-            shape = costs.shape
-            found.append([array.reshape(shape)[::order] for array in (values, parents, signatures)])
-        (self._before, self._parents, signed), (self._after, self._children, unsigned) = found
-        self._totals = self._before + self._after - np.where(np.isfinite(costs), costs, 0.0)
-        self._signatures = signed - unsigned
+            values, parents = np.empty_like(costs), np.empty(costs.shape, np.int32)
+            layers = np.ascontiguousarray(costs[::order])
+            spread(layers, np.array([*cell, grid.reach]), weight, values, parents)
+            found.append([np.ascontiguousarray(array[::order]) for array in (values, parents)])
+        (before, self._parents), (after, self._children) = found
+        self._totals = before + after - np.where(np.isfinite(costs), costs, 0.0)
         self.cheapest = float(self._totals.min())
+        limit = self.cheapest * (1.0 + MAX_EXCESS)
+        self._signatures = np.zeros(costs.shape, np.int64)
+        for parents, order in ((self._parents, 1), (self._children, -1)):
+            add_crossings(self._totals, limit, parents, order, centres, self._signatures)
         turn_weight = scenario.robot.metric(scenario.cost)[1]
         power = self.cheapest / horizon if self.cheapest < math.inf else 0.0
         self._turn_cost = TURN_SHARE * math.sqrt(2.0 * turn_weight * power)
@@ -79,17 +83,36 @@ class SpaceTimeSearch:
             count: largest number of paths.
 
         """
-        totals = self._totals
-        order = np.argsort(totals, axis=None, kind="stable")
-        flat, signatures = totals.ravel()[order], self._signatures.ravel()[order]
-        end = int(np.searchsorted(flat, self.cheapest * (1.0 + MAX_EXCESS)))
-        _, first = np.unique(signatures[:end], return_index=True)
-        found: list[tuple[float, Trajectory]] = []
-        for index in np.sort(first)[:classes].tolist():
-            modes = self._lifted(self._positions(int(order[index])))
-            found += [(float(flat[index]) + self._turn_cost * turn, path) for turn, path in modes]
+        found: list[tuple[float, Callable[[], Trajectory]]] = []
+        for cost, positions in islice(self._local_minima(), classes):
+            found += [(cost + self._turn_cost * turn, path) for turn, path in self._lifted(positions)]
         found.sort(key=lambda entry: entry[0])
-        return [path for _, path in found[:count]]
+        return [path() for _, path in found[:count]]
+
+    def _local_minima(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the costs and the positions of the cheapest path of each class, and of others that are local minima.
+
+        These are cheaper than the paths through the cells beside them, and differ in where and when the robot waits.
+        """
+        totals, signatures = self._totals, self._signatures
+        within = totals <= self.cheapest * (1.0 + MAX_EXCESS)  # and cheaper than the cells beside them of their class
+        lowest = within.copy()
+        for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1])):
+            for one, other in ((first, second), (second, first)):
+                is_less = totals[one] <= totals[other]
+                lowest[one] &= is_less
+                within[one] &= is_less | (signatures[one] != signatures[other])
+        nodes = np.flatnonzero(within)
+        nodes = nodes[np.argsort(totals.ravel()[nodes], kind="stable")]
+        of_nodes = (array.ravel()[nodes].tolist() for array in (totals, signatures, lowest))
+        known: dict[int, list[list[int]]] = {}  # cells of the paths, by class
+        for node, cost, signature, is_lowest in zip(nodes.tolist(), *of_nodes, strict=True):
+            layer, cell = divmod(node, totals[0].size)
+            paths = known.setdefault(signature, [])
+            if not paths or (is_lowest and not any(self._are_close(path[layer], cell) for path in paths)):
+                cells = self._cells(node)
+                paths.append(cells.tolist())
+                yield cost, self._smoothed(cells)
 
     def random_candidates(self, count: int, reach: float, rng: np.random.Generator) -> list[Trajectory]:
         """Return the cheapest paths through random cells, in random driving modes.
@@ -103,28 +126,38 @@ class SpaceTimeSearch:
         nodes = np.flatnonzero(self._totals <= reach * self.cheapest)
         found = []
         for node in rng.choice(nodes, count).tolist():
-            modes = self._lifted(self._positions(node))
-            found.append(modes[rng.integers(len(modes))][1])
+            modes = self._lifted(self._smoothed(self._cells(node)))
+            found.append(modes[rng.integers(len(modes))][1]())
         return found
 
-    def _positions(self, node: int) -> np.ndarray:
-        """Return the positions (layers + 1, 2) (m) of the cheapest path through a cell of a layer."""
-        grid, size = self._grid, self._grid.columns * self._grid.lines
-        layer, cell = divmod(node, size)
+    def _cells(self, node: int) -> np.ndarray:
+        """Return the cells (layers + 1,) of the cheapest path through a cell of a layer."""
+        grid = self._grid
+        layer, cell = divmod(node, grid.columns * grid.lines)
         cells = np.empty(grid.layers + 1, np.int64)
         cells[layer] = cell
         for k in range(layer, 0, -1):
             cells[k - 1] = self._parents[k].ravel()[cells[k]]
         for k in range(layer, grid.layers):
             cells[k + 1] = self._children[k].ravel()[cells[k]]
+        return cells
+
+    def _are_close(self, cell: int, other: int) -> bool:
+        """Return whether two cells are close to each other."""
+        (column, line), (other_column, other_line) = divmod(cell, self._grid.lines), divmod(other, self._grid.lines)
+        return self._grid.cell * max(abs(column - other_column), abs(line - other_line)) < SIMILAR
+
+    def _smoothed(self, cells: np.ndarray) -> np.ndarray:
+        """Return the positions (layers + 1, 2) (m) of a path through cells."""
+        grid = self._grid
         positions = np.stack(np.divmod(cells, grid.lines), axis=1) * grid.cell + (grid.x0, grid.y0)
         positions[0], positions[-1] = self._scenario.start[:2], self._scenario.goal[:2]
         for _ in range(2):  # the steps of a grid have few directions
             positions[1:-1] = 0.25 * positions[:-2] + 0.5 * positions[1:-1] + 0.25 * positions[2:]
         return positions
 
-    def _lifted(self, positions: np.ndarray) -> list[tuple[float, Trajectory]]:
-        """Return the path in its driving modes, as poses (N, 3), each with the turns (rad) besides those of the path.
+    def _lifted(self, positions: np.ndarray) -> list[tuple[float, Callable[[], Trajectory]]]:
+        """Return the turns (rad) besides those of the path in its driving modes, each with a function of its poses.
 
         The headings are along the path or against it, and change once at most. The robot turns at the start and at the
         goal, to the one or to the other side.
@@ -135,23 +168,39 @@ class SpaceTimeSearch:
         moves = speeds > SLOW * speeds.mean()
         start, goal = self._scenario.start[2], self._scenario.goal[2]
         if not moves.any():
-            ends = np.linspace(start, start if goal is None else goal, len(times))
-            return [(0.0, Trajectory(times, np.column_stack([positions, ends])))]
+            headings = np.linspace(start, start if goal is None else goal, len(times))
+            return [(0.0, partial(_with_headings, times, positions, headings))]
         along = np.interp(times, times[moves], np.unwrap(np.arctan2(rates[moves, 1], rates[moves, 0])))
         fractions = np.cumsum(np.append(0.0, np.hypot(*np.diff(positions, axis=0).T)))
         fractions /= fractions[-1]
         found = []
         for first, last in product((0.0, np.pi), repeat=2):
-            for cusp in (0.0,) if first == last else CUSPS:
-                headings = along + np.where(fractions < cusp, first, last)
-                turns = [_turns(start, headings[0]), [0.0] if goal is None else _turns(headings[-1], goal)]
-                for before, after in product(*turns):
-                    poses = headings + (start + before - headings[0])
-                    ends = np.concatenate([[start], poses[1:-1], [poses[-1] + after]])
-                    states = np.column_stack([positions, ends])
-                    turn = abs(before) + abs(after) + abs(last - first)
-                    found.append((turn, Trajectory(times, states)))
+            after = [0.0] if goal is None else _turns(along[-1] + last, goal)
+            for turns in product(_turns(start, along[0] + first), after):
+                for cusp in (0.0,) if first == last else CUSPS:
+                    headings = along + np.where(fractions < cusp, first, last)
+                    turn = abs(turns[0]) + abs(turns[1]) + abs(last - first)
+                    found.append((turn, partial(_with_headings, times, positions, headings, (start, *turns))))
         return found
+
+
+def _with_headings(
+    times: np.ndarray, positions: np.ndarray, headings: np.ndarray, ends: tuple[float, float, float] | None = None
+) -> Trajectory:
+    """Return the poses (N, 3) at positions with headings (N,) up to a multiple of 2 pi.
+
+    Args:
+        times, positions, headings: of the path.
+        ends: the first heading, and the turns after it and at the last pose (rad); None for those of the path.
+
+    """
+    poses = np.column_stack([positions, headings])
+    if ends is not None:
+        start, before, after = ends
+        poses[:, 2] += start + before - headings[0]
+        poses[0, 2] = start
+        poses[-1, 2] += after
+    return Trajectory(times, poses)
 
 
 def _turns(heading: float, other: float) -> list[float]:

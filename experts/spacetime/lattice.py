@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, int64
+from numba import float64, int32, int64
 
 from leapnav.envs.field.barrier import CONTACT, barrier
 from leapnav.envs.field.clearance import obstacle_distance
@@ -34,6 +34,8 @@ NEAR = 10.0  # scales; a moving obstacle costs nothing at a larger distance
 MAX_DEPTH = 0.5  # cells by which the centre of a cell may be too close to an obstacle
 # Factors of the crossings of an obstacle in a signature, so that different crossings have different sums.
 SQUARE, LINEAR = 1 << 20, 7919
+
+INDEX_CUBE, CROSSINGS = int32[:, :, ::1], int64[:, :, ::1]
 
 
 class SpaceTimeGrid(NamedTuple):
@@ -134,51 +136,85 @@ def crossing(x, y, to_x, to_y):
     return 1 if x < 0.0 else -1
 
 
-@kernel(NOTHING(CUBE, INTEGERS, float64, CUBE, INTEGERS, MATRIX, INTEGERS))
-def spread(costs, start, weight, values, parents, centres, signatures):
+@kernel(NOTHING(CUBE, INTEGERS, float64, CUBE, INDEX_CUBE))
+def spread(costs, start, weight, values, parents):
     """Compute the cheapest path from a cell in the first layer to each cell of each layer.
+
+    The square of a distance is a sum over the two axes, so that the minimum is taken along one after the other.
 
     Args:
         costs (layers + 1, columns, lines): of the cells, for the time of a step; the first axis may be reversed.
-        start (3,): column and line, and the largest length of a move (cells).
+        start (3,): column and line, and the largest move along an axis (cells).
         weight: cost of a move of one cell; that of longer moves grows with the square of their length.
         values (layers + 1, columns, lines): overwritten by the costs of the paths.
-        parents: of each cell, flat; overwritten by the number of the cell before, -1 for none.
-        centres (layers + 1, 2 obstacles): positions of the obstacles (cells), in the order of the layers.
-        signatures: of each cell, flat; overwritten by that of its path, see `crossing`.
+        parents: overwritten by the number of the cell before, in the layer; meaningless where there is no path.
 
     """
     layers, columns, lines = costs.shape
-    reach, size = start[2], columns * lines
-    values[:] = np.inf
-    parents[:] = -1
-    signatures[:] = 0
+    reach = start[2]
+    origins = np.zeros((columns, lines), np.int32)
+    partial = np.empty((columns, lines))
+    shifts = np.zeros(lines, np.int32)
+    values[0] = np.inf
     values[0, start[0], start[1]] = 0.0
     for k in range(1, layers):
+        partial[:] = values[k - 1]
         for i in range(columns):
             for j in range(lines):
-                if costs[k, i, j] == np.inf:
-                    continue
-                best, parent = np.inf, -1
-                for a in range(max(i - reach, 0), min(i + reach + 1, columns)):
-                    for b in range(max(j - reach, 0), min(j + reach + 1, lines)):
-                        square = (a - i) * (a - i) + (b - j) * (b - j)
-                        if square <= reach * reach:
-                            value = values[k - 1, a, b] + weight * square
-                            if value < best:
-                                best, parent = value, a * lines + b
-                if parent >= 0:
-                    node = k * size + i * lines + j
-                    values[k, i, j] = best + costs[k, i, j]
-                    parents[node] = parent
-                    a, b = parent // lines, parent % lines
-                    signature = signatures[(k - 1) * size + parent]
+                origins[i, j] = i
+            for a in range(max(i - reach, 0), min(i + reach + 1, columns)):
+                move = weight * (a - i) * (a - i)
+                for j in range(lines):
+                    value = values[k - 1, a, j] + move
+                    is_less = value < partial[i, j]
+                    partial[i, j] = value if is_less else partial[i, j]
+                    origins[i, j] = a if is_less else origins[i, j]
+        for i in range(columns):
+            for j in range(lines):
+                values[k, i, j] = partial[i, j]
+                shifts[j] = 0
+            for shift in range(-reach, reach + 1):
+                move = weight * shift * shift
+                for j in range(max(-shift, 0), min(lines - shift, lines)):
+                    value = partial[i, j + shift] + move
+                    is_less = value < values[k, i, j]
+                    values[k, i, j] = value if is_less else values[k, i, j]
+                    shifts[j] = shift if is_less else shifts[j]
+            for j in range(lines):
+                values[k, i, j] += costs[k, i, j]
+                parents[k, i, j] = origins[i, j + shifts[j]] * lines + j + shifts[j]
+
+
+@kernel(NOTHING(CUBE, float64, INDEX_CUBE, int64, MATRIX, CROSSINGS))
+def add_crossings(totals, limit, parents, order, centres, signatures):
+    """Add the signature of the cheapest path to each cell of each layer, see `crossing`.
+
+    Args:
+        totals (layers + 1, columns, lines): costs of the cheapest paths from the start to the goal through the cells.
+        limit: the signatures of paths that cost more are not computed.
+        parents: of the cells, in the layer before, or after it if the order is -1.
+        order: 1 for the paths from the start, -1 for the paths from the goal.
+        centres (layers + 1, 2 obstacles): positions of the obstacles (cells).
+        signatures (layers + 1, columns, lines): those of the paths multiplied by the order are added.
+
+    """
+    layers, columns, lines = totals.shape
+    found = np.zeros(totals.shape, np.int64)
+    for number in range(1, layers):
+        k = number if order > 0 else layers - 1 - number
+        before = k - order
+        for i in range(columns):
+            for j in range(lines):
+                if totals[k, i, j] <= limit:
+                    a, b = parents[k, i, j] // lines, parents[k, i, j] % lines
+                    signature = found[before, a, b]
                     for n in range(centres.shape[1] // 2):
                         crossed = crossing(
-                            a - centres[k - 1, 2 * n],
-                            b - centres[k - 1, 2 * n + 1],
+                            a - centres[before, 2 * n],
+                            b - centres[before, 2 * n + 1],
                             i - centres[k, 2 * n],
                             j - centres[k, 2 * n + 1],
                         )
                         signature += crossed * (SQUARE * (n + 1) * (n + 1) + LINEAR * (n + 1))
-                    signatures[node] = signature
+                    found[k, i, j] = signature
+                    signatures[k, i, j] += order * signature

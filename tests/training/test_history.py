@@ -1,6 +1,7 @@
 """Observations with a history and the last action, and policies that use them."""
 
 import json
+import pickle
 from dataclasses import replace
 
 import gymnasium as gym
@@ -153,6 +154,15 @@ def test_the_displacements_are_those_of_the_robot():
         ahead = np.cos(heading) * moved[0] + np.sin(heading) * moved[1]
         left = -np.sin(heading) * moved[0] + np.cos(heading) * moved[1]
         assert found[:, k] == pytest.approx([ahead / 2, left / 2, np.sin(turned), np.cos(turned) - 1], abs=1e-4)
+
+
+def test_an_observer_is_copied_to_other_processes_without_its_arrays():
+    scenario, observer = sample_scenario("clutter", 3), Observer(EnvironmentSettings(history=AGES))
+    stored = pickle.dumps(observer)
+    poses = np.array(scenario.start) + np.linspace(0, 1, 9)[:, None] * [0.8, -0.5, 1.1]
+    arguments = [scenario] * 9, poses, 0.05 * np.arange(9)
+    assert len(stored) < 10_000
+    np.testing.assert_array_equal(pickle.loads(stored).observe(*arguments), observer.observe(*arguments))
 
 
 @pytest.mark.parametrize("algorithm", [PPO, SAC])

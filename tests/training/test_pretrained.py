@@ -14,7 +14,7 @@ SOC = {
     "car-clutter": 0.967,
     "clutter": 0.992,
     "crossing": 0.869,
-    "crowd": 0.834,
+    "crowd": 0.868,
     "dynamic_unicycle-clutter": 0.938,
     "free-clutter": 0.901,
     "open": 0.997,
