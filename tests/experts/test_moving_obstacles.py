@@ -173,6 +173,11 @@ def test_scenarios_of_families_are_certified_without_a_doubt(family):
         assert optimum.success and not optimum.doubts
 
 
+def test_paths_of_a_class_that_wait_elsewhere_are_found():
+    """The best path and the one with cost 4.391 are in one class; the best cost is confirmed by IPOPT."""
+    assert find_optimum(sample_scenario("doors", 60013)).cost == pytest.approx(4.307168, rel=1e-6)
+
+
 @pytest.mark.parametrize("family", ["crossing", *(pytest.param(one, marks=pytest.mark.slow) for one in MOVING_LAYOUTS)])
 def test_no_second_search_finds_better(family):
     opinion = second_opinion(sample_scenario(family, 0))
