@@ -28,7 +28,7 @@ from leapnav.experts.search import local_optima
 STAGES = {
     "lattice": ((search, "Lattice"), (search, "CandidateSearch"), (search, "plane_lattice"), (search, "PlaneSearch")),
     "transcription": ((local_optima, "optimise"),),
-    "Newton": ((local_optima, "_polish"),),
+    "Newton": ((local_optima, "polish_in_stages"),),
     "certificate": ((local_optima, "confirm"),),
 }
 ROBOTS = ("differential_drive", "car", "dynamic_unicycle")

@@ -93,6 +93,9 @@ class Disturbance:
             check_not_negative(f"disturbance: {field.name}", getattr(self, field.name))
 
 
+UNDISTURBED = Disturbance()
+
+
 @dataclass(frozen=True)
 class EnvironmentSettings:
     """The arguments of `NavigateEnv`, which documents them, without those that select scenarios.
@@ -110,7 +113,7 @@ class EnvironmentSettings:
     observation: str = "lidar"
     reward: str = "cost"
     actuation: str = "velocity"
-    disturbance: Disturbance = Disturbance()
+    disturbance: Disturbance = UNDISTURBED
     motor: Motor = Motor()
     dict_observation: bool = False
     control_period: float = 0.05
@@ -240,7 +243,7 @@ class EnvironmentSettings:
     @property
     def disturbed(self) -> bool:
         """Whether there is any noise."""
-        return self.disturbance != Disturbance()
+        return self.disturbance != UNDISTURBED
 
     @property
     def motors(self) -> bool:

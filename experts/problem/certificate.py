@@ -106,7 +106,7 @@ def certify(
         if has_free_end:
             conjugate_point = first_focal_time(extremal, arrays.free)
         else:
-            conjugate_point = first_even_conjugate_time(extremal, out[:, -1])
+            conjugate_point = first_even_conjugate_time(extremal, out[:, -1].copy())
             if conjugate_step >= 0:
                 crossing = conjugate_time(extremal, conjugate_step, sensitivity)
                 conjugate_point = min((t for t in (conjugate_point, crossing) if t is not None), default=None)
@@ -174,10 +174,8 @@ def _controllability(extremal: Extremal, frame: np.ndarray) -> float:
 
 
 def _smallest_singular_value(frame: np.ndarray, clock: int) -> float:
-    """Return that of the upper half of an orthonormal basis of the columns (2n, n); NaN if these have diverged."""
-    if not np.isfinite(frame).all():
-        return math.nan
-    return smallest_singular_value(np.linalg.qr(frame).Q, clock)
+    """Return that of the upper half of an orthonormal frame (2n, n); NaN if it has diverged."""
+    return smallest_singular_value(frame, clock) if np.isfinite(frame).all() else math.nan
 
 
 def _time_curvature(frame: np.ndarray, rates: np.ndarray, free: np.ndarray) -> float:

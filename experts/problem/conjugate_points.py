@@ -13,8 +13,11 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
+from numba import boolean
 from scipy.optimize import brentq, minimize_scalar
 
+from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import INTEGERS, VECTOR
 from leapnav.experts.numerics.integrator import propagate
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.frames import (
@@ -70,7 +73,7 @@ def first_even_conjugate_time(extremal: Extremal, determinants: np.ndarray) -> f
         determinants: (N,), the determinant at the integrator's steps.
 
     """
-    if not _dips(extremal.times, determinants, check_parabola=True):
+    if len(_dips(extremal.times, determinants, True)) == 0:
         return None
     n, clock = extremal.problem.system.n, extremal.problem.clock
     z = np.concatenate([extremal.states, extremal.costates], axis=1)
@@ -101,24 +104,26 @@ def _transport(extremal: Extremal, z: np.ndarray, S: np.ndarray, duration: float
         raise FloatingPointError(DIVERGENCE)
 
 
-def _dips(times: np.ndarray, determinants: np.ndarray, check_parabola: bool) -> list[int]:
+@kernel(INTEGERS(VECTOR, VECTOR, boolean))
+def _dips(times, determinants, check_parabola):
     """Return the indices at which |determinant| has a low local minimum.
 
     A determinant that has only been rounding error so far is that of an extremal whose controls are at their bounds.
     With `check_parabola` the parabola through each minimum and its neighbours must come close to zero as well.
     """
-    size = np.abs(determinants)
-    largest = np.maximum.accumulate(size)[1:-1]
-    is_minimum = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & (size[1:-1] < MAX_DIP * largest)
-    is_minimum &= largest > MIN_DETERMINANT
-    found = []
-    for i in np.flatnonzero(is_minimum) + 1:
-        before, after = np.diff(size[i - 1 : i + 2]) / np.diff(times[i - 1 : i + 2])
-        a = (after - before) / (times[i + 1] - times[i - 1])
-        b = before + a * (times[i] - times[i - 1])
-        if not check_parabola or a <= 0.0 or size[i] - b * b / (4.0 * a) < MAX_PARABOLA_MINIMUM * size[i]:
-            found.append(int(i))
-    return found
+    found, count, largest = np.empty(len(times), np.int64), 0, abs(determinants[0])
+    for i in range(1, len(times) - 1):
+        before, here, after = abs(determinants[i - 1]), abs(determinants[i]), abs(determinants[i + 1])
+        largest = max(largest, here)
+        if not (here <= before and here <= after and here < MAX_DIP * largest and largest > MIN_DETERMINANT):
+            continue
+        falling, rising = (here - before) / (times[i] - times[i - 1]), (after - here) / (times[i + 1] - times[i])
+        a = (rising - falling) / (times[i + 1] - times[i - 1])
+        b = falling + a * (times[i] - times[i - 1])
+        if not check_parabola or a <= 0.0 or here - b * b / (4.0 * a) < MAX_PARABOLA_MINIMUM * here:
+            found[count] = i
+            count += 1
+    return found[:count]
 
 
 def _first_rank_loss(
@@ -165,7 +170,7 @@ def first_focal_time(extremal: Extremal, free: np.ndarray) -> float | None:
 
     """
     arrays, n = extremal.problem.arrays, extremal.problem.system.n
-    times, count = extremal.times[::-1], len(extremal.times)
+    times, count = extremal.times[::-1].copy(), len(extremal.times)
     frames, determinants = np.empty((count, 2 * n, n)), np.zeros(count)
     frames[0] = np.concatenate([np.diag(free.astype(float)), np.diag((~free).astype(float))])
     z = np.concatenate([extremal.states, extremal.costates], axis=1)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import int64
 
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, NOTHING
+from leapnav.envs.kernels.types import CONSTANT, CUBE, MATRIX, NOTHING, VECTOR
 from leapnav.experts.numerics.flow import AFFINE_FUNCTION
 from leapnav.experts.numerics.linear import eliminate, substitute
 
@@ -18,16 +19,6 @@ def sample_dynamics(affine, data, states, drift, fields):
     """Evaluate a(q) into `drift` (N, n) and B(q) into `fields` (N, n, m) at states (N, n)."""
     for k in range(len(states)):
         affine(states[k], data, drift[k], fields[k])
-
-
-def least_squares_controls(fields: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Return the controls u (N, m) for which B u is closest to given rates (N, n), with fields B (N, n, m)."""
-    return _solve_gram(fields, np.einsum("kij,ki->kj", fields, rates))
-
-
-def least_norm_costates(fields: np.ndarray, switching: np.ndarray) -> np.ndarray:
-    """Return the costates (N, n) of least norm with given switching functions B'lambda (N, m)."""
-    return np.einsum("kij,kj->ki", fields, _solve_gram(fields, switching))
 
 
 @kernel(MATRIX(CUBE, MATRIX))
@@ -53,3 +44,36 @@ def _solve_gram(fields, right):
             system[:] = np.nan
         substitute(system, result[k])
     return result
+
+
+@kernel(MATRIX(CUBE, MATRIX))
+def least_squares_controls(fields, rates):
+    """Return the controls u (N, m) for which B u is closest to given rates (N, n), with fields B (N, n, m)."""
+    count, n, m = fields.shape
+    right = np.zeros((count, m))
+    for k in range(count):
+        for i in range(n):
+            for j in range(m):
+                right[k, j] += fields[k, i, j] * rates[k, i]
+    return _solve_gram(fields, right)
+
+
+@kernel(MATRIX(AFFINE_FUNCTION, CONSTANT, VECTOR, MATRIX, int64))
+def controls_along(affine, data, times, states, m):
+    """Return the controls (N, m) that follow a path (N + 1, n) best, each constant between two times (N + 1,)."""
+    count, n = len(times) - 1, states.shape[1]
+    middles, rates = np.empty((count, n)), np.empty((count, n))
+    drift, fields = np.empty((count, n)), np.empty((count, n, m))
+    for k in range(count):
+        for i in range(n):
+            middles[k, i] = 0.5 * (states[k + 1, i] + states[k, i])
+    sample_dynamics(affine, data, middles, drift, fields)
+    for k in range(count):
+        for i in range(n):
+            rates[k, i] = (states[k + 1, i] - states[k, i]) / (times[k + 1] - times[k]) - drift[k, i]
+    return least_squares_controls(fields, rates)
+
+
+def least_norm_costates(fields: np.ndarray, switching: np.ndarray) -> np.ndarray:
+    """Return the costates (N, n) of least norm with given switching functions B'lambda (N, m)."""
+    return np.einsum("kij,kj->ki", fields, _solve_gram(fields, switching))

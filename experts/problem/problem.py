@@ -212,7 +212,7 @@ class OptimalControlProblem:
                 goal[i] = value + 2 * math.pi * round((float(last[i]) - value) / (2 * math.pi))
         return tuple(goal)
 
-    @property
+    @cached_property
     def winding_states(self) -> tuple[int, ...]:
         """Indices of the angles, whose goal is met modulo 2 pi, without those with state bounds."""
         at = [self.system.state.index(symbol) for symbol in self.system.angles]
@@ -244,7 +244,7 @@ class OptimalControlProblem:
         """Return the problem with another barrier weight."""
         return self if weight == self.barrier_weight else replace(self, barrier_weight=weight)
 
-    @property
+    @cached_property
     def proximity_weight(self) -> float:
         """The weight of the proximity cost that the solvers use; 0 without obstacles."""
         return 0.0 if self.field is None else max(float(read_header(self.field)["weight"]), self.barrier_weight)
@@ -301,7 +301,7 @@ class OptimalControlProblem:
             return None
         return () if self.footprint is None else tuple(sorted({int(joint) for joint in self.outline[:, 4]}))
 
-    @property
+    @cached_property
     def outline(self) -> np.ndarray:
         """The robot's outline (K, 5), see `leapnav.envs.robots.footprints.outline_of`; (0, 5) without obstacles."""
         if self.field is None:

@@ -18,7 +18,7 @@ from leapnav.envs.field.sampling import PointGrid, sample_grid
 from leapnav.envs.robots.footprints import arm_of, enclosed_radius
 from leapnav.envs.robots.moves import ANGLES, HEADINGS, Moves
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.experts.search.shortest_paths import Nodes
+from leapnav.experts.search.shortest_paths import Nodes, fill_poses
 
 # Smallest and largest cell (m), and number of cells from start to goal: small enough for manoeuvres over a short
 # distance. The obstacles are sampled at half of this resolution.
@@ -167,15 +167,12 @@ class Lattice:
 
     def poses(self, path: np.ndarray) -> np.ndarray:
         """Return the poses (N + 2, 3) from start to goal along nodes (N,)."""
-        start, goal = self.scenario.start, self.scenario.goal
         poses = np.empty((len(path) + 2, 3))
-        poses[0] = start
-        poses[1:-1, 0] = self.origin[0] + self.cell * (path // (self.lines * HEADINGS))
-        poses[1:-1, 1] = self.origin[1] + self.cell * (path // HEADINGS % self.lines)
-        poses[1:-1, 2] = ANGLES[path % HEADINGS]
-        poses[-1] = (goal[0], goal[1], poses[-2, 2] if goal[2] is None else goal[2])
-        if np.abs(poses[1:, 2] - poses[:-1, 2]).max() >= np.pi:
-            poses[:, 2] = np.unwrap(poses[:, 2])
+        poses[0] = self.scenario.start
+        fill_poses(path, self.lines, *self.origin, self.cell, poses)
+        x, y, heading = self.scenario.goal
+        last = float(poses[-2, 2])
+        poses[-1] = x, y, last if heading is None else last + math.remainder(heading - last, math.tau)
         return poses
 
 

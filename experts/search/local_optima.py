@@ -41,6 +41,7 @@ INTERVALS_PER_SEGMENT, MIN_SEGMENTS, MAX_ATTEMPTS = 8, 8, 3
 # Numbers of segments of the last attempts on an adaptive mesh. In a door of 0.45 m, 8, 32 and 64 segments converge, but
 # 16, 28, 57 and 114 do not: with many nodes near an edge, the closest feature changes from one Newton step to the next.
 FEW_SEGMENTS = 32, 8
+UNCONFIRMED = Status.NOT_CERTIFIED, Status.STALLED, Status.MAX_ITERATIONS  # of a solution that is not accurate enough
 MAX_SETTLED = 3  # paths at which Newton's method stalled
 # A long refined path: number of intervals above which it is one, attempts that it omits, and intervals per segment.
 LONG_PATH, SKIPPED_ATTEMPTS, INTERVALS_PER_SEGMENT_OF_LONG_PATH = 2048, 2, 3
@@ -387,7 +388,7 @@ class LocalOptima:
             if status is Status.SUCCESS:
                 options = SolverOptions(TOLERANCE, max_iterations)
                 found = confirm(problem, times, nodes, status, history, total, options)
-                if found.status is Status.NOT_CERTIFIED:  # on shorter segments, integration errors grow less
+                if found.status in UNCONFIRMED:  # on shorter segments, integration errors grow less
                     refused = found
                 elif len(found.times):  # otherwise re-integration diverged
                     return found, total

@@ -16,7 +16,7 @@ from numba import boolean, float64, int64, types
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.types import CUBE, FLAGS, INDICES, INTEGERS, LINKS, MATRIX, NOTHING, VECTOR, tuple_of
-from leapnav.envs.robots.moves import DIRECTIONS, HEADINGS
+from leapnav.envs.robots.moves import ANGLES, DIRECTIONS, HEADINGS
 
 # Number of buckets of the circular bucket queue, and number of buckets that cover the cost of the shortest path.
 BUCKETS, BUCKETS_PER_COST = 4096, 2000
@@ -349,6 +349,27 @@ def mark(marked, path, lines, cells, headings):
             for b in range(max(0, j - cells), min(lines, j + cells + 1)):
                 for c in range(k - headings, k + headings + 1):
                     marked[(a * lines + b) * HEADINGS + c % HEADINGS] = True
+
+
+@kernel(NOTHING(INTEGERS, int64, float64, float64, float64, MATRIX))
+def fill_poses(path, lines, x0, y0, cell, poses):
+    """Fill `poses` (N + 2, 3), except for the first and the last one, with those of nodes (N,), unwrapped.
+
+    Args:
+        path: nodes.
+        lines: cells in y.
+        x0, y0: position (m) of the cell (0, 0).
+        cell: side of a cell (m).
+        poses: x, y (m) and heading (rad), of which the first one is given.
+
+    """
+    for k in range(len(path)):
+        node = path[k]
+        poses[k + 1, 0] = x0 + cell * (node // (lines * HEADINGS))
+        poses[k + 1, 1] = y0 + cell * (node // HEADINGS % lines)
+        before, angle = poses[k, 2], ANGLES[node % HEADINGS]
+        turn = (angle - before) / (2.0 * math.pi)
+        poses[k + 1, 2] = angle - 2.0 * math.pi * math.floor(turn + 0.5)
 
 
 @kernel(float64(VECTOR, VECTOR, float64))

@@ -28,6 +28,7 @@ from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.numerics.time_scaling import time_factor
+from leapnav.experts.problem.dynamics import controls_along
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.transcription.descent import descend
 from leapnav.experts.transcription.discrete_problem import DiscreteProblem, Path
@@ -136,7 +137,8 @@ def discretise(problem: OptimalControlProblem, path: Trajectory) -> DirectPath:
     intervals = min(max(int(INTERVALS_PER_STEP * (len(path.times) - 1)), MIN_INTERVALS), MAX_INTERVALS)
     times = np.linspace(0.0, path.times[-1], intervals + 1)
     states = path.resample(times).states
-    controls = problem.follow((states[1:] + states[:-1]) / 2, np.diff(states, axis=0) / np.diff(times)[:, None])
+    affine, m = problem.compiled_dynamics.affine, problem.system.m
+    controls = controls_along(affine, problem.arrays.data, times, states, m)
     return DirectPath(times, states, controls, np.zeros_like(states), math.inf, math.inf, False)
 
 
