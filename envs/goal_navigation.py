@@ -8,6 +8,7 @@ import numpy as np
 
 from leapnav.envs.goals import GoalConditioned
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.simulation.state import Episode
 
 
 class NavigateGoalEnv(GoalConditioned, NavigateEnv):
@@ -33,8 +34,8 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
 
     `env.unwrapped.compute_reward(achieved_goal, desired_goal, info)` returns it for any goal, as in Gymnasium-Robotics.
 
-    The sensing noise of a `Disturbance` affects the lidar but not the goals, which determine the reward. The `info` of
-    a step also contains `terminated` and `at_horizon`. Everything else is the same as in `NavigateEnv`.
+    The sensing noise of a `Disturbance` affects the lidar but not the goals, which determine the reward. The `info`
+    also contains `terminated` and `at_horizon`. Everything else is the same as in `NavigateEnv`.
     """
 
     _goal_conditioned = True
@@ -45,7 +46,9 @@ class NavigateGoalEnv(GoalConditioned, NavigateEnv):
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Hold an action for one control period, see `NavigateEnv.step`; the reward is that of `compute_reward`."""
         observation, _, terminated, truncated, info = super().step(action)
-        episode = self._simulator.episode(0)
-        info["terminated"], info["at_horizon"] = terminated, episode.steps >= episode.last_step
         reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info))
         return observation, reward, terminated, truncated, info
+
+    def _info(self, episode: Episode) -> dict[str, Any]:
+        ends = {"terminated": episode.terminated, "at_horizon": episode.steps >= episode.last_step}
+        return {**super()._info(episode), **ends}

@@ -56,13 +56,13 @@ class GoalConditioned:
         return np.array([self._cost_reward(bool(r), i) for r, i in zip(reached, info, strict=True)])
 
     def _cost_reward(self, reached: bool, info: Any) -> float:
-        if not isinstance(info, Mapping) or "reward_parts" not in info:
+        if not isinstance(info, Mapping) or "reward_effort" not in info:
             raise ValueError(
                 f'info: the reward "cost" needs the info of the step, got {_describe(info)} '
                 "(HerReplayBuffer passes it on with copy_info_dict=True)"
             )
-        parts = info["reward_parts"]
-        running = parts["effort"] + parts["proximity"] + parts["collision"] + parts.get("time", 0.0)
+        names = "effort", "proximity", "collision", "time"
+        running = sum(info.get(f"reward_{name}", 0.0) for name in names)
         arrived = reached and (info["at_horizon"] or self.settings.free_horizon)
         missed = info["terminated"] and not arrived
         return running - (self.settings.miss_penalty if missed else 0.0)

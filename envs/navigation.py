@@ -14,7 +14,7 @@ from leapnav.envs.keys import keys_to_action
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.scenarios.sources import ScenarioSource, WithSpec, get_scenario
+from leapnav.envs.scenarios.sources import ScenarioSource, WithSpec, get_scenario, reference_infos
 from leapnav.envs.settings import EnvironmentSettings, takes_settings
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.simulation.state import Episode
@@ -103,17 +103,16 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     cannot be observed.
 
     ## Rewards
-    With `reward="cost"`, the return is `-J` minus the penalties. `info["reward_parts"]` contains the parts of each
-    reward:
+    With `reward="cost"`, the return is `-J` minus the penalties. The `info` contains the parts of each reward:
 
     | Part | Value | When |
     |---|---|---|
-    | `effort` | minus the integral of the running cost without the proximity cost over the step, for the unicycle 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
-    | `proximity` | minus the integral of the proximity cost Phi over the step, with a relative error of at most 1e-4 (1e-3 in rare steps that end in a collision) | always |
-    | `time` | minus the time weight times the duration of the step | free horizon |
-    | `collision` | `-collision_penalty` | at the first collision of the episode |
-    | `miss` | `-miss_penalty` | if the episode terminates without reaching the goal, at the horizon or by a collision |
-    | `shaping` (`reward="shaped"` only) | `discount` times the potential after the step, minus the potential before it | always |
+    | `reward_effort` | minus the integral of the running cost without the proximity cost over the step, for the unicycle 1/2 (speed_weight v^2 + turn_weight omega^2) | always |
+    | `reward_proximity` | minus the integral of the proximity cost Phi over the step, with a relative error of at most 1e-4 (1e-3 in rare steps that end in a collision) | always |
+    | `reward_time` | minus the time weight times the duration of the step | free horizon |
+    | `reward_collision` | `-collision_penalty` | at the first collision of the episode |
+    | `reward_miss` | `-miss_penalty` | if the episode terminates without reaching the goal, at the horizon or by a collision |
+    | `reward_shaping` (`reward="shaped"` only) | `discount` times the potential after the step, minus the potential before it | always |
 
     v and omega are the actual speed and turn rate, which differ from the commanded ones with motors, in contact and
     with noise.
@@ -154,12 +153,13 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `collision` | whether the robot has collided in this episode |
     | `is_success` | whether the episode is a success |
     | `time` | time since the start of the episode (s) |
-    | `pose` | x, y (m), heading (rad, unwrapped) |
-    | `motion` | further states of the robot, if its model has any |
-    | `reward_parts` | see Rewards |
-    | `scenario` | after a reset: the `Scenario` |
-    | `index`, `reference_cost` | after a reset, with a bank: index of the scenario, and cost of its optimum |
-    | `lower_bound` | after a reset, with a bank: proved lower bound of the cost, NaN if none is known |
+    | `pose` (3,) | x, y (m), heading (rad, unwrapped) |
+    | `motion` (n - 3,) | further states of the robot, if its model has any |
+    | `reward_effort`, ... | see Rewards |
+    | `index`, `reference_cost` | with a bank: index of the scenario, and cost of its optimum; -1 and NaN for a scenario that is not from the bank |
+    | `lower_bound` | with a bank: proved lower bound of the cost, -infinity if none is known |
+
+    All infos have the same keys, after a reset and after a step. The scenario of the episode is `env.unwrapped.scenario`.
 
     ## Arguments
     | Argument | Default | Meaning |
@@ -231,6 +231,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         self._action_shape = self._source.robot.sizes()[1:]
         self._simulator.check(self._source.scenario, self.bank)
         self._choice: Scenario | int | None = None
+        self._reference: dict[str, Any] = {}  # of the scenario in the bank, see Info
         self._playing = np.zeros(1, dtype=bool)
         self._noise_generator: np.random.Generator | None = None
         self._trail: list[tuple[float, float, float]] = []
@@ -264,12 +265,9 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         self._choice = choice
         self._playing[0] = True
         self._trail = [self.pose]
-        info = self._info(self._simulator.episode(0))
-        info["scenario"] = self.scenario
-        if isinstance(choice, int) and self.bank is not None:
-            info["index"], info["reference_cost"] = choice, float(self.bank.costs[choice])
-            info["lower_bound"] = float(self.bank.lower_bounds[choice])
-        observation = self._observe()
+        if self.bank is not None:
+            self._reference = reference_infos(choice, self.bank)
+        info, observation = self._info(self._simulator.episode(0)), self._observe()
         if self.render_mode == "human":
             self.render()
         return observation, info
@@ -396,23 +394,27 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         return self._simulator.layout.divide(out[0])
 
     def _info(self, episode: Episode) -> dict[str, Any]:
-        """Return the info of a step."""
-        parts = {name: -getattr(episode, name) for name in ("effort", "proximity", "collision", "miss")}
-        if self.settings.free_horizon:
-            parts["time"] = -episode.time_cost
-        if self.settings.shaped:
-            parts["shaping"] = episode.shaping
+        """Return the info of a reset or of a step."""
+        state = self._simulator.states[0]
         info: dict[str, Any] = {
             "cost": episode.cost,
             "clearance": episode.clearance,
             "time": episode.time,
             "collision": episode.collided,
             "is_success": episode.success,
-            "pose": self.pose,
-            "reward_parts": parts,
+            "pose": state[:3].copy(),
+            "reward_effort": -episode.effort,
+            "reward_proximity": -episode.proximity,
+            "reward_collision": -episode.collision,
+            "reward_miss": -episode.miss,
+            **self._reference,
         }
-        if self._simulator.states.shape[1] > 3:
-            info["motion"] = self._simulator.states[0, 3:].copy()
+        if self.settings.free_horizon:
+            info["reward_time"] = -episode.time_cost
+        if self.settings.shaped:
+            info["reward_shaping"] = episode.shaping
+        if len(state) > 3:
+            info["motion"] = state[3:].copy()
         return info
 
     def __getstate__(self) -> dict[str, Any]:

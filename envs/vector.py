@@ -25,6 +25,7 @@ from leapnav.envs.scenarios.sources import (
     check_sampler,
     draw_level,
     get_scenario,
+    reference_infos,
 )
 from leapnav.envs.settings import EnvironmentSettings, takes_settings
 from leapnav.envs.simulation.simulator import BatchSimulator
@@ -48,8 +49,8 @@ else:
 class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # type: ignore[misc] (`spec` is a property)
     """`NavigateEnv` for many robots. The episodes of each are identical to those of a single environment.
 
-    Infos are arrays with masks, as in Gymnasium; `pose` is (num_envs, 3). With a bank, the infos of a reset contain
-    `index`, `reference_cost` and `lower_bound`, but not `scenario`, see the property `scenarios`.
+    Infos are arrays with masks, as in Gymnasium; `pose` is (num_envs, 3). The scenarios of the episodes are the
+    property `scenarios`.
 
     Args:
         num_envs: number of robots.
@@ -112,6 +113,10 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._simulator.check(self._source.scenario, self.bank)
         self._choices: list[Scenario | int | None] = [None] * self.num_envs
+        self._references: dict[str, np.ndarray] = {}  # of the scenarios in the bank, see `NavigateEnv`
+        if self.bank is not None:
+            kinds = {"index": np.int64, "reference_cost": np.float64, "lower_bound": np.float64}
+            self._references = {name: np.zeros(self.num_envs, kind) for name, kind in kinds.items()}
         self._seeds: list[int] = [-1] * self.num_envs
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._noise_generators: list[np.random.Generator | None] = [None] * self.num_envs
@@ -152,7 +157,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
                 self._generators[i], self._seeds[i] = seeding.np_random(seeds[i])
                 self._noise_generators[i] = make_noise_generator(self._seeds[i]) if self.settings.disturbed else None
         self._start(robots, selected)
-        return self._simulator.layout.divide(self._flat_observations()), self._infos(mask, mask)
+        return self._simulator.layout.divide(self._flat_observations()), self._infos(mask)
 
     def _check_mask(self, mask: Any) -> np.ndarray:
         if mask is None:
@@ -198,6 +203,9 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         self._simulator.reset(robots, choices, self.bank, noise)
         for i, choice in zip(indices, choices, strict=True):
             self._choices[i] = choice
+            if self.bank is not None:
+                for name, value in reference_infos(choice, self.bank).items():
+                    self._references[name][i] = value
         self._ended[robots] = False
         if self.render_mode is not None:
             for i in indices:
@@ -244,7 +252,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
             simulator.observe(flat, robots)
             restarting = ended
         self._ended = (self._no_robots if self.autoreset_mode is AutoresetMode.SAME_STEP else ended).copy()
-        infos.update(self._infos(self._all_robots, restarting if restarting is not self._no_robots else None))
+        infos.update(self._infos(self._all_robots))
         return simulator.layout.divide(flat), rewards, terminated, truncated, infos
 
     def _record_outcomes(self, sampler: LevelSampler, ended: np.ndarray) -> None:
@@ -344,8 +352,8 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
     def _rewards(self, flat: np.ndarray, ended: np.ndarray, restarted: np.ndarray) -> np.ndarray:
         return self._simulator.episodes["reward"].copy()
 
-    def _infos(self, mask: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
-        """Return the infos of the robots in `mask`, with the infos of a reset for those in `restarted`."""
+    def _infos(self, mask: np.ndarray) -> dict[str, Any]:
+        """Return the infos of the robots in `mask`."""
         episodes, states = self._simulator.episodes, self._simulator.states
         names = {"cost": "cost", "clearance": "clearance", "time": "time"}
         names |= {"collision": "collided", "is_success": "success"}
@@ -353,39 +361,13 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         values["pose"] = states[:, :3].copy()
         if states.shape[1] > 3:
             values["motion"] = states[:, 3:].copy()
-        parts = {name: -episodes[name] for name in ("effort", "proximity", "collision", "miss")}
+        values |= {f"reward_{name}": -episodes[name] for name in ("effort", "proximity", "collision", "miss")}
         if self.settings.free_horizon:
-            parts["time"] = -episodes["time_cost"]
+            values["reward_time"] = -episodes["time_cost"]
         if self.settings.shaped:
-            parts["shaping"] = episodes["shaping"].copy()
-        values["reward_parts"] = _add_masks(parts, mask)
-        infos = _add_masks(values, mask)
-        if restarted is not None and restarted.any():
-            infos.update(self._reset_infos(restarted))
-        return infos
-
-    def _reset_infos(self, restarted: np.ndarray) -> dict[str, Any]:
-        """Return the infos that only a reset adds: the scenario, or its index and costs in the bank."""
-        indices = np.zeros(self.num_envs, dtype=np.int64)
-        costs, bounds = np.zeros(self.num_envs), np.full(self.num_envs, np.nan)
-        scenarios = np.full(self.num_envs, None, dtype=object)
-        from_bank = np.zeros(self.num_envs, dtype=bool)
-        for i in np.flatnonzero(restarted).tolist():
-            choice = self._choices[i]
-            if isinstance(choice, int):
-                indices[i], from_bank[i] = choice, True
-            else:
-                scenarios[i] = choice
-        infos: dict[str, Any] = {}
-        if from_bank.any():
-            assert self.bank is not None  # an index always refers to a bank
-            costs[from_bank] = self.bank.costs[indices[from_bank]]
-            bounds[from_bank] = self.bank.lower_bounds[indices[from_bank]]
-            found = {"index": indices, "reference_cost": costs, "lower_bound": bounds}
-            infos.update(_add_masks(found, from_bank))
-        if (restarted & ~from_bank).any():
-            infos.update(_add_masks({"scenario": scenarios}, restarted & ~from_bank))
-        return infos
+            values["reward_shaping"] = episodes["shaping"].copy()
+        values |= {name: column.copy() for name, column in self._references.items()}
+        return _add_masks(values, mask)
 
 
 class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
@@ -405,15 +387,10 @@ class NavigateGoalVectorEnv(GoalConditioned, NavigateVectorEnv):
         rewards = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], infos)
         return np.where(restarted, 0.0, rewards)
 
-    def _infos(self, mask: np.ndarray, restarted: np.ndarray | None = None) -> dict[str, Any]:
+    def _infos(self, mask: np.ndarray) -> dict[str, Any]:
         episodes = self._simulator.episodes
-        ends = {
-            "terminated": episodes["terminated"].copy(),
-            "at_horizon": episodes["steps"] >= episodes["last_step"],
-        }
-        stepped = mask if restarted is None else mask & ~restarted
-        infos = super()._infos(mask, restarted)
-        return {**infos, **_add_masks(ends, stepped)} if stepped.any() else infos
+        ends = {"terminated": episodes["terminated"].copy(), "at_horizon": episodes["steps"] >= episodes["last_step"]}
+        return {**super()._infos(mask), **_add_masks(ends, mask)}
 
 
 def _add_masks(values: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
@@ -429,7 +406,7 @@ def select_robot(infos: dict[str, Any], i: int) -> dict[str, Any]:
         mask = infos.get(f"_{name}")
         if mask is None or not mask[i]:  # a mask itself, or an entry that the robot does not have
             continue
-        if isinstance(values, dict):
+        if isinstance(values, dict):  # those of the end of an episode
             info[name] = select_robot(values, i)
         else:
             info[name] = values[i].item() if isinstance(values[i], np.generic) else values[i]

@@ -124,7 +124,7 @@ def main(
                 error = np.hypot(final_obs[:, 0], final_obs[:, 1]) + np.abs(
                     np.arctan2(final_obs[:, 3], final_obs[:, 2])
                 )
-                reward[done] -= final_info["reward_parts"]["miss"][done] * (1 - np.minimum(1, 0.2 + 0.1 * error))
+                reward[done] -= final_info["reward_miss"][done] * (1 - np.minimum(1, 0.2 + 0.1 * error))
             step = (observed, action, distribution.log_prob(action).sum(1), value, REWARD_SCALE * reward, done)
             for row, entry in zip(rows.values(), step, strict=True):
                 row.append(torch.as_tensor(entry, dtype=torch.float32))

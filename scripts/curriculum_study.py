@@ -115,9 +115,9 @@ def play(model: PPO, venv: Any, indices: np.ndarray) -> dict[str, np.ndarray]:
         for column, entry in zip(rows.values(), (rewards, values[:, 0].numpy(), alive), strict=True):
             column.append(entry.copy())
         for i in np.flatnonzero(dones & alive).tolist():
-            parts = infos[i]["reward_parts"]  # of the last step
-            ends["costs"][i], ends["success"][i] = infos[i]["cost"], infos[i]["is_success"]
-            ends["returns"][i] = parts["collision"] + parts["miss"] - infos[i]["cost"]
+            last = infos[i]
+            ends["costs"][i], ends["success"][i] = last["cost"], last["is_success"]
+            ends["returns"][i] = last["reward_collision"] + last["reward_miss"] - last["cost"]
         alive &= ~dones
     return {**{name: np.array(column) for name, column in rows.items()}, **ends}
 

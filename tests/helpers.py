@@ -220,3 +220,9 @@ def let_newton_stall(monkeypatch, cost):
         return (Status.STALLED if is_it else status), rows, evaluations
 
     monkeypatch.setattr(local_optima, "polish_in_stages", stalled)
+
+
+def drawn_scenario(env, **arguments):
+    """Return the scenario of an episode that `env.reset(**arguments)` starts."""
+    env.reset(**arguments)
+    return env.unwrapped.scenario

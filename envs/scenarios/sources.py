@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import os
 from collections.abc import Mapping
@@ -302,3 +303,11 @@ def to_json_value(value: Any) -> Any:
             return [to_json_value(item) for item in value]
         case _:
             return value
+
+
+def reference_infos(choice: Scenario | int, bank: ScenarioBank) -> dict[str, Any]:
+    """Return what the info of an episode contains of its scenario in a bank."""
+    if not isinstance(choice, int):
+        return {"index": -1, "reference_cost": math.nan, "lower_bound": -math.inf}
+    cost, bound = float(bank.costs[choice]), float(bank.lower_bounds[choice])
+    return {"index": choice, "reference_cost": cost, "lower_bound": -math.inf if math.isnan(bound) else bound}

@@ -130,7 +130,8 @@ class Watch:
             options = None if self.index is None or inner.bank is None else {"index": self.index + episode}
             seed = self.seed if episode == 0 else None
             _, info, steps = play_episode(env, act_with(policy), seed=seed, options=options)
-            scenario, reference = info["scenario"].name, info.get("reference_cost")
+            scenario = inner.scenario.name
+            reference = info["reference_cost"] if inner.index is not None else None
             for step in steps:
                 info = step.info
                 if inner.window_closed:

@@ -347,7 +347,7 @@ def test_episodes_come_from_the_bank_with_their_reference(family):
     shipped = ScenarioBank.shipped(family, "test")
     _, info = env.reset(options={"index": 7})
     assert info["index"] == 7
-    assert info["scenario"] == shipped[7]
+    assert env.unwrapped.scenario == shipped[7]
     assert info["reference_cost"] == shipped.costs[7]
     expert = ExpertPolicy(env)
     observation, terminated = env.reset(options={"index": 7})[0], False

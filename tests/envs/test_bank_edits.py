@@ -170,8 +170,8 @@ def play(bank, rng):
     """Drive a few steps of each scenario."""
     env = NavigateEnv(bank=bank)
     for index in range(len(bank)):
-        observation, info = env.reset(seed=0, options={"index": index})
-        assert info["scenario"] is bank[index]
+        observation, _ = env.reset(seed=0, options={"index": index})
+        assert env.scenario is bank[index]
         for _ in range(3):
             observation, reward, terminated, truncated, _ = env.step(rng.uniform(-1, 1, env.action_space.shape))
             assert np.isfinite(observation).all() and math.isfinite(reward)

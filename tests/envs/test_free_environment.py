@@ -51,7 +51,7 @@ def test_an_episode_terminates_at_the_goal_and_its_return_is_the_cost():
     assert last.terminated and not last.truncated and last.info["is_success"]
     assert last.info["cost"] == pytest.approx(1.95)  # (0.5 + 1/2 v^2) T
     assert sum(step.reward for step in steps) == pytest.approx(-last.info["cost"])
-    assert last.info["reward_parts"]["time"] == pytest.approx(-0.5 * 0.05)
+    assert last.info["reward_time"] == pytest.approx(-0.5 * 0.05)
     optimum = find_reached_optimum(env.scenario, env.state, last.info["cost"])
     assert optimum.cost == pytest.approx(last.info["cost"])
     with pytest.raises(gym.error.ResetNeeded):  # after the end
@@ -72,7 +72,7 @@ def test_a_collision_terminates_an_episode_with_both_penalties():
     wall = [{"circle": {"center": [2.0, 5.0], "radius": 0.3}}]
     steps = play(NavigateEnv(scenario=straight(obstacles=wall)), AHEAD)
     assert steps[-1].terminated and not steps[-1].truncated
-    assert steps[-1].info["reward_parts"]["collision"] == steps[-1].info["reward_parts"]["miss"] == -50.0
+    assert steps[-1].info["reward_collision"] == steps[-1].info["reward_miss"] == -50.0
     behind = straight(obstacles=wall, time_limit=2.0)
     steps = play(NavigateEnv(scenario=behind, terminate_on_collision=False), AHEAD)
     assert steps[-1].truncated and steps[-1].info["collision"]
@@ -83,7 +83,7 @@ def test_a_goal_that_is_reached_after_a_collision_ends_the_episode_without_succe
     env = NavigateEnv(scenario=straight(obstacles=wall, goal=[3, 4.95, None]), terminate_on_collision=False)
     steps = play(env, AHEAD)
     assert steps[-1].terminated and steps[-1].info["collision"] and not steps[-1].info["is_success"]
-    assert steps[-1].info["reward_parts"]["miss"] == 0.0
+    assert steps[-1].info["reward_miss"] == 0.0
 
 
 def test_the_observation_has_no_time_left():

@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import SMALL
+from helpers import SMALL, drawn_scenario
 
 from leapnav.cli import main
 from leapnav.envs import Circle, NavigateEnv, Obstacle, Scenario, ScenarioBank, ScenarioLayout, register_family
@@ -66,11 +66,11 @@ def test_the_horizon_grows_with_the_arena():
 def test_environments_play_it(pillar, module):
     for name in ("pillar", module):
         env = NavigateEnv(name)
-        _, info = env.reset(seed=0)
-        assert len(info["scenario"].obstacles) == 1 and env.family == name
+        scenario = drawn_scenario(env, seed=0)
+        assert len(scenario.obstacles) == 1 and env.family == name
         venv = gym.make_vec("leapnav/Navigate-v0", 3, "vector_entry_point", family=name)
         venv.reset(seed=0)
-        assert venv.unwrapped.scenarios[0].obstacles == info["scenario"].obstacles
+        assert venv.unwrapped.scenarios[0].obstacles == scenario.obstacles
         for _ in range(3):
             venv.step(np.zeros((3, 2)))
 

@@ -166,7 +166,7 @@ def test_the_potential_rises_along_the_optimum():
     times = np.arange(0, bank[3].horizon, 0.05) + 0.025
     actions = np.stack([np.interp(times, reference.times, c) for c in reference.controls.T], axis=1) / limits
     steps = drive(env, actions, options={"index": 3})
-    shaping = np.array([step[4]["reward_parts"]["shaping"] for step in steps])
+    shaping = np.array([step[4]["reward_shaping"] for step in steps])
     assert (shaping[: len(shaping) // 2] > 0).mean() > 0.9
 
 

@@ -87,7 +87,7 @@ def test_a_step_after_the_end_is_an_error_and_changes_nothing(kind):
     for _ in range(2):
         with pytest.raises(gym.error.ResetNeeded):
             env.step(action)
-    assert (env.pose, env.time, info["pose"]) == (pose, time, pose)
+    assert (env.pose, env.time, tuple(info["pose"])) == (pose, time, pose)
     env.reset()
     assert env.step(action)[4]["time"] > 0
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import yaml
-from helpers import cluster_that_loses_a_worker, let_newton_stall
+from helpers import cluster_that_loses_a_worker, drawn_scenario, let_newton_stall
 
 import leapnav
 from leapnav.cli import main
@@ -111,7 +111,7 @@ def test_files_are_scenarios_of_a_bank_and_of_a_family(folder, tmp_path, capsys,
     assert [episode.family for episode in evaluation] == ["mine"] * 3
     for family in ("mine.bank", "worlds/[012].json"):
         env = NavigateEnv(family)
-        names = {env.reset(seed=seed)[1]["scenario"].name for seed in range(12)}
+        names = {drawn_scenario(env, seed=seed).name for seed in range(12)}
         assert names == {"0", "clutter-6", "clutter-7"}
         rollout(family, 2, tmp_path / f"demos-{len(family)}", seed=3, progress=False)
         assert {demo.scenario.name for demo in load_demonstrations(tmp_path / f"demos-{len(family)}")} <= names

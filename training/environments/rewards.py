@@ -58,7 +58,7 @@ class GradedMiss(VecEnvWrapper):
         """Step all robots; the episode records in the infos keep the return of the environment."""
         observations, rewards, dones, infos = self.venv.step_wait()
         for i in np.flatnonzero(dones).tolist():
-            penalty = -infos[i]["reward_parts"]["miss"]  # 0 for a success
+            penalty = -infos[i]["reward_miss"]  # 0 for a success
             ahead, left, cosine, sine = infos[i]["terminal_observation"][:4]
             away = math.hypot(ahead, left) + abs(math.atan2(sine, cosine))  # the heading error of a free heading is 0
             rewards[i] += penalty * (1.0 - min(1.0, MIN_MISS_FRACTION + MISS_FRACTION_SLOPE * away))
