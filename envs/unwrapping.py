@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
+
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.vector import NavigateVectorEnv
 
@@ -29,3 +32,39 @@ def unwrap(env: Any) -> list[NavigateEnv | NavigateVectorEnv]:
         if not isinstance(one, (NavigateEnv, NavigateVectorEnv)):
             raise TypeError(f"env: expected an environment of leapnav, got {type(one).__name__}")
     return inner
+
+
+def action_scale(env: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return factor and offset (m,) with which actions of leapnav's environment become those of its wrappers.
+
+    Raises:
+        ValueError: an action wrapper is neither Gymnasium's `RescaleAction` nor `ClipAction`.
+
+    """
+    while hasattr(env, "venv"):
+        env = env.venv
+    layers: list[Any] = []
+    while True:
+        if isinstance(env, gym.ActionWrapper | gym.vector.VectorActionWrapper):
+            layers.append(env)
+        if isinstance(env, gym.Wrapper | gym.vector.VectorWrapper):
+            env = env.env
+        elif getattr(env, "envs", None):  # those of a vector environment are wrapped in the same way
+            env = env.envs[0]
+        else:
+            break
+    space = _single_action_space(env)
+    factor, offset = np.ones(space.shape), np.zeros(space.shape)
+    for layer in reversed(layers):
+        name = type(layer).__name__
+        if name == "RescaleAction":
+            inside, outside = _single_action_space(layer.env), _single_action_space(layer)
+            ratio = (outside.high - outside.low) / (inside.high - inside.low)
+            factor, offset = ratio * factor, outside.low + ratio * (offset - inside.low)
+        elif name != "ClipAction":
+            raise ValueError(f"env: expected no action wrapper but RescaleAction and ClipAction, got {name}")
+    return factor, offset
+
+
+def _single_action_space(env: Any) -> Any:
+    return getattr(env, "single_action_space", None) or env.action_space

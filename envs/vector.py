@@ -60,6 +60,8 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         autoreset_mode: an `AutoresetMode` or its value. "NextStep": the step after the end of an episode starts the
             next one. "SameStep": the last step starts the next episode, and `infos["final_obs"]` and
             `infos["final_info"]` describe the end. "Disabled": `reset(options={"reset_mask": mask})` starts it.
+        max_episode_steps: number of steps after which an episode is truncated; None for no other end than those of
+            `NavigateEnv`.
         render_mode: None or "rgb_array"; `render` returns a frame of each robot.
         settings: the other arguments of `NavigateEnv`.
 
@@ -86,10 +88,14 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         obstacles: Any = None,
         sampler: LevelSampler | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
         self.num_envs = check_integer("num_envs", num_envs, 1)
+        self._max_steps = (
+            None if max_episode_steps is None else check_integer("max_episode_steps", max_episode_steps, 1)
+        )
         self._source = ScenarioSource(family, scenario, split, bank, robot, horizon, obstacles)
         if sampler is not None and self._source.bank is None:
             raise ValueError("sampler: expected an environment with a bank, got one of fresh or fixed scenarios")
@@ -227,6 +233,9 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
             raise gym.error.ResetNeeded(f"robot {int(np.argmax(restarting))}: its episode has ended; reset it first")
         simulator, episodes = self._simulator, self._simulator.episodes
         simulator.step(values, ~restarting)
+        if self._max_steps is not None:
+            is_late = (episodes["steps"] >= self._max_steps) & ~episodes["terminated"] & ~restarting
+            episodes["truncated"][is_late] = True
         if self.render_mode is not None:
             for i in np.flatnonzero(~restarting).tolist():
                 self._trails[i].append(tuple(simulator.states[i, :3].tolist()))

@@ -42,7 +42,6 @@ class Entry:
     high: float
 
 
-ACTION = (Entry("speed / max_speed", "1", -1.0, 1.0), Entry("turn_rate / max_turn_rate", "1", -1.0, 1.0))
 _DISTANCE, _COSINE, _RATE = ("m", -MAX_DISTANCE, MAX_DISTANCE), ("1", -1.0, 1.0), (-MAX_RATE, MAX_RATE)
 _POSE = (("m", -MAX_MAGNITUDE, MAX_MAGNITUDE),) * 2 + (_COSINE,) * 2
 _GOAL = (

@@ -15,7 +15,7 @@ import numpy as np
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.unwrapping import unwrap
+from leapnav.envs.unwrapping import action_scale, unwrap
 from leapnav.envs.utils.validation import as_matrix, as_vector, check_choice
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.gains import Gains
@@ -110,7 +110,7 @@ class ExpertPolicy:
     Args:
         env: the environment that the actions are for: `NavigateEnv` or `NavigateVectorEnv`, wrapped or not, or a
             Stable-Baselines3 `VecEnv` of them. Scenarios, states and times are read from it; the observations given to
-            `predict` are ignored.
+            `predict` are ignored. The actions are those of the wrapped environment, also with `RescaleAction`.
         references: known optima of scenarios, with costates. The optima of a bank are read from the bank; all others
             are computed at the first step of an episode.
         feedback: "resolve": at each step the optimal control from the current state and time, re-solved from the
@@ -122,7 +122,8 @@ class ExpertPolicy:
 
     Raises:
         TypeError: the environment is not one of leapnav's.
-        ValueError: `feedback` or `effort` is unknown, or a reference has a wrong shape.
+        ValueError: `feedback` or `effort` is unknown, a reference has a wrong shape, or the environment has an action
+            wrapper other than `RescaleAction` and `ClipAction`.
 
     """
 
@@ -138,7 +139,8 @@ class ExpertPolicy:
         check_choice("feedback", feedback, FEEDBACKS)
         check_choice("effort", effort, EFFORTS)
         self._effort: Effort = effort
-        self._envs = unwrap(env)
+        self._envs, self._is_batch = unwrap(env), hasattr(env, "num_envs")
+        self._factor, self._offset = action_scale(env)
         self._n, self._m = self._envs[0].settings.model.sizes()
         self._references = {s: _check_reference(s, path) for s, path in (references or {}).items()}
         self._feedback = feedback
@@ -169,15 +171,15 @@ class ExpertPolicy:
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Return the actions for the environment's current step, and `state` unchanged.
 
-        Actions have shape (m,), or (N, m) for batched observations.
+        Actions have shape (m,), or (N, m) for a vector environment.
 
         Raises:
             NoOptimumError: a scenario has no certified optimum.
 
         """
-        actions = np.array(self._each(self._act, self._situations()), dtype=np.float32)
-        batched = np.ndim(next(iter(observation.values())) if isinstance(observation, Mapping) else observation) > 1
-        return (actions if batched else cast(np.ndarray, actions[0])), state
+        found = self._factor * np.array(self._each(self._act, self._situations())) + self._offset
+        actions = found.astype(np.float32)
+        return (actions if self._is_batch else cast(np.ndarray, actions[0])), state
 
     def value(self, state: Any = None, time: Any = None) -> Any:
         """Return the cost-to-go J* from the robots' states, or from other states in their episodes.

@@ -278,8 +278,9 @@ def write_dataset(
             author_email="",
             code_permalink="",
             description="Certified optima driven in the environment. Infos: state (x, y, heading, further states of "
-            "the robot), control, executed_action, costate, cost_to_go, running_cost, reference_cost; the episode's "
-            "scenario is options['scenario'] as JSON. Reference scores: random actions and the optimum.",
+            "the robot), control, expert_action, costate, cost_to_go, running_cost, reference_cost; the episode's "
+            "scenario is options['scenario'] as JSON. The actions are the executed ones; the expert's without noise "
+            "are in the infos. Reference scores: random actions and the optimum.",
             requirements=[f"leapnav=={leapnav.__version__}"],
         )
         scores = {"ref_min_score": _random_score(env, scenarios), "ref_max_score": float(np.mean(returns))}
@@ -312,7 +313,7 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
         options={"scenario": demonstration.scenario.to_json()},
         # Minari declares lists, but arrays work as well.
         observations=cast(list[Any], demonstration.observations),
-        actions=cast(list[Any], demonstration.actions),
+        actions=cast(list[Any], demonstration.executed),
         rewards=demonstration.rewards.tolist(),
         terminations=terminations.tolist(),
         truncations=[False] * steps,
@@ -320,7 +321,7 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
         infos={
             "state": demonstration.states,
             "control": np.concatenate([controls, controls[-1:]]),
-            "executed_action": np.concatenate([demonstration.executed, demonstration.executed[-1:]]),
+            "expert_action": np.concatenate([demonstration.actions, demonstration.actions[-1:]]),
             "costate": demonstration.costates,
             "cost_to_go": demonstration.cost_to_go,
             "running_cost": np.concatenate([[0.0], demonstration.running_cost]),
@@ -401,7 +402,7 @@ def iterate_demonstrations(folder: str | os.PathLike[str]) -> Iterator[Demonstra
         dataset.iterate_episodes(), dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True
     ):
         infos = episode.infos or {}
-        missing = sorted({"state", "executed_action", "costate", "cost_to_go", "running_cost"} - set(infos))
+        missing = sorted({"state", "expert_action", "costate", "cost_to_go", "running_cost"} - set(infos))
         text = (metadata.get("options") or {}).get("scenario")
         if missing or text is None:
             raise ValueError(
@@ -411,8 +412,8 @@ def iterate_demonstrations(folder: str | os.PathLike[str]) -> Iterator[Demonstra
             Demonstration(
                 scenario=Scenario.from_json(str(text)),
                 observations=episode.observations,
-                actions=episode.actions,
-                executed=infos["executed_action"][:-1],
+                actions=infos["expert_action"][:-1],
+                executed=episode.actions,
                 rewards=np.asarray(episode.rewards),
                 states=infos["state"],
                 costates=infos["costate"],

@@ -65,7 +65,7 @@ def certify(
         return failure(problem, Status.DIVERGED if converged is Status.SUCCESS else converged, history, evaluations)
     accuracy = ACCURACY if converged is Status.SUCCESS else UNCONVERGED_ACCURACY
     capacity = max(MIN_ROWS, ROWS_PER_SEGMENT * len(times))
-    sensitivity, final = np.empty((2 * n, n)), np.empty((2 * n, n))
+    sensitivity, final = np.full((2, 2 * n, n), np.nan)
     while True:
         out, terms = np.empty((capacity, 4 + m + 4 * n)), np.empty((capacity, DENSE_TERMS, 2 * n + 1))
         record = TraceRecord(out, terms, sensitivity, final)
@@ -166,7 +166,7 @@ def _controllability(extremal: Extremal, frame: np.ndarray) -> float:
         times = np.array([0.0, 0.5 * extremal.times[-1]])
         rows = np.empty((len(extremal.times) + MIN_ROWS, 4 + extremal.controls.shape[1] + 2 * size))
         terms = np.empty((len(rows), DENSE_TERMS, size + 1))
-        middle = np.empty((size, n))
+        middle = np.full((size, n), np.nan)  # remains if the flow diverges
         record = TraceRecord(rows, terms, np.empty((size, n)), middle)
         trace(arrays.flow, arrays.control, times, extremal.interpolate(times), clock, ACCURACY, record)
         largest = max(largest, _smallest_singular_value(middle, clock))

@@ -9,6 +9,7 @@ The functions raise FloatingPointError where the sensitivities diverge, so that 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -111,11 +112,14 @@ def _dips(times, determinants, check_parabola):
     A determinant that has only been rounding error so far is that of an extremal whose controls are at their bounds.
     With `check_parabola` the parabola through each minimum and its neighbours must come close to zero as well.
     """
-    found, count, largest = np.empty(len(times), np.int64), 0, abs(determinants[0])
-    for i in range(1, len(times) - 1):
-        before, here, after = abs(determinants[i - 1]), abs(determinants[i]), abs(determinants[i + 1])
+    found, count, largest = np.empty(len(times), np.int64), 0, 0.0
+    for i in range(len(times) - 1):
+        here, after = abs(determinants[i]), abs(determinants[i + 1])
+        if math.isnan(here):  # the sensitivities have diverged
+            break
         largest = max(largest, here)
-        if not (here <= before and here <= after and here < MAX_DIP * largest and largest > MIN_DETERMINANT):
+        before = abs(determinants[i - 1]) if i > 0 else 0.0
+        if i == 0 or not (here <= before and here <= after and here < MAX_DIP * largest and largest > MIN_DETERMINANT):
             continue
         falling, rising = (here - before) / (times[i] - times[i - 1]), (after - here) / (times[i + 1] - times[i])
         a = (rising - falling) / (times[i + 1] - times[i - 1])
@@ -153,6 +157,8 @@ def smallest_singular_value(frame: np.ndarray, clock: int) -> float:
     """Return the smallest singular value of the upper block of a frame (2n, n); see `orthonormalise` for `clock`."""
     n = frame.shape[1]
     rows = np.arange(n) + np.where(np.arange(n) == clock, n, 0)
+    if not np.isfinite(frame).all():
+        raise FloatingPointError(DIVERGENCE)
     return float(np.linalg.svd(frame[rows], compute_uv=False)[-1])
 
 

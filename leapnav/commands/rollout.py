@@ -33,7 +33,7 @@ class Rollout(TaskOptions, ParallelOptions):
     recoveries: int = 0
     """Number of recoveries per scenario: demonstrations from perturbed states of the optimum."""
     noise: float = 0.0
-    """Standard deviation of the noise on the executed actions; the recorded ones are the expert's, in closed loop."""
+    """Standard deviation of the noise on the actions. The infos contain the expert's actions without it."""
     force: bool = False
     """Replace an existing dataset or unfinished rollout in the output directory."""
     json: Path | None = None

@@ -266,7 +266,7 @@ def test_the_disturbance_has_a_generator_of_its_own():
 def test_disturbances_are_the_same_with_the_same_seed_and_differ_otherwise():
     def end(seed):
         env = gym.make(ID, scenario=scenario(horizon=4.0), disturbance=0.1)
-        return drive(env, [(0.3, 0.1)] * 70, seed=seed)[-1][4]["pose"]
+        return drive(env, [(0.3, 0.1)] * 70, seed=seed)[-1][4]["pose"].tolist()
 
     assert end(1) == end(1)
     assert end(1) != end(2)

@@ -19,7 +19,7 @@ from leapnav.envs import NavigateEnv
 from leapnav.envs.utils.files import digest
 from leapnav.experts import ExpertPolicy, pools
 from leapnav.experts.data import rollouts
-from leapnav.experts.data.demonstrations import CHECKSUM, dataset_id, load_demonstrations
+from leapnav.experts.data.demonstrations import CHECKSUM, dataset_id, load_demonstrations, open_dataset
 from leapnav.experts.data.rollouts import DONE, RECORD, SHARD_SIZE, WORK, check_dataset, rollout
 from leapnav.experts.data.store import ResumableStore
 
@@ -272,7 +272,10 @@ def test_the_dataset_has_reference_scores_seeds_and_costs(whole, monkeypatch):
 
 def test_with_noise_the_expert_s_own_actions_are_recorded(tmp_path):
     rollout("clutter", 6, tmp_path, noise=0.2, workers=2, progress=False)
-    for demonstration in load_demonstrations(tmp_path):
+    episodes = open_dataset(tmp_path).iterate_episodes()
+    for demonstration, episode in zip(load_demonstrations(tmp_path), episodes, strict=True):
+        assert np.array_equal(episode.actions, demonstration.executed)  # what learners of transitions need
+        assert np.array_equal(episode.infos["expert_action"][:-1], demonstration.actions)
         off = demonstration.executed - demonstration.actions
         assert 0.1 < off.std() < 0.25
         env = NavigateEnv(scenario=demonstration.scenario)

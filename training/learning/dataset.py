@@ -300,7 +300,7 @@ _SHAPES = {
     "episodes": "scalar",
 }
 _COLUMNS = ("observations", *_SHAPES)
-_REQUIRED_INFOS = {"state", "costate", "cost_to_go", "executed_action"}
+_REQUIRED_INFOS = {"state", "costate", "cost_to_go", "expert_action"}
 
 
 def _from_demonstration(demonstration: Demonstration) -> tuple[str, dict[str, np.ndarray]]:
@@ -325,11 +325,11 @@ def _from_episode(directory: Path, episode: Any, metadata: Mapping[str, Any]) ->
         )
     return str(text), {
         "observations": episode.observations[:-1],
-        "actions": episode.actions,
+        "actions": infos["expert_action"][:-1],
         "returns": -infos["cost_to_go"][:-1],
         "costates": infos["costate"][:-1],
         "states": infos["state"][:-1],
         "times": CONTROL_PERIOD * np.arange(len(episode.actions)),
-        "executed": infos["executed_action"][:-1],
+        "executed": episode.actions,
         "rewards": episode.rewards,
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
@@ -19,8 +20,16 @@ def policy_of(model: BaseAlgorithm | BasePolicy) -> BasePolicy:
 
     Raises:
         TypeError: `model` is neither of the two, or the policy has no actor with continuous actions.
+        ValueError: `VecNormalize` normalises the observations of the model; its statistics are no part of the policy.
 
     """
+    if isinstance(model, BaseAlgorithm):
+        statistics = model.get_vec_normalize_env()
+        if statistics is not None and statistics.norm_obs:
+            raise ValueError(
+                "model: its observations are normalised by VecNormalize, whose statistics are no part of the policy; "
+                "use VecNormalize with norm_obs=False and policy_kwargs=network(), which scales the observations"
+            )
     policy = model.policy if isinstance(model, BaseAlgorithm) else model
     if not isinstance(policy, BasePolicy):
         raise TypeError(f"model: expected one of Stable-Baselines3 or its policy, got {type(model).__name__}")
@@ -42,8 +51,18 @@ def actor_parameters(policy: BasePolicy) -> list[nn.Parameter]:
     return list(_actor(policy).parameters())
 
 
+def action_range(space: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return middle and half width (m,), float32, of an action space, or 0 and 1 if it has no bounds."""
+    if not np.isfinite(space.low).all() or not np.isfinite(space.high).all():
+        return np.zeros(space.shape, np.float32), np.ones(space.shape, np.float32)
+    return (space.high + space.low) / np.float32(2), (space.high - space.low) / np.float32(2)
+
+
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     """Compute the deterministic actions of a policy without momentum, not clipped, with gradients.
+
+    They are in units of [-1, 1] also if the bounds of the policy's action space are others, as with Gymnasium's
+    `RescaleAction`.
 
     Args:
         policy: the policy.
@@ -55,7 +74,8 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     """
     if isinstance(policy, ActorCriticPolicy):
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
-        return policy.action_net(policy.mlp_extractor.forward_actor(features))
+        middle, half = (th.as_tensor(part) for part in action_range(policy.action_space))
+        return (policy.action_net(policy.mlp_extractor.forward_actor(features)) - middle) / half
     actor = _actor(policy)
     if isinstance(actor, MomentumActor):
         return th.tanh(Actor.get_action_dist_params(actor, cast(Any, observations))[0])
@@ -69,7 +89,7 @@ def set_noise(policy: BasePolicy, std: th.Tensor | float) -> None:
     std = th.as_tensor(std)
     with th.no_grad():
         if isinstance(policy, ActorCriticPolicy):
-            policy.log_std.copy_(std.log())
+            policy.log_std.copy_((std * th.as_tensor(action_range(policy.action_space)[1])).log())
         elif isinstance(getattr(_actor(policy), "log_std", None), nn.Linear):
             # This is the standard deviation before squashing, almost the same for actions close to 0.
             _actor(policy).log_std.weight.zero_()

@@ -121,6 +121,11 @@ class NavigationFeatures(BaseFeaturesExtractor):
     def _timed_features(self, observations: th.Tensor, motion: th.Tensor) -> list[th.Tensor]:
         """Return the features of the pose and of the motion with a fixed horizon."""
         goal, time_left = observations[:, 0:2], observations[:, 4:5]
+        if not th.compiler.is_compiling() and bool((time_left < 0.0).any()):
+            raise ValueError(
+                f"observation: time left: expected at least 0 s, got {float(time_left.min()):g}; the network scales "
+                "the observations itself, so use VecNormalize with norm_obs=False"
+            )
         distance = goal.norm(dim=1, keepdim=True)
         heading = observations[:, 2:4]  # cosine and sine of the heading error
         error = th.atan2(observations[:, 3:4], observations[:, 2:3])

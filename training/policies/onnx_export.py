@@ -19,7 +19,7 @@ from torch import nn
 
 import leapnav
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.observations import ACTION, observation_entries
+from leapnav.envs.simulation.observations import Entry, observation_entries
 from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.training.policies.actors import mean_action, policy_of
@@ -97,7 +97,10 @@ def export_onnx(
         "input": {"name": INPUT, "shape": ["N", len(entries)], "type": "float32"},
         "output": {"name": OUTPUT, "shape": ["N", *actor.policy.action_space.shape], "type": "float32"},
         "observation": [{"index": k, **asdict(entry)} for k, entry in enumerate(entries)],
-        "action": [{"index": k, **asdict(entry)} for k, entry in enumerate(ACTION)],
+        "action": [
+            {"index": k, **asdict(Entry(f"{name} / max_{name}", "1", -1.0, 1.0))}
+            for k, name in enumerate(settings.model.control_names)
+        ],
         "control_period": settings.control_period,
         "environment": asdict(settings),
         "largest_difference_from_torch": difference,

@@ -55,7 +55,7 @@ def load_zip(
     """Load the policy of a model saved by Stable-Baselines3.
 
     Args:
-        path: the file, written by `model.save` of PPO, A2C, SAC, TD3, DDPG or TQC.
+        path: the file, written by `model.save` of PPO, A2C, SAC, TD3, DDPG or TQC; with `trust` also of CrossQ.
         environment: arguments of the environment with which it was trained; None: derived from the observation space,
             for a lidar.
         trust: load with Stable-Baselines3, which executes code from the file; for models with custom classes.
@@ -86,7 +86,7 @@ def load_zip(
         policy = _algorithm(path, data).load(path, device="cpu").policy
     else:
         n_controls = robot_class(arguments.get("robot", "unicycle")).sizes()[1]
-        policy = _architecture(path, data).make(space, spaces.Box(-1.0, 1.0, (n_controls,), np.float32))
+        policy = _architecture(path, data).make(space, _action_space(path, data, n_controls))
         _load_actor(path, policy, weights)
     policy.set_training_mode(False)
     return policy, arguments
@@ -113,6 +113,20 @@ def _environment(path: Path, data: Mapping[str, Any], given: Mapping[str, Any] |
             f"{arguments or 'the defaults'}; give the arguments it was trained with (--env observation=map, ...)"
         )
     return arguments, space
+
+
+def _action_space(path: Path, data: Mapping[str, Any], n_controls: int) -> spaces.Box:
+    """Return the action space, whose bounds are not -1 and 1 if the environment had a wrapper of actions."""
+    stored = _described(data.get("action_space"))
+    if stored.get("_shape") != [n_controls]:
+        raise ValueError(
+            f"{path}: its actions have the shape {stored.get('_shape')}, those of the robot ({n_controls},)"
+        )
+    low, high = (
+        np.array([float(number) for number in re.findall(r"-?(?:inf|[\d.]+(?:e[-+]?\d+)?)", str(stored.get(side)))])
+        for side in ("low", "high")
+    )
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), (n_controls,), np.float32)
 
 
 def _has_bounds(space: Any, stored: Mapping[str, Any]) -> bool:
@@ -156,6 +170,10 @@ def _algorithm(path: Path, data: Mapping[str, Any]) -> type[BaseAlgorithm]:
     import stable_baselines3 as sb3
 
     module = str(_described(data.get("policy_class")).get("__module__"))
+    if module.startswith("sb3_contrib.crossq"):
+        from sb3_contrib import CrossQ  # from the extra `contrib`
+
+        return CrossQ
     if "clip_range" in data:
         return sb3.PPO
     if "gae_lambda" in data:

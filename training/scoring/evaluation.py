@@ -14,6 +14,7 @@ import numpy as np
 from joblib import delayed
 
 from leapnav.envs.episodes import act_with, play_episode
+from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.banks.checks import Reference
@@ -23,17 +24,19 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least, in_words
-from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv
+from leapnav.envs.vector import AutoresetMode, NavigateGoalVectorEnv, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.training.environments.playing import PlayedEpisode, play_episodes
+from leapnav.training.scoring.adapters import adapted, is_goal_conditioned
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.threads import limit_threads
 
 BATCH_SIZE = 256  # episodes simulated in parallel
 MIN_PARALLEL = 64  # searches, below which starting processes takes longer
 MAX_TIMED_ACTIONS = 100
+GOAL_ARGUMENTS = {"reward": "cost"}  # of the environment for goal-conditioned policies
 MIN_REVERSE_SPEED = 0.05  # m/s; an optimum that reaches this speed backwards counts as reversing
 
 
@@ -137,7 +140,10 @@ def evaluate(
     Args:
         policy: an object with the `predict` method of Stable-Baselines3 for batches of observations; a class of such
             objects that takes an environment, such as `ExpertPolicy`, or a `PolicyFactory`; or any other function,
-            which maps one observation to an action.
+            which maps one observation to an action. The arguments of `predict` after the observation are optional. A
+            model with `VecNormalize` gets normalised observations. The actions of a policy with another bounded
+            action space, such as that of `RescaleAction`, are scaled to [-1, 1]. A policy of
+            `leapnav/NavigateGoal-v0` is evaluated there.
         bank: a bank, or the name of a family for its test split, with the robot, horizon and obstacles of
             `environment`.
         count: number of scenarios, from the first of the bank; None: all.
@@ -203,7 +209,9 @@ def _play_batch(
     seed: int,
 ) -> list[Episode]:
     """Play scenarios of a bank in parallel, one robot for each; the optima for the poses reached are not searched."""
-    venv = NavigateVectorEnv(len(indices), bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
+    is_goal = is_goal_conditioned(policy_or_factory)
+    make, kinds = (NavigateGoalVectorEnv, GOAL_ARGUMENTS) if is_goal else (NavigateVectorEnv, {})
+    venv = make(len(indices), bank=bank, autoreset_mode=AutoresetMode.SAME_STEP, **{**kinds, **arguments})
     policy = _policy_for(policy_or_factory, venv, venv.single_observation_space)
     played = play_episodes(policy, venv, {"index": list(indices)}, seed)
     venv.close()
@@ -250,10 +258,23 @@ def _optimal_cost_to(scenario: Scenario, state: np.ndarray, cost: float, guess: 
     return optimum.cost if optimum.success else math.nan
 
 
+class _OneRobot:
+    """A policy that gets batches of one observation, because it may be a policy for batches only."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+
+    def predict(self, observation: Any, *arguments: Any, **others: Any) -> Any:
+        batch = {k: v[None] for k, v in observation.items()} if isinstance(observation, dict) else observation[None]
+        return self._policy.predict(batch, *arguments, **others)
+
+
 def _median_milliseconds(policy_or_factory: PolicyOrFactory, bank: ScenarioBank, arguments: Mapping[str, Any]) -> float:
     """Return the median computation time of one action on the first scenario of a bank (ms)."""
-    env = NavigateEnv(bank=bank, **arguments)
-    act = act_with(_policy_for(policy_or_factory, env, env.observation_space))
+    is_goal = is_goal_conditioned(policy_or_factory)
+    make, kinds = (NavigateGoalEnv, GOAL_ARGUMENTS) if is_goal else (NavigateEnv, {})
+    env = make(bank=bank, **{**kinds, **arguments})
+    act = act_with(_OneRobot(_policy_for(policy_or_factory, env, env.observation_space)))
     seconds: list[float] = []
 
     def timed_act(observation: Any, info: dict[str, Any]) -> np.ndarray | None:
@@ -286,4 +307,4 @@ def _policy_for(policy_or_factory: PolicyOrFactory, env: Any, observation_space:
             f"policy: expected observations {expected.shape or 'as a dict'}, got {observation_space.shape or 'a dict'} "
             "or other bounds; pass the arguments of the environment that the policy was trained with"
         )
-    return policy
+    return adapted(policy)

@@ -1,0 +1,160 @@
+"""Clients of the environments and the policies: wrappers of Gymnasium, models of Stable-Baselines3, recorders."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3 as sb3
+from gymnasium.utils.env_match import check_environments_match
+from gymnasium.wrappers import (
+    AddRenderObservation,
+    ClipAction,
+    DiscretizeAction,
+    FrameStackObservation,
+    RescaleAction,
+)
+from gymnasium.wrappers.vector import RescaleAction as RescaleActions
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from leapnav.experts import ExpertPolicy, rollout
+from leapnav.training import behaviour_clone, evaluate, network
+from leapnav.training.policies.zips import load_zip
+
+ID = "leapnav/Navigate-v0"
+DOUBLE = np.float32(-2.0), np.float32(2.0)
+
+
+def open_env(**arguments):
+    return gym.make(ID, family="open", **arguments)
+
+
+def rescaled():
+    return RescaleAction(open_env(), *DOUBLE)
+
+
+def drives_to_the_goal(env):
+    policy, done = ExpertPolicy(env), False
+    observation, _ = env.reset(seed=0)
+    while not done:
+        observation, _, terminated, truncated, info = env.step(policy.predict(observation)[0])
+        done = terminated or truncated
+    return info["is_success"]
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda: rescaled(),
+        lambda: RescaleAction(rescaled(), np.float32(0.0), np.float32(1.0)),
+        lambda: ClipAction(open_env()),
+        lambda: FrameStackObservation(open_env(), 3),
+        lambda: AddRenderObservation(open_env(render_mode="rgb_array")),
+    ],
+    ids=["rescaled", "twice", "clipped", "stacked", "rendered"],
+)
+def test_the_expert_drives_wrapped_environments(wrap):
+    assert drives_to_the_goal(wrap())
+
+
+def test_the_expert_drives_wrapped_vector_environments():
+    for venv in (
+        RescaleActions(gym.make_vec(ID, 2, "vector_entry_point", family="open"), *DOUBLE),
+        gym.vector.SyncVectorEnv([rescaled, rescaled]),
+    ):
+        observations, _ = venv.reset(seed=0)
+        policy, successes = ExpertPolicy(venv), 0
+        while not successes:
+            observations, _, terminated, _, infos = venv.step(policy.predict(observations)[0])
+            if terminated.any():
+                successes = int(infos["is_success"][terminated].sum())
+                assert successes
+
+
+def test_other_action_wrappers_are_refused():
+    with pytest.raises(ValueError, match=r"env: expected no action wrapper but .*, got DiscretizeAction"):
+        ExpertPolicy(DiscretizeAction(open_env(), 3))
+
+
+def test_cloned_models_of_a_rescaled_environment_have_its_actions(tmp_path):
+    folder, returns = tmp_path / "demonstrations", []
+    rollout("open", 12, folder, progress=False)
+    for env in (open_env(), rescaled()):
+        model = sb3.PPO("MlpPolicy", env, seed=0, policy_kwargs=network())
+        behaviour_clone(model, folder, progress=False)
+        model.save(tmp_path / "model.zip")
+        loaded, arguments = load_zip(tmp_path / "model.zip")
+        assert loaded.action_space == env.action_space
+        found = [
+            evaluate(policy, "open", count=8, environment=arguments, timed=False, progress=False)
+            for policy in (model, loaded)
+        ]
+        assert [e.cost for e in found[0]] == pytest.approx([e.cost for e in found[1]])
+        returns.append(np.mean([e.episode_return for e in found[0]]))
+    assert returns[0] == pytest.approx(returns[1], abs=12.0)  # other initial weights relative to the range
+
+
+def test_evaluations_normalise_the_observations_of_a_model_with_vec_normalize():
+    class Recorded(sb3.PPO):
+        def predict(self, observation, *arguments, **others):
+            seen.append(np.abs(observation).max())
+            return super().predict(observation, *arguments, **others)
+
+    seen = []
+    venv = VecNormalize(DummyVecEnv([open_env]), clip_obs=0.5)
+    model = Recorded("MlpPolicy", venv, n_steps=64, batch_size=64)
+    evaluate(model, "open", count=2, timed=False, progress=False)
+    assert max(seen) <= 0.5
+    with pytest.raises(ValueError, match="model: its observations are normalised by VecNormalize"):
+        behaviour_clone(model, [])
+
+
+def test_the_network_refuses_normalised_observations():
+    venv = VecNormalize(DummyVecEnv([open_env]))
+    model = sb3.PPO("MlpPolicy", venv, n_steps=64, batch_size=64, policy_kwargs=network())
+    with pytest.raises(
+        ValueError, match=r"time left: expected at least 0 s, got -.*use VecNormalize with norm_obs=Fal"
+    ):
+        model.learn(128)
+
+
+@pytest.mark.parametrize("returned", [lambda a: a, lambda a: (a, None)])
+def test_arguments_of_predict_after_the_observation_are_optional(returned):
+    class Batches:
+        def predict(self, observation):
+            assert observation.ndim == 2
+            return returned(np.zeros((len(observation), 2), np.float32))
+
+    class Deterministic:
+        def predict(self, observation, deterministic=False):
+            assert deterministic
+            return returned(np.zeros((*np.shape(observation)[:-1], 2), np.float32))
+
+    for policy in (Batches(), Deterministic()):
+        assert len(evaluate(policy, "open", count=2, progress=False)) == 2
+
+
+def test_goal_conditioned_models_are_evaluated_in_their_environment():
+    env = gym.make("leapnav/NavigateGoal-v0", family="open")
+    model = sb3.SAC("MultiInputPolicy", env, buffer_size=500, replay_buffer_class=sb3.HerReplayBuffer)
+    for one in evaluate(model, "open", count=2, progress=False):
+        assert not one.success
+        assert one.episode_return == pytest.approx(-one.cost - 50 * (1 + one.collision))
+
+
+def test_environments_match_themselves():
+    check_environments_match(gym.make(ID, family="slalom"), gym.make(ID, family="slalom"), num_steps=20)
+
+
+def test_infos_have_the_same_keys_and_kinds_after_a_reset_and_a_step():
+    for env in (open_env(), open_env(horizon="free"), gym.make("leapnav/NavigateGoal-v0"), open_env(robot="car")):
+        _, first = env.reset(seed=0)
+        second = env.step(env.action_space.sample())[4]
+        for name, value in first.items():
+            assert type(second[name]) is type(value) and isinstance(value, (bool, int, float, np.ndarray)), name
+        assert len(first) == len(second)
+
+
+def test_vector_episodes_are_truncated():
+    venv = gym.make_vec(ID, 2, "vector_entry_point", family="open", max_episode_steps=3)
+    venv.reset(seed=0)
+    ends = [venv.step(np.zeros((2, 2), np.float32))[2:4] for _ in range(8)]
+    assert [(bool(t.any()), bool(c.all())) for t, c in ends] == [(False, k in (2, 6)) for k in range(8)]
