@@ -48,7 +48,8 @@ class GoalConditioned:
         """
         reached = is_reached(achieved_goal, desired_goal, self.settings)
         if self.settings.reward == "sparse":
-            return reached.astype(float) if reached.ndim else float(reached)
+            scaled = self.settings.reward_scale * reached
+            return scaled if reached.ndim else float(scaled)
         if reached.ndim == 0:
             return self._cost_reward(bool(reached), info)
         if isinstance(info, Mapping) or len(info) != len(reached):
@@ -65,7 +66,7 @@ class GoalConditioned:
         running = sum(info.get(f"reward_{name}", 0.0) for name in names)
         arrived = reached and (info["at_horizon"] or self.settings.free_horizon)
         missed = info["terminated"] and not arrived
-        return running - (self.settings.miss_penalty if missed else 0.0)
+        return self.settings.reward_scale * (running - (self.settings.miss_penalty if missed else 0.0))
 
 
 def _describe(info: Any) -> str:

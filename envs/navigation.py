@@ -111,8 +111,12 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `reward_proximity` | minus the integral of the proximity cost Phi over the step, with a relative error of at most 1e-4 (1e-3 in rare steps that end in a collision) | always |
     | `reward_time` | minus the time weight times the duration of the step | free horizon |
     | `reward_collision` | `-collision_penalty` | at the first collision of the episode |
-    | `reward_miss` | `-miss_penalty` | if the episode terminates without reaching the goal, at the horizon or by a collision |
+    | `reward_miss` | `-miss_penalty`; with `graded_miss` times min(1, 0.2 + 0.1 (distance (m) + heading error (rad) from the goal)) | if the episode terminates without reaching the goal, at the horizon or by a collision |
     | `reward_shaping` (`reward="shaped"` only) | `discount` times the potential after the step, minus the potential before it | always |
+
+    The reward is the sum of the parts, times `reward_scale`. With a constant penalty, a learner has no information about
+    the goal until it reaches it by chance, and the cost favours standing still: use `graded_miss=True` to learn without
+    demonstrations. The return of a success is the same.
 
     v and omega are the actual speed and turn rate, which differ from the commanded ones with motors, in contact and
     with noise.
@@ -183,6 +187,8 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `heading_tolerance` | 0.1 | tolerance of success (rad) |
     | `motion_tolerance` | 0.1 | tolerance of success of further states (in their units) |
     | `collision_penalty`, `miss_penalty` | 50 | should exceed the cost of the optimum, or else not moving is optimal; 50 is sufficient for the families |
+    | `graded_miss` | False | whether the penalty of a miss is smaller near the goal, see Rewards |
+    | `reward_scale` | 1 | factor of all rewards |
     | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
     | `terminate_on_collision` | True | whether a collision ends the episode |
     | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and maximum range (m) |

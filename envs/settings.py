@@ -122,6 +122,8 @@ class EnvironmentSettings:
     motion_tolerance: float = 0.1
     collision_penalty: float = 50.0
     miss_penalty: float = 50.0
+    graded_miss: bool = False
+    reward_scale: float = 1.0
     discount: float = 0.99
     terminate_on_collision: bool = True
     lidar_beams: int = 32
@@ -139,7 +141,14 @@ class EnvironmentSettings:
         check_choice("observation", self.observation, OBSERVATIONS)
         check_choice("reward", self.reward, GOAL_REWARDS if self.goal_conditioned else REWARDS)
         check_choice("actuation", self.actuation, ACTUATIONS)
-        for name in ("control_period", "position_tolerance", "heading_tolerance", "motion_tolerance", "lidar_range"):
+        for name in (
+            "control_period",
+            "position_tolerance",
+            "heading_tolerance",
+            "motion_tolerance",
+            "lidar_range",
+            "reward_scale",
+        ):
             check_positive(name, getattr(self, name))
         for name in ("collision_penalty", "miss_penalty"):
             check_not_negative(name, getattr(self, name))
@@ -147,7 +156,7 @@ class EnvironmentSettings:
         check_fraction("discount", self.discount, zero=False)
         for name, minimum in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
             check_integer(name, getattr(self, name), minimum, MAX_COUNT)
-        for name in ("terminate_on_collision", "dict_observation", "previous_action", "velocities"):
+        for name in ("terminate_on_collision", "graded_miss", "dict_observation", "previous_action", "velocities"):
             check_flag(name, getattr(self, name))
         if self.velocities and self.observation not in WITH_VELOCITIES:
             raise ValueError(f"velocities: expected False for the observation {self.observation!r}, got True")
@@ -168,6 +177,8 @@ class EnvironmentSettings:
             raise ValueError(
                 "observation: with a free horizon, a goal-conditioned environment needs 'lidar' or 'map', got 'state'"
             )
+        if self.goal_conditioned and self.graded_miss:
+            raise ValueError("graded_miss: expected False for a goal-conditioned environment, got True")
         if self.goal_conditioned and self.observation == "geodesic":
             raise ValueError(
                 "observation: geodesic distances depend on the goal, which a goal-conditioned learner replaces; "

@@ -273,7 +273,8 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
             if not isinstance(index, int):  # selected by a reset
                 continue
             collision = episode.collided
-            value = -episode.cost - self.settings.collision_penalty * collision - episode.miss
+            missed = self.settings.miss_penalty * (episode.miss > 0.0)  # in full, also if it is graded
+            value = -episode.cost - self.settings.collision_penalty * collision - missed
             regret = -float(bank.costs[index]) - value
             sampler.record(LevelOutcome(index, episode.success, collision, value, regret))
 

@@ -19,6 +19,9 @@ from leapnav.envs.simulation.paths import ADDRESSES, MOTION, Path, drive_path, m
 from leapnav.envs.simulation.state import PACKED, SIMULATION, Simulation, field_of, row_of
 
 GRAVITY = 9.81  # m/s^2
+# Of a graded miss: fraction of the penalty that any miss costs, without which a success would return hardly more than a
+# close miss, and fraction per m of distance and per rad of heading error.
+MIN_MISS_FRACTION, MISS_FRACTION_SLOPE = 0.2, 0.1
 
 
 @kernel(MATRIX(SIMULATION, int64), inline="always")
@@ -293,6 +296,16 @@ def at_goal(i, sim):
     return math.isnan(goal[2]) or abs(wrapped(state[2] - goal[2])) <= settings.heading_tolerance
 
 
+@kernel(float64(int64, SIMULATION))
+def miss_fraction(i, sim):
+    """Return the fraction of the miss penalty that depends on the distance from the goal pose."""
+    state, goal = row_of(sim.states, i), row_of(sim.goals, i)
+    away = math.hypot(state[0] - goal[0], state[1] - goal[1])
+    if not math.isnan(goal[2]):
+        away += abs(wrapped(state[2] - goal[2]))
+    return min(1.0, MIN_MISS_FRACTION + MISS_FRACTION_SLOPE * away)
+
+
 @kernel(NOTHING(FLAGS, PACKED))
 def end_periods(active, packed):
     """Complete a period: update time, cost and reward, and determine whether the episode has ended."""
@@ -317,10 +330,11 @@ def end_periods(active, packed):
         episode.terminated = ended
         episode.truncated = settings.free_horizon and last and not ended
         if ended and not reached:
-            episode.miss = settings.miss_penalty
+            episode.miss = settings.miss_penalty * (miss_fraction(i, sim) if settings.graded_miss else 1.0)
         episode.reward = -episode.effort - episode.proximity - episode.collision - episode.miss - episode.time_cost
         if settings.shaped:
             after = 0.0 if ended else potential(i, sim)
             episode.shaping = settings.discount * after - episode.potential
             episode.potential = after
             episode.reward += episode.shaping
+        episode.reward *= settings.reward_scale

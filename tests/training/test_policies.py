@@ -9,7 +9,6 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.envs import NavigateEnv
 from leapnav.training import NavigationFeatures, load_policy, make_vec_env, network, save_policy
-from leapnav.training.environments.rewards import ScaledReward
 from leapnav.training.policies.files import _checksum
 
 
@@ -26,7 +25,7 @@ def test_the_features_have_the_promised_size_and_are_finite(env):
 
 def test_policies_are_checked_against_the_robots_of_stable_baselines3(clone, tmp_path):
     save_policy(clone[0], tmp_path)
-    load_policy(tmp_path, ScaledReward(make_vec_env(n_envs=2, family="open"), 0.1))
+    load_policy(tmp_path, make_vec_env(n_envs=2, family="open", reward_scale=0.1))
     with pytest.raises(ValueError, match="lidar_beams=32"):
         load_policy(tmp_path, make_vec_env(n_envs=2, family="open", lidar_beams=16))
 

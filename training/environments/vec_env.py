@@ -128,7 +128,7 @@ class NavigateVecEnv(VecEnv):
         """Step all robots; a robot whose episode ends starts the next one."""
         observations, rewards, terminated, truncated, infos = self.venv.step(self._actions)
         ended = terminated | truncated
-        self._returns += rewards
+        self._returns += rewards / self.venv.settings.reward_scale
         self._lengths += 1
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if self._step_infos:

@@ -26,7 +26,6 @@ from leapnav.envs.vector import NavigateVectorEnv
 from leapnav.training.config import PPOConfig, SACConfig
 from leapnav.training.environments.level_samplers import VALUE_SCORES, PrioritizedSampler, UniformSampler
 from leapnav.training.environments.level_scoring import LevelScoring
-from leapnav.training.environments.rewards import GradedMiss, ScaledReward
 from leapnav.training.environments.vec_env import environment_seed, make_vec_env
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
@@ -226,18 +225,16 @@ def make_training_env(config: Config) -> VecEnv:
     if isinstance(config, PPOConfig):
         penalty = config.penalty
         task = {"control_period": config.control_period, "collision_penalty": penalty, "miss_penalty": penalty}
-    robots = make_vec_env(
+    return make_vec_env(
         n_envs=config.n_envs,
         **_scenarios(config),
         reward=config.reward,
         discount=config.discount,
+        graded_miss=config.graded_miss,
+        reward_scale=config.reward_scale,
         **config.environment,
         **task,
     )
-    venv: VecEnv = robots
-    if config.graded_miss:
-        venv = GradedMiss(venv)
-    return ScaledReward(venv, config.reward_scale)
 
 
 def _scenarios(config: Config) -> dict[str, Any]:
