@@ -159,6 +159,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `time` | time since the start of the episode (s) |
     | `pose` (3,) | x, y (m), heading (rad, unwrapped) |
     | `motion` (n - 3,) | further states of the robot, if its model has any |
+    | `goal_distance`, `heading_error` | distance of the pose from the goal (m), and difference of the headings (rad), 0 if that of the goal is free |
     | `reward_effort`, ... | see Rewards |
     | `index`, `reference_cost` | with a bank: index of the scenario, and cost of its optimum; -1 and NaN for a scenario that is not from the bank |
     | `lower_bound` | with a bank: proved lower bound of the cost, -infinity if none is known |
@@ -409,6 +410,8 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
             "collision": episode.collided,
             "is_success": episode.success,
             "pose": state[:3].copy(),
+            "goal_distance": episode.goal_distance,
+            "heading_error": episode.heading_error,
             "reward_effort": -episode.effort,
             "reward_proximity": -episode.proximity,
             "reward_collision": -episode.collision,

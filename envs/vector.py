@@ -367,6 +367,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         episodes, states = self._simulator.episodes, self._simulator.states
         names = {"cost": "cost", "clearance": "clearance", "time": "time"}
         names |= {"collision": "collided", "is_success": "success"}
+        names |= {name: name for name in ("goal_distance", "heading_error")}
         values: dict[str, Any] = {name: episodes[field].copy() for name, field in names.items()}
         values["pose"] = states[:, :3].copy()
         if states.shape[1] > 3:

@@ -29,6 +29,7 @@ class Episode(NamedTuple):
         duration, remaining: of the period, and of its part after the first contact (s).
         vx, vy, spin: velocity (m/s, m/s, rad/s) of a robot with motors.
         pose_clearance, clearance: of the pose, and the smallest one during the period (m).
+        goal_distance, heading_error: of the pose from the goal (m, rad); the error of a free heading is 0.
         effort, proximity, time_cost, collision, miss: parts of the reward of the period, as costs.
         shaping: part of the reward of the period.
         reward: the reward of the period.
@@ -53,6 +54,8 @@ class Episode(NamedTuple):
     spin: float
     pose_clearance: float
     clearance: float
+    goal_distance: float
+    heading_error: float
     effort: float
     proximity: float
     time_cost: float

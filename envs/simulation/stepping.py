@@ -69,6 +69,14 @@ def potential(i, sim):
     return -min(estimate, settings.miss_penalty)
 
 
+@kernel(NOTHING(int64, SIMULATION))
+def measure_miss(i, sim):
+    """Set how far the pose of robot i is from its goal."""
+    state, goal, episode = row_of(sim.states, i), row_of(sim.goals, i), sim.episodes[i]
+    episode.goal_distance = math.hypot(state[0] - goal[0], state[1] - goal[1])
+    episode.heading_error = 0.0 if math.isnan(goal[2]) else abs(wrapped(state[2] - goal[2]))
+
+
 @kernel(NOTHING(INTEGERS, PACKED))
 def start_episodes(robots, packed):
     """Start the episodes of robots, given by index, whose states and tasks are set."""
@@ -80,6 +88,7 @@ def start_episodes(robots, packed):
         episode.last_step = max(1, math.ceil(episode.horizon / settings.control_period - 1e-6))
         clearance, _ = footprint_clearance(state, outline_of(sim, i), field_of(sim.fields, i))
         episode.pose_clearance = episode.clearance = clearance
+        measure_miss(i, sim)
         if settings.shaped:
             episode.potential = potential(i, sim)
 
@@ -296,16 +305,6 @@ def at_goal(i, sim):
     return math.isnan(goal[2]) or abs(wrapped(state[2] - goal[2])) <= settings.heading_tolerance
 
 
-@kernel(float64(int64, SIMULATION))
-def miss_fraction(i, sim):
-    """Return the fraction of the miss penalty that depends on the distance from the goal pose."""
-    state, goal = row_of(sim.states, i), row_of(sim.goals, i)
-    away = math.hypot(state[0] - goal[0], state[1] - goal[1])
-    if not math.isnan(goal[2]):
-        away += abs(wrapped(state[2] - goal[2]))
-    return min(1.0, MIN_MISS_FRACTION + MISS_FRACTION_SLOPE * away)
-
-
 @kernel(NOTHING(FLAGS, PACKED))
 def end_periods(active, packed):
     """Complete a period: update time, cost and reward, and determine whether the episode has ended."""
@@ -329,8 +328,11 @@ def end_periods(active, packed):
         ended = (reached if settings.free_horizon else last) or (episode.collided and settings.terminate_on_collision)
         episode.terminated = ended
         episode.truncated = settings.free_horizon and last and not ended
+        measure_miss(i, sim)
         if ended and not reached:
-            episode.miss = settings.miss_penalty * (miss_fraction(i, sim) if settings.graded_miss else 1.0)
+            away = episode.goal_distance + episode.heading_error
+            graded = min(1.0, MIN_MISS_FRACTION + MISS_FRACTION_SLOPE * away)
+            episode.miss = settings.miss_penalty * (graded if settings.graded_miss else 1.0)
         episode.reward = -episode.effort - episode.proximity - episode.collision - episode.miss - episode.time_cost
         if settings.shaped:
             after = 0.0 if ended else potential(i, sim)

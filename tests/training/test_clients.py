@@ -15,6 +15,7 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RescaleAction as RescaleActions
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from leapnav.envs import ScenarioBank
 from leapnav.experts import ExpertPolicy, rollout
 from leapnav.training import behaviour_clone, evaluate, network
 from leapnav.training.policies.zips import load_zip
@@ -158,3 +159,12 @@ def test_vector_episodes_are_truncated():
     venv.reset(seed=0)
     ends = [venv.step(np.zeros((2, 2), np.float32))[2:4] for _ in range(8)]
     assert [(bool(t.any()), bool(c.all())) for t, c in ends] == [(False, k in (2, 6)) for k in range(8)]
+
+
+def test_the_distance_from_the_goal_says_by_how_much_it_was_missed():
+    (episode,) = evaluate(lambda observation: np.zeros(2), "open", count=1, timed=False, progress=False)
+    x, y, heading = ScenarioBank.shipped("open", "test")[0].goal
+    last = episode.states[-1]
+    assert episode.goal_distance == pytest.approx(np.hypot(last[0] - x, last[1] - y))
+    assert episode.heading_error == pytest.approx(abs(np.remainder(last[2] - heading + np.pi, 2 * np.pi) - np.pi))
+    assert episode.to_dict()["goal_distance"] == episode.goal_distance

@@ -23,6 +23,7 @@ class PlayedEpisode:
         clearance: smallest clearance (m).
         duration: time at the end (s).
         success, collision, truncated: the outcome.
+        goal_distance, heading_error: of the last pose from the goal (m, rad).
 
     """
 
@@ -35,6 +36,8 @@ class PlayedEpisode:
     success: bool
     collision: bool
     truncated: bool
+    goal_distance: float
+    heading_error: float
 
 
 def play_episodes(
@@ -78,6 +81,8 @@ def play_episodes(
                 success=bool(last["is_success"][i]),
                 collision=bool(last["collision"][i]),
                 truncated=bool(truncated[i]),
+                goal_distance=float(last["goal_distance"][i]),
+                heading_error=float(last["heading_error"][i]),
             )
     return [episode for episode in episodes if episode is not None]
 

@@ -40,6 +40,7 @@ class Episode:
         lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
         truncated: whether the time limit of a free horizon ended the episode, without a penalty for the missed goal.
         duration: of the episode (s).
+        goal_distance, heading_error: of the last pose from the goal (m, rad): by how much a failure missed it.
         shortest_length: length (m) of the shortest path of the scenario without contact; NaN if it is not known.
         shortest_time: minimum time (s) of the scenario without contact; NaN if it is not known.
 
@@ -63,6 +64,8 @@ class Episode:
     lower_bound: float = math.nan
     truncated: bool = False
     duration: float = math.nan
+    goal_distance: float = math.nan
+    heading_error: float = math.nan
     shortest_length: float = math.nan
     shortest_time: float = math.nan
 
