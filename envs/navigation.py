@@ -18,6 +18,7 @@ from leapnav.envs.scenarios.sources import ScenarioSource, WithSpec, get_scenari
 from leapnav.envs.settings import EnvironmentSettings, takes_settings
 from leapnav.envs.simulation.simulator import BatchSimulator
 from leapnav.envs.simulation.state import Episode
+from leapnav.envs.utils.validation import check_flag
 
 if TYPE_CHECKING:
     from leapnav.envs.simulation.rendering import Window
@@ -197,6 +198,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `previous_action` | False | whether the observation contains the last action |
     | `map_obstacles`, `map_vertices` | 8, 8 | number of discs, capsules and polygons in the map, and of vertices of each; more vertices are an error |
     | `render_mode` | None | `"rgb_array"` or `"human"` |
+    | `show_optimum` | False | whether frames contain the optimum of a scenario of a bank, and its cost; not if they are observations |
 
     ## Errors
     `ValueError` for an invalid argument; the message states its name and value. `ScenarioError`, a `ValueError`, for an
@@ -224,12 +226,14 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         horizon: str | None = None,
         obstacles: str | None = None,
         render_mode: str | None = None,
+        show_optimum: bool = False,
         **settings: Any,
     ) -> None:
         self._source = ScenarioSource(family, scenario, split, bank, robot, horizon, obstacles)
         self.settings = EnvironmentSettings.of(self, self._source, settings)
         check_render_mode(render_mode, self.metadata["render_modes"])
-        self.render_mode = render_mode
+        check_flag("show_optimum", show_optimum)
+        self.render_mode, self._show_optimum = render_mode, bool(show_optimum)
         # Real time, also for the wrappers that record videos.
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.settings.control_period))}
         self._simulator = BatchSimulator(1, self.settings)
@@ -320,7 +324,9 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
             raise gym.error.ResetNeeded("reset the environment before rendering it")
         from leapnav.envs.simulation.rendering import Window, draw_scene, make_scene  # imports pygame
 
-        frame = draw_scene(make_scene(self._simulator, 0, self._choice, self.bank, self._trail))
+        frame = draw_scene(
+            make_scene(self._simulator, 0, self._choice, self.bank, self._trail, show_optimum=self._show_optimum)
+        )
         if self.render_mode == "rgb_array":
             return frame
         if self._window is None:

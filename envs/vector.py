@@ -29,7 +29,7 @@ from leapnav.envs.scenarios.sources import (
 )
 from leapnav.envs.settings import EnvironmentSettings, takes_settings
 from leapnav.envs.simulation.simulator import BatchSimulator
-from leapnav.envs.utils.validation import check_integer, is_integer
+from leapnav.envs.utils.validation import check_flag, check_integer, is_integer
 
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode as AutoresetMode
@@ -63,6 +63,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         max_episode_steps: number of steps after which an episode is truncated; None for no other end than those of
             `NavigateEnv`.
         render_mode: None or "rgb_array"; `render` returns a frame of each robot.
+        show_optimum: see `NavigateEnv`.
         settings: the other arguments of `NavigateEnv`.
 
     Raises:
@@ -90,6 +91,7 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        show_optimum: bool = False,
         **settings: Any,
     ) -> None:
         self.num_envs = check_integer("num_envs", num_envs, 1)
@@ -111,7 +113,8 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
         check_render_mode(render_mode, self.metadata["render_modes"])
         fps = max(1, round(1 / self.settings.control_period))
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": fps}
-        self.render_mode = render_mode
+        check_flag("show_optimum", show_optimum)
+        self.render_mode, self._show_optimum = render_mode, bool(show_optimum)
         self._simulator = BatchSimulator(self.num_envs, self.settings)
         self.single_observation_space = self._simulator.layout.space
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self._source.robot.sizes()[1],), np.float32)
@@ -292,7 +295,9 @@ class NavigateVectorEnv(WithSpec, VectorEnv[Any, np.ndarray, np.ndarray]):  # ty
 
         choice = self._choices[i]
         assert choice is not None  # checked by `render`
-        return draw_scene(make_scene(self._simulator, i, choice, self.bank, self._trails[i]))
+        return draw_scene(
+            make_scene(self._simulator, i, choice, self.bank, self._trails[i], show_optimum=self._show_optimum)
+        )
 
     @property
     def family(self) -> str:

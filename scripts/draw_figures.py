@@ -83,7 +83,7 @@ def draw_frames() -> None:
     """Draw frames of three episodes of the expert in progress."""
     frames = []
     for family, index, steps in FRAMES:
-        env = NavigateEnv(family, split="test", render_mode="rgb_array")
+        env = NavigateEnv(family, split="test", render_mode="rgb_array", show_optimum=True)
         observation, _ = env.reset(options={"index": index})
         expert = ExpertPolicy(env)
         for _ in range(steps):

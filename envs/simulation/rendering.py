@@ -64,10 +64,12 @@ def make_scene(
     choice: Scenario | int,
     bank: ScenarioBank | None,
     trail: list[tuple[float, float, float]],
+    *,
+    show_optimum: bool,
 ) -> Scene:
-    """Return the scene of one robot's episode."""
+    """Return the scene of one robot's episode, with the optimum of a scenario of the bank if it is to be shown."""
     optimum, reference_cost = None, None
-    if bank is not None and isinstance(choice, int):
+    if show_optimum and bank is not None and isinstance(choice, int):
         optimum, reference_cost = bank.states(choice), float(bank.costs[choice])
     episode = simulator.episode(robot)
     return Scene(

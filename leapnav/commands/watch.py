@@ -110,7 +110,7 @@ class Watch:
 
         arguments = {**self._sensors(), "actuation": self.actuation, "disturbance": self.disturbance}
         scenarios = {"family": self.family, "split": self.split, "obstacles": self.obstacles}
-        return gym.make("leapnav/Navigate-v0", **scenarios, render_mode=render_mode, **arguments)
+        return gym.make("leapnav/Navigate-v0", **scenarios, render_mode=render_mode, show_optimum=True, **arguments)
 
     def _play(self, env: gym.Env[Any, Any]) -> None:
         """Play and report the episodes, until the window is closed."""

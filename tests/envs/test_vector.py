@@ -32,6 +32,8 @@ SETTINGS = [
     {"scenario": TIME_LIMITED, "terminate_on_collision": False, "actuation": "motor"},
 ]
 
+ORANGE = 0xD9, 0x73, 0x0D  # of the optimum in a frame
+
 
 def make(count, **arguments):
     return gym.make_vec(ID, num_envs=count, vectorization_mode="vector_entry_point", **arguments)
@@ -373,3 +375,14 @@ def test_frames_are_of_each_robot():
     alone.step(np.ones(2, np.float32))
     assert np.array_equal(frames[1], alone.render())
     assert not np.array_equal(frames[0], frames[1])
+
+
+def test_frames_contain_the_optimum_only_on_request():
+    for kind in (make, lambda count, **arguments: NavigateEnv(**arguments)):
+        shown = []
+        for wish in (True, False):
+            env = kind(1, render_mode="rgb_array", show_optimum=wish)
+            env.reset(seed=0)
+            orange = np.abs(np.squeeze(env.render()).astype(int) - ORANGE).sum(axis=2) < 20
+            shown.append(int(orange.sum()))
+        assert shown[0] > 100 and shown[1] == 0
