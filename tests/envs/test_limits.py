@@ -158,6 +158,7 @@ def test_optima_respect_the_limits_of_states():
     assert info["is_success"] and info["cost"] == pytest.approx(optimum.cost, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_the_expert_drives_at_the_limit_of_the_speed():
     scenario = task(LIMITED, horizon=None, start_motion=[0.8, 0.0], cost={"time_weight": 1.0})
     env = NavigateEnv(scenario=scenario)

@@ -65,7 +65,7 @@ def test_a_rectangle_passes_corners_on_its_way_through_a_gap():
     assert not touches(scenario, optimum.evaluate(np.linspace(0, 10, 2001))[0])
 
 
-@pytest.mark.parametrize("obstacles", ["cost", "hard"])
+@pytest.mark.parametrize("obstacles", ["cost", pytest.param("hard", marks=pytest.mark.slow)])
 def test_fresh_scenarios_with_a_rectangle(obstacles):
     for seed in range(8):
         scenario = sample_scenario("polygons", 60_000 + seed, robot=Unicycle(footprint=BOX), obstacles=obstacles)

@@ -207,7 +207,13 @@ def test_the_optimum_of_a_scenario_minimises_over_the_horizon(family):
 # With the large time weights the robots drive at their speed limits most of the time.
 @pytest.mark.parametrize(
     ("robot", "time_weight"),
-    [("unicycle", 5.0), ("differential_drive", 0.5), ("car", 0.5), ("car", 3.0), ("dynamic_unicycle", 5.0)],
+    [
+        ("unicycle", 5.0),
+        ("differential_drive", 0.5),
+        ("car", 0.5),
+        ("dynamic_unicycle", 5.0),
+        pytest.param("car", 3.0, marks=pytest.mark.slow),
+    ],
 )
 def test_no_fixed_horizon_close_to_the_optimum_costs_less(robot, time_weight):
     for seed in (41_007,):
