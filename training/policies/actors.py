@@ -74,7 +74,7 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     """
     if isinstance(policy, ActorCriticPolicy):
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
-        middle, half = (th.as_tensor(part) for part in action_range(policy.action_space))
+        middle, half = (th.as_tensor(part, device=features.device) for part in action_range(policy.action_space))
         return (policy.action_net(policy.mlp_extractor.forward_actor(features)) - middle) / half
     actor = _actor(policy)
     if isinstance(actor, MomentumActor):
@@ -89,7 +89,8 @@ def set_noise(policy: BasePolicy, std: th.Tensor | float) -> None:
     std = th.as_tensor(std)
     with th.no_grad():
         if isinstance(policy, ActorCriticPolicy):
-            policy.log_std.copy_((std * th.as_tensor(action_range(policy.action_space)[1])).log())
+            half = th.as_tensor(action_range(policy.action_space)[1], device=std.device)
+            policy.log_std.copy_((std * half).log())
         elif isinstance(getattr(_actor(policy), "log_std", None), nn.Linear):
             # This is the standard deviation before squashing, almost the same for actions close to 0.
             _actor(policy).log_std.weight.zero_()
