@@ -51,6 +51,8 @@ def driven(scenario, states, *, success=False, collision=False, costs=None):
         success=success,
         collision=collision,
         truncated=False,
+        goal_distance=1.0,
+        heading_error=0.1,
     )
     return DrivenEpisode(scenario, played)
 

@@ -222,7 +222,19 @@ def test_the_history_of_a_takeover_is_the_learners():
     scenario = sample_scenario("clutter", 7)
     poses = np.linspace(scenario.start, scenario.goal, 121)
     actions = np.random.default_rng(0).uniform(-1, 1, (120, 2)).astype(np.float32)
-    played = PlayedEpisode(poses, actions, np.zeros(121), 0.0, 0.0, 6.0, success=False, collision=True, truncated=False)
+    played = PlayedEpisode(
+        poses,
+        actions,
+        np.zeros(121),
+        episode_return=0.0,
+        clearance=0.0,
+        duration=6.0,
+        success=False,
+        collision=True,
+        truncated=False,
+        goal_distance=0.0,
+        heading_error=0.0,
+    )
     settings = EnvironmentSettings(**HISTORY)
     parts = Labeller(settings, 1.0, "low").label(DrivenEpisode(scenario, played), np.random.default_rng(0))
     seen = Observer(EnvironmentSettings()).observe([scenario] * 121, poses, 0.05 * np.arange(121))
