@@ -1,4 +1,4 @@
-"""Study of curricula: scores of levels beside the exact regret, and PPO from scratch with each level sampler.
+"""Study of curricula: scores of levels beside the regret, and PPO from scratch with each level sampler.
 
 python scripts/curriculum_study.py                          # everything; finished parts are skipped
 python scripts/curriculum_study.py --only uniform --seeds 0 # trains these runs only

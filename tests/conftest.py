@@ -95,7 +95,7 @@ def _few_scenarios(monkeypatch):
     from leapnav.training.runs import run
 
     monkeypatch.setattr(run, "FINAL_SCENARIOS", 5)
-    monkeypatch.setattr(run, "TEST_COUNT", 5)
+    monkeypatch.setattr(run, "BANK_COUNT", 5)
 
 
 @pytest.fixture(autouse=True)

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from leapnav.training.scoring.evaluation import Policy, PolicyFactory, evaluate
     from leapnav.training.scoring.html_report import write_report
     from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores
-    from leapnav.training.scoring.results import Episode, Evaluation
-    from leapnav.training.scoring.scores import Interval, Score, profile, score
+    from leapnav.training.scoring.results import Episode, Evaluation, read_episodes, write_episodes
+    from leapnav.training.scoring.scores import Interval, Limits, Score, profile, score
 
 __all__ = [
     "BCConfig",
@@ -58,6 +58,7 @@ __all__ = [
     "Interval",
     "LearnabilitySampler",
     "LevelScoring",
+    "Limits",
     "NavigateVecEnv",
     "NavigationFeatures",
     "PPOConfig",
@@ -86,6 +87,7 @@ __all__ = [
     "policy_environment",
     "print_scores",
     "profile",
+    "read_episodes",
     "regret",
     "save_policy",
     "score",
@@ -95,6 +97,7 @@ __all__ = [
     "train_ppo",
     "train_sac",
     "warm_start",
+    "write_episodes",
     "write_report",
 ]
 
@@ -123,10 +126,10 @@ _LAZY = {
     "scoring.comparison": ("Comparison", "compare"),
     "scoring.decisions": ("Decisions", "PolicyRegret", "regret"),
     "scoring.evaluation": ("Policy", "PolicyFactory", "evaluate"),
-    "scoring.results": ("Episode", "Evaluation"),
+    "scoring.results": ("Episode", "Evaluation", "read_episodes", "write_episodes"),
     "scoring.html_report": ("write_report",),
     "scoring.reports": ("plot_episodes", "plot_scores", "print_scores"),
-    "scoring.scores": ("Interval", "Score", "profile", "score"),
+    "scoring.scores": ("Interval", "Limits", "Score", "profile", "score"),
 }
 
 

@@ -137,7 +137,7 @@ class RunConfig:
     """Whether the observation contains the last action, in whose direction the policy moves on where the network
     hesitates (momentum); by default with a free horizon, if the robot has no drift and there is no history."""
     evaluation_scenarios: int = 100
-    """Scenarios per family of the test split in an evaluation during the run; the final evaluation plays all."""
+    """Scenarios per family of the training split in evaluations during the run; the last one plays the test split."""
 
     @property
     def fresh_scenarios(self) -> dict[str, Any]:
@@ -177,9 +177,9 @@ class RunConfig:
             raise ValueError("previous_action: expected a free horizon and a robot without drift, got True")
         return found
 
-    def own_bank(self, folder: Path, family: str) -> Path:
-        """Return the file of the test bank that the run in a directory builds for a family without an included one."""
-        return folder / ("test.bank" if family == self.family else f"test-{family}.bank")
+    def own_bank(self, folder: Path, family: str, split: str = "test") -> Path:
+        """Return the file of the bank that the run in a directory builds for a family without an included one."""
+        return folder / (f"{split}.bank" if family == self.family else f"{split}-{family}.bank")
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, start: Sequence[Path] = (), **changes: Any) -> Self:
@@ -423,8 +423,8 @@ ALGORITHMS: dict[str, type[RunConfig]] = {
 }
 
 
-def read_config(folder: Path) -> tuple[str, RunConfig]:
-    """Read the algorithm and the configuration of the run in a directory.
+def read_config(run: Path) -> tuple[str, RunConfig]:
+    """Read the algorithm and the configuration of the run in a directory, or from its file `config.json`.
 
     Raises:
         FileNotFoundError: the directory contains no run.
@@ -433,7 +433,7 @@ def read_config(folder: Path) -> tuple[str, RunConfig]:
     """
     from pydantic import TypeAdapter, ValidationError
 
-    path = folder / "config.json"
+    path = run / "config.json" if run.is_dir() else run
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run in this directory")
     try:

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from leapnav.training import Episode, Evaluation, profile, score
+from leapnav.training import Episode, Evaluation, score
+from leapnav.training.scoring import scores
 
 P, SEED_EFFECT = 0.9, 0.03  # success rate, and standard deviation of the rates of runs
 
@@ -41,24 +42,42 @@ def runs_of_one_method(rng, n_runs, n_scenarios, seed_effect, difficulty):
     return [evaluation(row) for row in rng.random((n_runs, n_scenarios)) < np.clip(rates, 0, 1)]
 
 
+@pytest.fixture
+def rates_only(monkeypatch):
+    """Scores without the bootstrap of the other statistics, which takes most of the time."""
+    monkeypatch.setattr(scores, "N_RESAMPLES", 2)
+    monkeypatch.setattr(scores, "N_VARIANCE_RESAMPLES", 2)
+
+
+@pytest.mark.usefixtures("rates_only")
 @pytest.mark.parametrize(
     ("n_runs", "seed_effect", "difficulty"),
     [
-        (1, 0.0, 0.0),
-        (1, 0.0, 0.05),
         (3, SEED_EFFECT, 0.05),
         (5, SEED_EFFECT, 0.0),
         (5, SEED_EFFECT, 0.05),
         (5, 0.0, 0.05),
     ],
 )
-def test_intervals_of_a_rate_cover_it_with_and_without_a_seed_effect(n_runs, seed_effect, difficulty):
+def test_intervals_of_a_rate_over_runs_cover_that_of_the_method(n_runs, seed_effect, difficulty):
     rng, trials, hits = np.random.default_rng(0), 200, 0
     for _ in range(trials):
-        runs = runs_of_one_method(rng, n_runs, 200, seed_effect, difficulty)
-        _, (low,), (high,) = profile(runs, np.array([1.0]))  # the success rate, as all ratios are 1
+        low, high = score("method", runs_of_one_method(rng, n_runs, 200, seed_effect, difficulty)).success.over_runs
         hits += low <= P <= high
     assert hits / trials >= 0.91  # 95 % less 2.6 standard deviations of the estimate
+
+
+@pytest.mark.usefixtures("rates_only")
+@pytest.mark.parametrize(("n_runs", "difficulty"), [(1, 0.0), (1, 0.05), (5, 0.0), (5, 0.05)])
+def test_intervals_of_a_rate_over_scenarios_cover_that_of_the_policies(n_runs, difficulty):
+    """The rates of the runs differ, but stay the same in all trials: other scenarios are drawn, not other runs."""
+    rng, trials, hits = np.random.default_rng(0), 200, 0
+    rates = np.linspace(0.85, 0.95, n_runs)[:, None] if n_runs > 1 else np.array([[P]])
+    for _ in range(trials):
+        chances = rates + difficulty * rng.uniform(-1, 1, 200)
+        found = score("method", [evaluation(row) for row in rng.random((n_runs, 200)) < chances]).success
+        hits += found.low <= P <= found.high
+    assert 0.91 <= hits / trials < 1.0
 
 
 def test_intervals_of_a_median_cover_it_with_a_seed_effect():
@@ -67,7 +86,7 @@ def test_intervals_of_a_median_cover_it_with_a_seed_effect():
     for trial in range(trials):
         logs = 0.2 * rng.standard_normal((5, 1)) + rng.standard_normal(100) + 0.5 * rng.standard_normal((5, 100))
         found = score("method", [evaluation(np.ones(100), 1 + np.exp(row)) for row in logs], seed=trial).regret
-        hits += found.low <= 1.0 <= found.high
+        hits += found.over_runs.low <= 1.0 <= found.over_runs.high
     assert hits >= 34  # 38 less 2.9 standard deviations
 
 
@@ -76,7 +95,9 @@ def test_runs_that_differ_have_wider_intervals_than_runs_that_do_not():
     rates = np.array([168, 174, 180, 186, 192])
     apart = [evaluation(np.random.default_rng(k).permutation(200) < n) for k, n in enumerate(rates)]
     equal = [evaluation(np.random.default_rng(k).permutation(200) < 180) for k in range(5)]
-    widths = [(found := score("method", runs).success).high - found.low for runs in (apart, equal)]
+    found = [score("method", runs).success for runs in (apart, equal)]
+    assert found[0].runs == pytest.approx(rates / 200)
+    widths = [one.over_runs.high - one.over_runs.low for one in found]
     assert widths[0] > 2 * widths[1]
     spread = 2 * 2.776 * np.std(rates / 200, ddof=1) / math.sqrt(5)  # t distribution with 4 degrees of freedom
     assert widths[0] == pytest.approx(spread, rel=0.15)
@@ -85,7 +106,9 @@ def test_runs_that_differ_have_wider_intervals_than_runs_that_do_not():
 def test_identical_runs_add_no_information():
     one = evaluation([True] * 30 + [False] * 10)
     alone, thrice = score("method", one).success, score("method", [one] * 3).success
-    assert (thrice.low, thrice.high) == pytest.approx((alone.low, alone.high), abs=0.01)  # t instead of normal
+    assert (thrice.low, thrice.high) == pytest.approx((alone.low, alone.high), abs=1e-9)
+    assert thrice.over_runs == pytest.approx((alone.low, alone.high), abs=0.01)  # t instead of normal
+    assert all(math.isnan(limit) for limit in alone.over_runs)
 
 
 @pytest.mark.parametrize("n_runs", [1, 3])
@@ -121,4 +144,4 @@ def test_scenarios_are_resampled_within_their_banks():
 def test_outcomes_that_balance_leave_an_interval():
     """Each scenario is solved by one of two runs: neither runs nor scenarios differ on average."""
     found = score("method", [evaluation([True, False] * 20), evaluation([False, True] * 20)]).success
-    assert found.value == 0.5 and found.high - found.low > 0.1
+    assert found.value == 0.5 and found.high - found.low > 0.1 and found.over_runs.high - found.over_runs.low > 0.1

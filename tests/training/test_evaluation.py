@@ -118,8 +118,9 @@ def test_regret_is_measured_against_the_pose_that_was_reached():
     for episode in found:
         assert episode.cost < episode.reference_cost
         assert abs(episode.cost - episode.reference_cost) > 1e-3
-        assert 0 <= episode.regret < 2e-3
-        assert episode.soc == pytest.approx(1 / (1 + episode.regret), rel=1e-12) and episode.soc < 1
+        assert 0 <= episode.reached_regret < 2e-3
+        assert episode.reached_soc == pytest.approx(1 / (1 + episode.reached_regret), rel=1e-12)
+        assert episode.soc == pytest.approx(1 / (1 + max(0.0, episode.regret)), rel=1e-12)
         assert episode.ratio == pytest.approx(1 + episode.regret, rel=1e-12)
         reached = BANK[episode.index].model_copy(update={"goal": tuple(episode.states[-1].tolist())})
         assert episode.reached_reference == pytest.approx(find_optimum(reached).cost, rel=1e-5)
@@ -181,9 +182,20 @@ def test_the_score_is_what_its_definition_says():
     assert found.soc.value == pytest.approx((1 + 1 / 2 + 1 / 4 + 0) / 4)
     assert found.soc_iqm.value == pytest.approx((1 / 2 + 1 / 4) / 2)
     assert found.regret.value == 1.0
+    assert found.reached_soc.value == found.soc.value and found.reached_regret.value == 1.0 and found.unknown == 0
     assert found.mean_return.value == -(1 + 2 + 4 + 2) / 4
     assert found.success.low < 0.75 < found.success.high
     assert found.milliseconds == 0.5
+
+
+def test_the_soc_does_not_depend_on_the_pose_reached():
+    """J* of the scenario is 1; the policy stopped short at a pose with J* = 0.5, or at one whose J* is not known."""
+    short, unknown = (replace(episode(cost=2.0), reached_reference=value) for value in (0.5, math.nan))
+    assert short.soc == unknown.soc == 0.5 and short.regret == unknown.regret == 1.0
+    assert short.reached_soc == 0.25 and short.reached_regret == 3.0
+    found = score("policy", run(short, unknown, episode(False)))
+    assert found.soc.value == pytest.approx(1 / 3) and found.unknown == 1
+    assert found.reached_soc.value == 0.125 and found.reached_regret.value == 3.0  # of the episodes that are known
 
 
 def test_an_evaluation_is_one_line_and_one_data_frame():

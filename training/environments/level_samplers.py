@@ -235,7 +235,7 @@ class LearnabilitySampler(PrioritizedSampler):
 
 
 class RegretSampler(PrioritizedSampler):
-    """Draw levels by the exact regret of the policy; arguments as for `PrioritizedSampler`, without `score`."""
+    """Draw levels by the regret of the policy; arguments as for `PrioritizedSampler`, without `score`."""
 
     def __init__(self, bank: ScenarioBank, **options: Any) -> None:
         super().__init__(bank, "exact_regret", **options)

@@ -39,6 +39,11 @@ class PlayedEpisode:
     goal_distance: float
     heading_error: float
 
+    @property
+    def length(self) -> float:
+        """Length (m) of the path of the robot's position."""
+        return float(np.hypot(*np.diff(self.states[:, :2], axis=0).T).sum())
+
 
 def play_episodes(
     policy: Any, venv: NavigateVectorEnv, options: Mapping[str, Any], seed: int | None = None

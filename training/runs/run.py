@@ -30,11 +30,12 @@ from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.results import Evaluation
 
 FINAL_SCENARIOS: int | None = None  # in the final evaluation; None: all of the bank
-TEST_COUNT, TEST_SEED = 100, 1  # of the bank for the evaluations of a family that is not built in
+# Number of scenarios and seeds of the banks for the evaluations of a family that is not built in.
+BANK_COUNT, BANK_SEEDS = 100, {"train": 0, "test": 1}
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
-MEASURES = ("success", "collision", "soc", "regret")  # of an evaluation, for each family
+MEASURES = ("success", "collision", "soc", "regret", "reached_regret")  # of an evaluation, for each family
 
 
 class Run:
@@ -44,9 +45,9 @@ class Run:
     |---|---|
     | `config.json` | algorithm, configuration, versions of the libraries |
     | `policy.json`, `weights.pt` | the policy of the last evaluation, see `load_policy` |
-    | `evaluations.jsonl` | one line per evaluation: step, seconds; success, collision, SOC and regret per family |
+    | `evaluations.jsonl` | one line per evaluation: step, seconds, split; the `MEASURES` per family |
     | `tensorboard/` | logs |
-    | `test.bank` | scenarios of the evaluations, if the family is not built in |
+    | `train.bank`, `test.bank` | scenarios of the evaluations, if there are no included ones |
     | `checkpoint/` | state to resume from; it contains pickle files, so resume only runs from a trusted source |
 
     Args:
@@ -112,21 +113,24 @@ class Run:
                 )
 
     def evaluate(self, policy: PolicyOrFactory, step: int, *, final: bool = False) -> list[Evaluation]:
-        """Evaluate a policy on the test splits of the run's families, and record the results.
+        """Evaluate a policy on the training splits of the run's families, at the end on the test splits; record it.
+
+        Nothing that is chosen during a run depends on the test splits.
 
         Args:
             policy: the policy.
             step: number of samples or environment steps from which the policy has learned.
-            final: play all scenarios (`FINAL_SCENARIOS`) instead of the first `evaluation_scenarios`.
+            final: play all scenarios of the test splits (`FINAL_SCENARIOS`) instead of the first `evaluation_scenarios`
+                of the training splits.
 
         Returns:
             One evaluation for each family.
 
         """
-        count = FINAL_SCENARIOS if final else self.config.evaluation_scenarios
+        split, count = ("test", FINAL_SCENARIOS) if final else ("train", self.config.evaluation_scenarios)
         options: dict[str, Any] = {"environment": self.config.environment, "timed": False, "progress": False}
-        evaluations = [evaluate(policy, self._bank(family), count=count, **options) for family in self.families]
-        line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "final": final}
+        evaluations = [evaluate(policy, self._bank(family, split), count=count, **options) for family in self.families]
+        line: dict[str, Any] = {"step": step, "seconds": round(self.seconds, 3), "split": split, "final": final}
         for family, evaluation in zip(self.families, evaluations, strict=True):
             line[family] = plain({name: getattr(evaluation, name) for name in MEASURES})
             for name, value in line[family].items():
@@ -137,14 +141,14 @@ class Run:
         self._write_evaluations()
         return evaluations
 
-    def _bank(self, family: str) -> ScenarioBank:
-        """Return the included test bank of a family, or one that is built in the run directory if there is none."""
+    def _bank(self, family: str, split: str) -> ScenarioBank:
+        """Return the included bank of a family, or one that is built in the run directory if there is none."""
         config = self.config
         task: dict[str, Any] = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
-        if family in ScenarioBank.shipped_families(**task):
-            return ScenarioBank.shipped(family, "test", **task)
-        path = config.own_bank(self.folder, family)
-        return build_bank(family, TEST_COUNT, path, **task, seed=TEST_SEED, progress=False)
+        if family in ScenarioBank.shipped_families(**task, split=split):
+            return ScenarioBank.shipped(family, split, **task)
+        path, seed = config.own_bank(self.folder, family, split), BANK_SEEDS[split]
+        return build_bank(family, BANK_COUNT, path, **task, seed=seed, progress=False)
 
     def _write_evaluations(self) -> None:
         write_text(self.folder / "evaluations.jsonl", "".join(encode(line) + "\n" for line in self.evaluations))

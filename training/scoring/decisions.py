@@ -55,12 +55,13 @@ class Decisions:
 
 @dataclass(frozen=True, eq=False)
 class PolicyRegret:
-    """The exact regret of a policy on the levels (scenarios) of a bank.
+    """The regret of a policy on the levels (scenarios) of a bank.
 
     Attributes:
         evaluation: the episodes.
         levels (N,): regret of each level, in the unit of the cost: the return of the optimum minus that of the policy.
-            For a success it is J - J*, with J* for the pose reached, else J plus the penalties minus J*.
+            For a success it is J - J*, with J* for the pose reached, or that of the scenario if no optimum for the pose
+            reached is found; else J plus the penalties minus J*.
         decisions: the regret of the decisions in each episode; None unless requested.
 
     """
@@ -98,7 +99,7 @@ def regret(
     workers: int = 1,
     progress: bool = True,
 ) -> PolicyRegret:
-    """Compute the exact regret of a policy on each scenario of a bank, and on request that of its decisions.
+    """Compute the regret of a policy on each scenario of a bank, and on request that of its decisions.
 
     The regret of a decision is J(t2) - J(t1) + V(q(t2), t2) - V(q(t1), t1), with the cost J so far and the optimal cost
     V from the state of the robot. V comes from a new search at each of the states: a local optimum that is only tracked
@@ -159,7 +160,8 @@ def level_regrets(evaluation: Evaluation) -> np.ndarray:
 
 def _level_regret(episode: Episode, settings: EnvironmentSettings) -> float:
     if episode.success:
-        return max(0.0, episode.cost - episode.optimal_cost)
+        unknown = math.isnan(episode.reached_reference)
+        return max(0.0, episode.cost - (episode.reference_cost if unknown else episode.reached_reference))
     penalty = settings.collision_penalty * episode.collision + settings.miss_penalty * (not episode.truncated)
     return episode.cost + penalty - episode.reference_cost
 

@@ -233,6 +233,7 @@ def _make_episode(bank: ScenarioBank, index: int, played: PlayedEpisode) -> Epis
         reference_clearance=reference.certificate[3],
         reversing=bool(_speeds(reference).min() < -MIN_REVERSE_SPEED),
         lower_bound=math.nan if reference.lower_bound is None else reference.lower_bound,
+        length=played.length,
         shortest_length=float(bank.shortest_lengths[index]),
         shortest_time=float(bank.shortest_times[index]),
         **outcome,

@@ -33,13 +33,15 @@ from leapnav.training.scoring.decision_reports import costliest_decisions, plot_
 from leapnav.training.scoring.reports import (
     COLUMNS,
     NEGATIVE_REGRET,
+    RUN_COLUMNS,
     cell,
     draw_profiles,
     plot_episodes,
     row_name,
-    sampled,
+    runs_cell,
 )
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
+from leapnav.training.scoring.scores import Score
 
 CLEARANCE_BINS = (0.0, 0.05, 0.1, 0.2, math.inf)  # bin edges of the optimum's clearance (m)
 N_GALLERY_COLUMNS = 4
@@ -91,20 +93,20 @@ def write_report(comparison: Comparison, path: str | os.PathLike[str], *, progre
         date=datetime.now().astimezone().strftime("%Y-%m-%d"),
         episodes=scores[0].episodes,
         families=families,
-        sampled=sampled(scores),
-        columns=[title.replace("\n", " ").strip() for title, *_ in COLUMNS] + ["time ms"],
+        seeds=_seeds(scores),
+        columns=[*_titles(COLUMNS), "unknown", "time ms"],
         rows=[
             {
                 "name": row_name(row),
                 "cells": [_split_cell(cell(getattr(row, name), *form)) for _, name, *form in COLUMNS]
-                + [(f"{row.milliseconds:.2f}", "")],
+                + [(str(row.unknown), ""), (f"{row.milliseconds:.2f}", "")],
             }
             for row in scores
         ],
         curves=_learning_curves(by_row, families) if by_row else [],
         profiles=_profiles(comparison),
         failures=_success_tables(comparison),
-        negative_regret=NEGATIVE_REGRET if any(row.regret.value < 0 for row in scores) else "",
+        negative_regret=NEGATIVE_REGRET if any(row.reached_regret.value < 0 for row in scores) else "",
         galleries=[
             {"name": row, "png": _gallery(comparison.banks, comparison.runs[row][0])} for row in comparison.runs
         ],
@@ -118,6 +120,24 @@ def _title(records: Sequence[_RunRecord]) -> str:
     if not records:
         return "Comparison of policies"
     return "Training runs" if len(records) > 1 else f"Training run {records[0].folder}"
+
+
+def _titles(columns: Sequence[tuple[Any, ...]]) -> list[str]:
+    return [title.replace("\n", " ").strip() for title, *_ in columns]
+
+
+def _seeds(scores: Sequence[Score]) -> dict[str, Any]:
+    """Return the table of the runs of methods with several of them."""
+    columns = [column for column in COLUMNS if column[1] in RUN_COLUMNS]
+    rows = [
+        {
+            "name": row_name(row),
+            "cells": [_split_cell(runs_cell(getattr(row, name), *form)) for _, name, *form in columns],
+        }
+        for row in scores
+        if row.runs > 1
+    ]
+    return {"columns": _titles(columns), "rows": rows}
 
 
 def _split_cell(text: str) -> tuple[str, str]:
@@ -157,27 +177,32 @@ def _learning_curves(rows: dict[str, list[_RunRecord]], families: Sequence[str])
             axes.grid(alpha=0.3)
         handles = panels[1].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-        text = f"Scores on the test split ({', '.join(families)}) against {caption}{note}."
+        text = f"Scores on the training split ({', '.join(families)}) against {caption}{note}. Stars: test split."
         curves.append({"svg": _as_svg(figure), "caption": text})
     return curves
 
 
 def _draw_curve(axes: Axes, records: Sequence[_RunRecord], axis: str, measure: str, color: str, label: str) -> None:
-    """Draw the mean over the seeds, and their range."""
-    curves = []
+    """Draw the mean over the seeds on the training split, with their range, and the results on the test split."""
+    scale = 1 / 60 if axis == "seconds" else 1.0
+    curves, ends = [], []
     for record in records:
         families, lines = families_of(record.config.family), record.evaluations
         values = [float(np.mean([line[family][measure] for family in families])) for line in lines]
-        curves.append((np.array([line[axis] for line in lines], dtype=float), np.array(values)))
-    if axis == "seconds":
-        curves = [(places / 60, values) for places, values in curves]
+        points = [(scale * line[axis], value) for line, value in zip(lines, values, strict=True)]
+        curves.append(np.array([p for p, line in zip(points, lines, strict=True) if not line["final"]]).reshape(-1, 2))
+        ends += [p for p, line in zip(points, lines, strict=True) if line["final"]]
     # The grid is that of the run with the most evaluations, up to the end of the shortest run.
-    grid = max(curves, key=lambda curve: len(curve[0]))[0]
-    common = grid[grid <= min(places[-1] for places, _ in curves)]
-    rows = np.array([np.interp(common, places, values) for places, values in curves])
-    axes.plot(common, rows.mean(axis=0), color=color, linewidth=1.6, label=label, marker="o", markersize=2.5)
-    if len(rows) > 1:
-        axes.fill_between(common, rows.min(axis=0), rows.max(axis=0), color=color, alpha=0.18, linewidth=0)
+    if all(len(curve) for curve in curves):
+        grid = max(curves, key=len)[:, 0]
+        common = grid[grid <= min(curve[-1, 0] for curve in curves)]
+        rows = np.array([np.interp(common, *curve.T) for curve in curves])
+        axes.plot(common, rows.mean(axis=0), color=color, linewidth=1.6, label=label, marker="o", markersize=2.5)
+        label = "_" + label  # in the legend once
+        if len(rows) > 1:
+            axes.fill_between(common, rows.min(axis=0), rows.max(axis=0), color=color, alpha=0.18, linewidth=0)
+    if ends:
+        axes.plot(*np.array(ends).T, "*", color=color, markersize=7, label=label)
 
 
 def _success_tables(comparison: Comparison) -> list[dict[str, Any]]:

@@ -35,38 +35,41 @@ COLUMNS = (
     ("SPL\n", "spl", 1, 3, 2),
     ("SCT\n", "sct", 1, 3, 2),
     ("regret\n%, median", "regret", 100, 2, 2),
+    ("SOC,\npose reached", "reached_soc", 1, 3, 2),
+    ("regret,\npose reached\n%, median", "reached_regret", 100, 2, 2),
     ("clearance\nm, median", "clearance", 1, 2, 2),
 )
 NEGATIVE_REGRET = (
     "A negative regret: the episodes cost less than the best known optimum for the pose reached. A robot that slips "
     "violates the unicycle model, for which the optimum is computed; otherwise the search has missed a better path."
 )
-MARKDOWN_COLUMNS = ("success", "collision", "soc", "regret")  # attributes of `Score` in the tables of the documentation
-# Columns that fit into the 80 characters of a terminal, and those of a second table; the other outputs have all.
+# Attributes of `Score` in the tables of the documentation.
+MARKDOWN_COLUMNS = ("success", "collision", "soc", "reached_regret")
+# Columns that fit into the 80 characters of a terminal, and those of further tables; the other outputs have all.
 TERMINAL_COLUMNS = ("success", "collision", "soc", "soc_iqm", "regret")
+REACHED_COLUMNS = ("reached_soc", "reached_regret")
 PATH_COLUMNS = ("soc", "spl", "sct")
+RUN_COLUMNS = ("success", "soc", "regret")
+RUNS_TITLE = "each run; brackets: 95 % interval over runs and scenarios"
 
 
 def print_scores(comparison: Comparison) -> None:
-    """Print the table of the policies with 95 % intervals, and for several banks a table by bank."""
+    """Print the tables of the policies with 95 % intervals, and for several banks a table by bank."""
     scores = comparison.scores()
-    columns = [column for column in COLUMNS if column[1] in TERMINAL_COLUMNS]
-    rows = [
-        (
-            row_name(row),
-            *(cell(getattr(row, name), *form) for _, name, *form in columns),
-            f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-",
-        )
-        for row in scores
-    ]
-    title = f"{scores[0].episodes} scenarios; brackets: 95 % interval over {sampled(scores)}"
-    print_table(("policy", *(title for title, *_ in columns), "time\nms"), rows, title=title)
+    times = [f"{row.milliseconds:.2f}" if math.isfinite(row.milliseconds) else "-" for row in scores]
+    title = f"{scores[0].episodes} scenarios; brackets: 95 % interval over the scenarios"
+    _print_columns(scores, TERMINAL_COLUMNS, title, ("time\nms", times))
+    unknown = ("unknown\nepisodes", [str(row.unknown) for row in scores])
+    _print_columns(scores, REACHED_COLUMNS, "compared with the optimum for the pose reached", unknown)
     if any(math.isfinite(row.spl.value) or math.isfinite(row.sct.value) for row in scores):  # unknown in many banks
-        columns = [column for column in COLUMNS if column[1] in PATH_COLUMNS]
-        rows = [(row_name(row), *(cell(getattr(row, name), *form) for _, name, *form in columns)) for row in scores]
-        title = "success weighted by optimal cost, path length and completion time"
-        print_table(("policy", *(title for title, *_ in columns)), rows, title=title)
-    if any(row.regret.value < 0 for row in scores):
+        _print_columns(scores, PATH_COLUMNS, "success weighted by optimal cost, path length and completion time")
+    if any(row.runs > 1 for row in scores):
+        columns = [column for column in COLUMNS if column[1] in RUN_COLUMNS]
+        rows = [
+            (row_name(row), *(runs_cell(getattr(row, name), *form) for _, name, *form in columns)) for row in scores
+        ]
+        print_table(("policy", *(title for title, *_ in columns)), rows, title=RUNS_TITLE)
+    if any(row.reached_regret.value < 0 for row in scores):
         print(NEGATIVE_REGRET)
     if any(row.true_regret.episodes for row in scores):
         print("Cost above the true optimal cost of the scenario, between proved limits (medians):")
@@ -76,9 +79,18 @@ def print_scores(comparison: Comparison) -> None:
         _print_banks(comparison)
 
 
-def sampled(scores: Sequence[Score]) -> str:
-    """Return what the intervals of scores refer to."""
-    return "runs and scenarios" if any(row.runs > 1 for row in scores) else "the scenarios"
+def _print_columns(
+    scores: Sequence[Score], names: Sequence[str], title: str, last: tuple[str, Sequence[str]] | None = None
+) -> None:
+    """Print a table with the given columns and intervals over the scenarios; `last` is another column."""
+    columns = [column for column in COLUMNS if column[1] in names]
+    rows = [[row_name(row), *(cell(getattr(row, name), *form) for _, name, *form in columns)] for row in scores]
+    titles = ["policy", *(title for title, *_ in columns)]
+    if last is not None:
+        titles.append(last[0])
+        for row, value in zip(rows, last[1], strict=True):
+            row.append(value)
+    print_table(titles, rows, title=title)
 
 
 def print_barn_scores(scores: Sequence[BarnScore]) -> None:
@@ -125,8 +137,17 @@ def cell(interval: Interval, factor: float, digits: int, interval_digits: int) -
     return f"{factor * interval.value:z.{digits}f}\n[{low}, {high}]"
 
 
+def runs_cell(interval: Interval, factor: float, digits: int, interval_digits: int) -> str:
+    """Format the values of each run and, on the next line, the interval over runs and scenarios."""
+    values = ", ".join("-" if math.isnan(value) else f"{factor * value:z.{digits}f}" for value in interval.runs)
+    if math.isnan(interval.over_runs.low):
+        return values
+    low, high = (f"{factor * bound:z.{interval_digits}f}" for bound in interval.over_runs)
+    return f"{values}\n[{low}, {high}]"
+
+
 def markdown_cells(row: Score) -> str:
-    """Return success, collision, SOC and median regret, with intervals, as cells of a Markdown table."""
+    """Return the `MARKDOWN_COLUMNS`, with intervals over the scenarios, as cells of a Markdown table."""
     cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS if name in MARKDOWN_COLUMNS]
     return " | ".join(cells).replace("\n", " ")
 
@@ -245,7 +266,7 @@ def extremes(episodes: Sequence[Episode], count: int) -> dict[str, list[Episode]
 
 
 def _regret_or_infinity(episode: Episode) -> float:
-    return math.inf if math.isnan(episode.regret) else episode.regret
+    return math.inf if math.isnan(episode.reached_regret) else episode.reached_regret
 
 
 def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) -> None:
@@ -256,5 +277,7 @@ def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) ->
     axes.plot(*episode.states[:, :2].T, color=POLICY if episode.success else FAILURE, linewidth=1.8)
     outcome = "collision" if episode.collision else "missed"
     if episode.success:
-        outcome = "regret unknown" if math.isnan(episode.regret) else f"regret {100 * episode.regret:z.1f} %"
+        outcome = (
+            "regret unknown" if math.isnan(episode.reached_regret) else f"regret {100 * episode.reached_regret:z.1f} %"
+        )
     axes.set_title(f"{episode.scenario}: {outcome}", fontsize=9)

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ADDED, ScenarioBank, digest
 from leapnav.envs.settings import EnvironmentSettings
+from leapnav.envs.utils.json_utils import encode, plain
 
 if TYPE_CHECKING:
     import pandas
 
-_UNLISTED = ("states", "costs", "episode_return")  # not in the record of an episode
+MEASURES = ("soc", "spl", "sct", "regret", "reached_soc", "reached_regret")
+_ARRAYS = ("states", "costs")  # not in the record of an episode
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +44,7 @@ class Episode:
         costs (K + 1,): the cost J so far at these states.
         lower_bound: proved lower bound of the cost of the scenario; NaN if none is known.
         truncated: whether the time limit of a free horizon ended the episode, without a penalty for the missed goal.
+        length: length (m) of the path of the robot's position.
         duration: of the episode (s).
         goal_distance, heading_error: of the last pose from the goal (m, rad): by how much a failure missed it.
         shortest_length: length (m) of the shortest path of the scenario without contact; NaN if it is not known.
@@ -63,16 +69,12 @@ class Episode:
     costs: np.ndarray
     lower_bound: float = math.nan
     truncated: bool = False
+    length: float = math.nan
     duration: float = math.nan
     goal_distance: float = math.nan
     heading_error: float = math.nan
     shortest_length: float = math.nan
     shortest_time: float = math.nan
-
-    @property
-    def length(self) -> float:
-        """Length (m) of the path of the robot's position."""
-        return float(np.hypot(*np.diff(self.states[:, :2], axis=0).T).sum())
 
     @property
     def spl(self) -> float:
@@ -96,41 +98,45 @@ class Episode:
         return least / max(value, least) if self.success and least > 0.0 else float(self.success)
 
     @property
-    def optimal_cost(self) -> float:
-        """J* for the pose that a successful episode has reached, else J* of the scenario."""
-        return self.reference_cost if math.isnan(self.reached_reference) else self.reached_reference
+    def soc(self) -> float:
+        """Success weighted by optimal cost: S J* / max(J, J*), with J* of the scenario."""
+        return self._weighted(self.reference_cost, self.cost)
 
     @property
-    def soc(self) -> float:
-        """Success weighted by optimal cost: S J* / max(J, J*), with J* for the reached pose.
-
-        If that is not known, J* of the scenario is used.
-        """
-        if not self.success:
-            return 0.0
-        return self.optimal_cost / max(self.cost, self.optimal_cost)
+    def reached_soc(self) -> float:
+        """SOC for the pose reached: as `soc`, with J* for that pose; NaN if that is not known."""
+        return self._weighted(self.reached_reference, self.cost) if self.success else 0.0
 
     @property
     def ratio(self) -> float:
-        """Cost ratio J / J* of the performance profile, with J* as in `soc`; infinite for an unsuccessful episode."""
-        return self.cost / self.optimal_cost if self.success else math.inf
+        """Cost ratio J / J* of the performance profile, with J* of the scenario; infinite for a failure."""
+        return self.cost / self.reference_cost if self.success else math.inf
 
     @property
     def regret(self) -> float:
-        """Regret (J - J*) / J* of a successful episode, with J* for the reached pose; NaN if that is not known.
+        """Regret (J - J*) / J* of a successful episode, with J* of the scenario; NaN for others.
+
+        J* is the cost of the best known optimum. A robot may stop within the tolerances of the goal, so the regret can
+        be slightly negative; see `reached_regret`.
+        """
+        return self.cost / self.reference_cost - 1.0 if self.success else math.nan
+
+    @property
+    def reached_regret(self) -> float:
+        """Regret for the pose reached: (J - J*) / J* of a successful episode with J* for that pose; NaN if not known.
 
         It is negative only if the episode is cheaper than the best optimum that the search found, or if the robot
         slips: its path then violates the unicycle model.
         """
-        return (self.cost - self.reached_reference) / self.reached_reference
+        return self.cost / self.reached_reference - 1.0
 
     @property
     def true_regret(self) -> tuple[float, float]:
         """Proved limits of J / J_0 - 1, where J_0 is the infimum of the cost of collision-free paths to the goal pose.
 
         J_0 is between `lower_bound` and `reference_cost`. A robot may stop within the tolerances of the goal, so the
-        limits can be negative and need not contain `regret`, which refers to the pose reached. NaN if no lower bound is
-        known or the episode is no success; the upper limit is infinite if the lower bound is not positive.
+        limits can be negative and need not contain `reached_regret`. NaN if no lower bound is known or the episode is
+        no success; the upper limit is infinite if the lower bound is not positive.
         """
         if math.isnan(self.lower_bound) or not self.success:
             return math.nan, math.nan
@@ -138,10 +144,57 @@ class Episode:
         return self.cost / self.reference_cost - 1.0, high
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the attributes without the states and their costs, and SOC, SPL, SCT, length and regret."""
-        record = {name: value for name, value in vars(self).items() if name not in _UNLISTED}
-        derived = {name: getattr(self, name) for name in ("soc", "spl", "sct", "length", "regret")}
+        """Return the attributes without the states and their costs, and the measures that follow from them."""
+        record = {name: value for name, value in vars(self).items() if name not in (*_ARRAYS, "episode_return")}
+        derived = {name: getattr(self, name) for name in MEASURES}
         return {**record, "return": self.episode_return, **derived}
+
+
+def write_episodes(runs: Mapping[str, Sequence[Evaluation]], path: str | os.PathLike[str]) -> None:
+    """Write the episodes of evaluations as compressed JSON lines (`.jsonl.gz`), one for each episode.
+
+    A line contains the policy, the number of its run, and the attributes of the `Episode` without the states and their
+    costs; numbers have seven significant digits. `pandas.read_json(path, lines=True)` reads the file too.
+
+    Args:
+        runs: the evaluations of each policy, as in `Comparison.runs`.
+        path: the file.
+
+    """
+    lines = []
+    for policy, evaluations in runs.items():
+        for number, evaluation in enumerate(evaluations):
+            for episode in evaluation:
+                values = {name: value for name, value in vars(episode).items() if name not in _ARRAYS}
+                values = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in values.items()}
+                lines.append(encode(plain({"policy": policy, "run": number, **values})) + "\n")
+    # Without the time, so that the same episodes give the same bytes.
+    Path(path).write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
+
+
+def read_episodes(path: str | os.PathLike[str]) -> dict[str, list[Evaluation]]:
+    """Read a file of `write_episodes`: the evaluations of each policy, without states, times and settings.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it contains something else.
+
+    """
+    runs: dict[str, dict[int, list[Episode]]] = {}
+    values: dict[str, Any]
+    try:
+        text = gzip.decompress(Path(path).read_bytes()).decode()
+        for line in text.splitlines():
+            values = {name: math.nan if value is None else value for name, value in json.loads(line).items()}
+            policy, number = values.pop("policy"), values.pop("run")
+            episode = Episode(**values, states=np.empty((0, 3)), costs=np.empty(0))
+            runs.setdefault(policy, {}).setdefault(number, []).append(episode)
+    except (ValueError, TypeError, KeyError, AttributeError, EOFError, gzip.BadGzipFile) as error:
+        raise ValueError(f"{path}: no file of episodes: {error!r}") from None
+    return {
+        policy: [Evaluation(tuple(members[number]), math.nan) for number in sorted(members)]
+        for policy, members in runs.items()
+    }
 
 
 def bank_identity(bank: ScenarioBank) -> str:
@@ -186,7 +239,7 @@ class Evaluation:
         families = ", ".join(dict.fromkeys(episode.family for episode in self.episodes))
         return (
             f"<Evaluation: {len(self)} episodes ({families}), success {100 * self.success:.1f} %, collision "
-            f"{100 * self.collision:.1f} %, SOC {self.soc:.3f}, median regret {100 * self.regret:.2f} %>"
+            f"{100 * self.collision:.1f} %, SOC {self.soc:.3f}, median regret {100 * self.regret:z.2f} %>"
         )
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -227,4 +280,10 @@ class Evaluation:
     def regret(self) -> float:
         """Median regret of the successful episodes; NaN if there are none."""
         values = [episode.regret for episode in self.episodes if episode.success]
-        return float(np.nanmedian(values)) if values else math.nan
+        return float(np.median(values)) if values else math.nan
+
+    @property
+    def reached_regret(self) -> float:
+        """Median regret for the pose reached, of the episodes for which it is known; NaN if there are none."""
+        values = [episode.reached_regret for episode in self.episodes if not math.isnan(episode.reached_regret)]
+        return float(np.median(values)) if values else math.nan

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import norm, t, trim_mean
@@ -27,17 +28,38 @@ N_RESAMPLES = 2000  # bootstrap resamples of an interval with one run
 N_VARIANCE_RESAMPLES = 500  # bootstrap resamples of each of the three variances with several runs
 CONFIDENCE = 0.95
 QUANTILE = (1 + CONFIDENCE) / 2
+NORMAL_QUANTILE = float(norm.ppf(QUANTILE))
 MAX_RESAMPLED_VALUES = 2_000_000  # values in memory at the same time
 Statistic = Callable[[np.ndarray], np.ndarray]  # reduces the last axis
 
 
+class Limits(NamedTuple):
+    """The limits of a 95 % interval."""
+
+    low: float
+    high: float
+
+
+UNKNOWN = Limits(math.nan, math.nan)
+
+
 @dataclass(frozen=True)
 class Interval:
-    """A statistic with its 95 % interval; NaN if there are no values."""
+    """A statistic with its 95 % intervals; NaN if there are no values.
+
+    Attributes:
+        value: the statistic of all episodes.
+        low, high: the interval over the scenarios: for the same policies in other scenarios of the same banks.
+        runs: the statistic of each run.
+        over_runs: limits of the interval over runs and scenarios: for other seeds of the training too; NaN for one run.
+
+    """
 
     value: float
     low: float
     high: float
+    runs: tuple[float, ...] = ()
+    over_runs: Limits = UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -69,6 +91,9 @@ class Score:
             have the shortest length and the minimum time.
         soc_iqm: interquartile mean of the success weighted by optimal cost, over runs and scenarios.
         regret: median regret of the successful episodes.
+        reached_soc, reached_regret: both for the pose reached, see `Episode.reached_soc`, over the episodes for which
+            they are known.
+        unknown: number of successful episodes of all runs for which no optimum for the pose reached was found.
         clearance: median over the episodes of the minimum clearance (m).
         mean_return: mean return.
         milliseconds: median computation time of one action (ms), mean over the runs.
@@ -86,6 +111,9 @@ class Score:
     sct: Interval
     soc_iqm: Interval
     regret: Interval
+    reached_soc: Interval
+    reached_regret: Interval
+    unknown: int
     clearance: Interval
     mean_return: Interval
     milliseconds: float
@@ -95,12 +123,13 @@ class Score:
 def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> Score:
     """Compute the statistics of a policy, or of several runs of one method on the same scenarios.
 
-    The intervals refer to other scenarios of the same banks and, with several runs, to other seeds of the training:
+    Intervals over the scenarios contain the variance between scenarios only, those over runs and scenarios also that
+    between runs, see `Interval`:
 
-    - With one run, those of rates are Wilson intervals, and the others are percentiles of a bootstrap that resamples
-      the scenarios within their banks. An SOC, SPL or SCT of 0 or 1 in all episodes has the interval of a rate.
-    - With several runs, they contain the variance between runs and that between scenarios, and use the t distribution;
-      with two or three runs they are wide.
+    - Those of rates over the scenarios are Wilson intervals, and the others are percentiles of a bootstrap that
+      resamples the scenarios within their banks. An SOC, SPL or SCT of 0 or 1 in all episodes has the interval of a
+      rate.
+    - Those over runs and scenarios use the t distribution; with two or three runs they are wide.
 
     Args:
         name: name of the row.
@@ -129,7 +158,7 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
     def weighted(attribute: Callable[..., float]) -> Interval:
         values = values_of(attribute)
         if np.isnan(values).any():
-            return Interval(math.nan, math.nan, math.nan)
+            return Interval(math.nan, math.nan, math.nan, (math.nan,) * len(values))
         if set(values.flat) in ({0.0}, {1.0}):
             return _rate(values, banks)
         return _within_unit(_interval(values, banks, _mean, rng))
@@ -142,7 +171,10 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
         collision=_rate(values_of(lambda e: e.collision), banks),
         soc=weighted(lambda e: e.soc),
         soc_iqm=_within_unit(interval(lambda e: e.soc, _interquartile_mean)),
-        regret=interval(lambda e: e.regret if e.success else math.nan, _median),
+        regret=interval(lambda e: e.regret, _median),
+        reached_soc=_within_unit(interval(lambda e: e.reached_soc)),
+        reached_regret=interval(lambda e: e.reached_regret, _median),
+        unknown=sum(e.success and math.isnan(e.reached_reference) for evaluation in evaluations for e in evaluation),
         clearance=interval(lambda e: e.clearance, _median),
         mean_return=interval(lambda e: e.episode_return),
         milliseconds=float(np.mean([evaluation.milliseconds for evaluation in evaluations])),
@@ -170,7 +202,7 @@ def profile(runs: Sequence[Evaluation], ratios: np.ndarray) -> np.ndarray:
         ratios (N,): cost ratios.
 
     Returns:
-        Fractions and the lower and upper limits of their intervals (3, N), see `score`.
+        Fractions, and the lower and upper limits of their intervals over the scenarios (3, N), see `Interval`.
 
     Raises:
         ValueError: there are no runs.
@@ -211,23 +243,39 @@ class _Variances:
         """Quantile of the t distribution with the degrees of freedom of Satterthwaite; with one run, the normal one."""
         n_runs, n_scenarios = self.shape
         if n_runs == 1:
-            return float(norm.ppf(QUANTILE))
+            return NORMAL_QUANTILE
         runs, scenarios = n_runs - 1, max(1, n_scenarios - 1)
         parts = self.runs**2 / runs + self.scenarios**2 / scenarios + self.interaction**2 / (runs * scenarios)
         total = self.scenarios + self.excess
-        return float(t.ppf(QUANTILE, max(1.0, total**2 / parts))) if parts > 0 else float(norm.ppf(QUANTILE))
+        return float(t.ppf(QUANTILE, max(1.0, total**2 / parts))) if parts > 0 else NORMAL_QUANTILE
 
 
 def _rate(values: np.ndarray, banks: np.ndarray) -> Interval:
-    """Return the mean of values (runs, scenarios) from 0 to 1 with its interval, which never has zero width.
+    """Return the mean of values (runs, scenarios) from 0 to 1 with its intervals, which never have zero width."""
+    over_runs = UNKNOWN
+    if len(values) > 1:
+        variances = _variances_of_mean(values, banks)
+        over_runs = _wilson(values, banks, variances.quantile, variances.excess)
+    limits = _wilson(values, banks, NORMAL_QUANTILE, 0.0)
+    return Interval(float(values.mean()), *limits, tuple(values.mean(axis=1).tolist()), over_runs)
+
+
+def _wilson(values: np.ndarray, banks: np.ndarray, k: float, excess: float) -> Limits:
+    """Return the limits of the mean of values (runs, scenarios) from 0 to 1.
 
     In each bank, the Wilson interval has an effective number of episodes: that with which independent episodes would
     have the variance between the scenarios. It is the number of scenarios if all episodes have the same outcome.
+
+    Args:
+        values: see above.
+        banks: the bank of each scenario.
+        k: quantile of the distribution.
+        excess: variance that is added to that between the scenarios.
+
     """
     n_runs, n_scenarios = values.shape
-    value, variances = float(values.mean()), _variances_of_mean(values, banks)
-    k = variances.quantile
-    below = above = k**2 * variances.excess
+    value = float(values.mean())
+    below = above = k**2 * excess
     for bank in np.unique(banks):
         means = values[:, banks == bank].mean(axis=0)
         count, rate, spread = len(means), float(means.mean()), float(means.var())
@@ -237,12 +285,14 @@ def _rate(values: np.ndarray, banks: np.ndarray) -> Interval:
         below += (count / n_scenarios * (rate - centre + half)) ** 2
         above += (count / n_scenarios * (centre + half - rate)) ** 2
     # Rounding must not exclude the value.
-    return _within_unit(Interval(value, value - math.sqrt(below), value + math.sqrt(above)))
+    return Limits(max(0.0, value - math.sqrt(below)), min(1.0, value + math.sqrt(above)))
 
 
 def _within_unit(interval: Interval) -> Interval:
     """Return an interval of a statistic from 0 to 1, without the limits that it cannot have."""
-    return Interval(interval.value, max(0.0, interval.low), min(1.0, interval.high))
+    low, high = interval.over_runs
+    over_runs = UNKNOWN if math.isnan(low) else Limits(max(0.0, low), min(1.0, high))
+    return replace(interval, low=max(0.0, interval.low), high=min(1.0, interval.high), over_runs=over_runs)
 
 
 def _variances_of_mean(values: np.ndarray, banks: np.ndarray) -> _Variances:
@@ -261,57 +311,61 @@ def _variances_of_mean(values: np.ndarray, banks: np.ndarray) -> _Variances:
 
 
 def _interval(values: np.ndarray, banks: np.ndarray, statistic: Statistic, rng: np.random.Generator) -> Interval:
-    """Return a statistic of values (runs, scenarios) with its interval; NaN values are ignored."""
-    n_runs, n_scenarios = values.shape
-    flat = values.ravel()
+    """Return a statistic of values (runs, scenarios) with its intervals; NaN values are ignored."""
+    flat, runs = values.ravel(), tuple(statistic(values).tolist())
     if np.isnan(flat).all():
-        return Interval(math.nan, math.nan, math.nan)
+        return Interval(math.nan, math.nan, math.nan, runs)
     value = float(statistic(flat))
-    if n_runs == 1:
-        if np.ptp(flat[~np.isnan(flat)]) == 0 and not np.isnan(flat).any():  # all resamples would be identical
-            return Interval(value, value, value)
-        resamples = _statistics(values, lambda n: values[0][_scenarios(banks, n, rng)], statistic, N_RESAMPLES)
-        low, high = np.nanpercentile(resamples, [100 * (1 - QUANTILE), 100 * QUANTILE])
-        return Interval(value, float(low), float(high))
-    if statistic is _mean and not np.isnan(flat).any():
+    over_runs = UNKNOWN if len(values) == 1 else _over_runs(values, banks, statistic, rng)
+    if np.ptp(flat[~np.isnan(flat)]) == 0 and not np.isnan(flat).any():  # all resamples would be identical
+        return Interval(value, value, value, runs, over_runs)
+    resamples = _statistics(values, lambda n: _other_scenarios(values, banks, n, rng), statistic, N_RESAMPLES)
+    low, high = np.nanpercentile(resamples, [100 * (1 - QUANTILE), 100 * QUANTILE])
+    return Interval(value, float(low), float(high), runs, over_runs)
+
+
+def _over_runs(values: np.ndarray, banks: np.ndarray, statistic: Statistic, rng: np.random.Generator) -> Limits:
+    """Return the limits of a statistic of values of several runs (runs, scenarios), over runs and scenarios."""
+    n_runs, n_scenarios = values.shape
+    if statistic is _mean and not np.isnan(values).any():
         variances = _variances_of_mean(values, banks)
     else:
         columns = np.arange(n_scenarios)
         # Whole runs, whole scenarios, and for each scenario other runs
         schemes: list[Callable[[int], np.ndarray]] = [
             lambda n: values[rng.integers(n_runs, size=(n, n_runs))],
-            lambda n: np.moveaxis(values[:, _scenarios(banks, n, rng)], 0, 1),
+            lambda n: _other_scenarios(values, banks, n, rng),
             lambda n: values[rng.integers(n_runs, size=(n, n_runs, n_scenarios)), columns],
         ]
-        found = [
-            np.nanvar(_statistics(values, lambda n, draw=draw: draw(n).reshape(n, -1), statistic, N_VARIANCE_RESAMPLES))
-            for draw in schemes
-        ]
+        found = [np.nanvar(_statistics(values, draw, statistic, N_VARIANCE_RESAMPLES)) for draw in schemes]
         unbiased = n_runs / (n_runs - 1)  # resamples of few runs vary less than new runs
         variances = _Variances(
             unbiased * float(found[0]), float(found[1]), unbiased * float(found[2]), (n_runs, n_scenarios)
         )
+    value = float(statistic(values.ravel()))
     half = variances.quantile * math.sqrt(variances.scenarios + variances.excess)
-    return Interval(value, value - half, value + half)
+    return Limits(value - half, value + half)
 
 
 def _statistics(values: np.ndarray, draw: Callable[[int], np.ndarray], statistic: Statistic, count: int) -> np.ndarray:
-    """Return a statistic of `count` resamples, drawn in parts that fit into memory."""
+    """Return a statistic of `count` resamples (runs, scenarios), drawn in parts that fit into memory."""
     size = max(1, MAX_RESAMPLED_VALUES // values.size)
-    return np.concatenate([statistic(draw(min(size, count - first))) for first in range(0, count, size)])
+    parts = [min(size, count - first) for first in range(0, count, size)]
+    return np.concatenate([statistic(draw(n).reshape(n, -1)) for n in parts])
 
 
-def _scenarios(banks: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return resamples (count, scenarios) of the indices of the scenarios, drawn within their banks."""
+def _other_scenarios(values: np.ndarray, banks: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return resamples (count, runs, scenarios) with scenarios drawn within their banks."""
     columns = np.empty((count, len(banks)), dtype=int)
     for bank in np.unique(banks):
         members = np.flatnonzero(banks == bank)
         columns[:, members] = rng.choice(members, (count, len(members)))
-    return columns
+    return np.moveaxis(values[:, columns], 0, 1)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    return np.nanmean(values, axis=-1)
+    known = (~np.isnan(values)).sum(axis=-1)  # NumPy warns of a mean of NaN only
+    return np.nansum(values, axis=-1) / np.where(known > 0, known, np.nan)
 
 
 def _median(values: np.ndarray) -> np.ndarray:
