@@ -2,13 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from leapnav.envs.navigation import NavigateEnv
+from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.vector import NavigateVectorEnv
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Where one robot of an environment is.
+
+    Attributes:
+        scenario: its scenario.
+        index: its index in the bank; None if it is not from a bank.
+        bank: the bank of the environment.
+        state: (n,), the state of the robot.
+        time: s since the start of the episode.
+        period: control period (s).
+
+    """
+
+    scenario: Scenario
+    index: int | None
+    bank: ScenarioBank | None
+    state: np.ndarray
+    time: float
+    period: float
 
 
 def unwrap(env: Any) -> list[NavigateEnv | NavigateVectorEnv]:
@@ -68,3 +94,16 @@ def action_scale(env: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def _single_action_space(env: Any) -> Any:
     return getattr(env, "single_action_space", None) or env.action_space
+
+
+def situations(envs: Sequence[NavigateEnv | NavigateVectorEnv]) -> list[Situation]:
+    """Return the situations of all robots of environments, see `unwrap`."""
+    found: list[Situation] = []
+    for env in envs:
+        period, bank = env.control_period, env.bank
+        if isinstance(env, NavigateEnv):
+            found.append(Situation(env.scenario, env.index, bank, env.state, env.time, period))
+        else:
+            rows = zip(env.scenarios, env.indices, env.states, env.times.tolist(), strict=True)
+            found += [Situation(scenario, i, bank, state, time, period) for scenario, i, state, time in rows]
+    return found

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
     from leapnav.training.policies.files import load_policy, policy_environment, save_policy, shipped_policies
     from leapnav.training.policies.network import NavigationFeatures, make_policy, network
+    from leapnav.training.policies.planners import PlannerPolicy
     from leapnav.training.runs.imitation import train_bc, train_dagger
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
     from leapnav.training.scoring.comparison import Comparison, compare
@@ -62,6 +63,7 @@ __all__ = [
     "NavigateVecEnv",
     "NavigationFeatures",
     "PPOConfig",
+    "PlannerPolicy",
     "Policy",
     "PolicyFactory",
     "PolicyRegret",
@@ -111,6 +113,7 @@ _LAZY = {
     "learning.warm_start": ("WarmStart", "warm_start"),
     "policies.baselines": ("GoToGoal", "RandomPolicy"),
     "policies.files": ("load_policy", "policy_environment", "save_policy", "shipped_policies"),
+    "policies.planners": ("PlannerPolicy",),
     "policies.network": ("NavigationFeatures", "make_policy", "network"),
     "environments.level_samplers": (
         "LearnabilitySampler",

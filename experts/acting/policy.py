@@ -12,10 +12,8 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.unwrapping import action_scale, unwrap
+from leapnav.envs.unwrapping import Situation, action_scale, situations, unwrap
 from leapnav.envs.utils.validation import as_matrix, as_vector, check_choice
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.gains import Gains
@@ -59,18 +57,6 @@ def plan_actions(extremal: Extremal, scenario: Scenario, control_period: float) 
     if scenario.robot.sizes()[0] > 3:  # Simpson's rule
         controls = (extremal.evaluate(starts)[1] + 4.0 * controls + extremal.evaluate(ends)[1]) / 6.0
     return scenario.robot.actions(controls).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class _Situation:
-    """Scenario, state and time of one robot."""
-
-    scenario: Scenario
-    index: int | None
-    bank: ScenarioBank | None
-    state: np.ndarray
-    time: float
-    period: float
 
 
 @dataclass
@@ -177,7 +163,7 @@ class ExpertPolicy:
             NoOptimumError: a scenario has no certified optimum.
 
         """
-        found = self._factor * np.array(self._each(self._act, self._situations())) + self._offset
+        found = self._factor * np.array(self._each(self._act, situations(self._envs))) + self._offset
         actions = found.astype(np.float32)
         return (actions if self._is_batch else cast(np.ndarray, actions[0])), state
 
@@ -221,26 +207,26 @@ class ExpertPolicy:
         return np.array([cost for cost, _ in found]), np.array([costate for _, costate in found])
 
     def _ask(self, state: Any, time: Any) -> list[tuple[float, np.ndarray]]:
-        situations = self._situations()
-        count = len(situations)
+        found = situations(self._envs)
+        count = len(found)
         if state is not None:
             states = np.asarray(state, dtype=float)
             shape = count, self._n
             if states.shape not in (shape, shape[1:]) or not np.isfinite(states).all():
                 raise ValueError(f"state: expected finite numbers of shape {shape}, got {state!r}")
-            situations = [replace(s, state=p) for s, p in zip(situations, np.broadcast_to(states, shape), strict=True)]
-        times = [s.time for s in situations] if time is None else np.broadcast_to(time, (count,)).tolist()
-        for situation, t in zip(situations, times, strict=True):
+            found = [replace(s, state=p) for s, p in zip(found, np.broadcast_to(states, shape), strict=True)]
+        times = [s.time for s in found] if time is None else np.broadcast_to(time, (count,)).tolist()
+        for situation, t in zip(found, times, strict=True):
             end = math.inf if situation.scenario.horizon is None else situation.scenario.horizon
             if not 0.0 <= t < end:
                 raise ValueError(f"time: expected a number from 0 to {end:g}, got {t!r}")
 
-        def ask(i: int, situation: _Situation) -> tuple[float, np.ndarray]:
+        def ask(i: int, situation: Situation) -> tuple[float, np.ndarray]:
             return self._robot(i, situation).feedback.value(situation.state, times[i])
 
-        return self._each(ask, situations)
+        return self._each(ask, found)
 
-    def _act(self, i: int, situation: _Situation) -> np.ndarray:
+    def _act(self, i: int, situation: Situation) -> np.ndarray:
         left = situation.scenario.episode_limit - situation.time
         if left <= 0.0:  # the episode has ended
             return np.zeros(self._m)
@@ -257,7 +243,7 @@ class ExpertPolicy:
             control = robot.feedback.control(situation.time + ahead)
         return (control - robot.middle) / robot.half
 
-    def _robot(self, i: int, situation: _Situation) -> _Robot:
+    def _robot(self, i: int, situation: Situation) -> _Robot:
         """The solution of a robot's episode; a new episode is looked up or solved."""
         robot = self._robots[i]
         if robot is not None and robot.scenario is situation.scenario and situation.time >= robot.time:
@@ -283,19 +269,7 @@ class ExpertPolicy:
         self._robots[i] = robot
         return robot
 
-    def _situations(self) -> list[_Situation]:
-        """The situations of all robots."""
-        found: list[_Situation] = []
-        for env in self._envs:
-            period, bank = env.control_period, env.bank
-            if isinstance(env, NavigateEnv):
-                found.append(_Situation(env.scenario, env.index, bank, env.state, env.time, period))
-            else:
-                rows = zip(env.scenarios, env.indices, env.states, env.times.tolist(), strict=True)
-                found += [_Situation(scenario, i, bank, state, time, period) for scenario, i, state, time in rows]
-        return found
-
-    def _each(self, function: Callable[[int, _Situation], Any], situations: list[_Situation]) -> list[Any]:
+    def _each(self, function: Callable[[int, Situation], Any], situations: list[Situation]) -> list[Any]:
         """Call a function for all robots, in threads; the kernels release the global interpreter lock."""
         numbered = list(enumerate(situations))
         if len(numbered) < MIN_THREADED_ROBOTS or self._workers == 1:

@@ -22,9 +22,9 @@ from leapnav.outputs import check_outputs, write_json
 if TYPE_CHECKING:
     from leapnav.training.scoring.comparison import Comparison
 
-POLICIES = """Policies: "expert", "random", "go-to-goal", an included policy (the name of its family), the directory
-of a policy or of a run, or a model saved by Stable-Baselines3 (.zip). Runs that differ only in their seed share a row,
-and so do policies with the same LABEL=."""
+POLICIES = """Policies: "expert", a baseline ("random", "go-to-goal", "dwa", "mppi", "lattice"), an included policy (the
+name of its family), the directory of a policy or of a run, or a model saved by Stable-Baselines3 (.zip). Runs that
+differ only in their seed share a row, and so do policies with the same LABEL=."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Evaluate(ParallelOptions):
         from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores, scores_to_dict
 
         if not self.policies:
-            raise ValueError("policies: expected at least one: expert, random, go-to-goal or a directory; got none")
+            raise ValueError("policies: expected at least one: expert, dwa, clutter, a directory, ...; got none")
         if self.count is not None:
             check_at_least("count", self.count, 1)
         for plot in (self.plot, self.episodes_plot, self.decisions):

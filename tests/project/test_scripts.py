@@ -108,9 +108,3 @@ def test_the_study_of_reinforcement(script, capsys):
     words = "--only", "grazes", "--seeds", "0", "--workers", "1"
     script("reinforcement_study", *words, SCENARIOS=2, N_DRIVEN=16, N_ROBOTS=16)
     assert capsys.readouterr().out.count("  gain ") == 1
-
-
-def test_the_training_of_the_included_policies(script, capsys, tmp_path):
-    script("ship_policies", "open", SHIPPED=tmp_path / "shipped")
-    assert "open on open: success" in capsys.readouterr().out
-    assert (tmp_path / "shipped" / "open" / "policy.json").is_file()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
 from leapnav.training.policies.files import BASELINES as BASELINES
 from leapnav.training.policies.files import load_policy, policy_environment, read_description
+from leapnav.training.policies.planners import PLANNERS, PlannerPolicy
 from leapnav.training.policies.zips import is_zip, load_zip
 from leapnav.training.scoring.evaluation import Policy, PolicyFactory, PolicyOrFactory
 
@@ -59,10 +61,10 @@ def load_policy_spec(
     """Load a policy by its name.
 
     Args:
-        name: "expert", "random", "go-to-goal", the directory of a policy or a run, a model saved by Stable-Baselines3
-            (`.zip`), or the name of an included policy. With the prefix "LABEL=", policies with the same label are
-            treated as runs of one method.
-        seed: random seed of the random policy.
+        name: one of `BASELINES`, the name of an included policy, the directory of a policy or a run, or a model of
+            Stable-Baselines3 (`.zip`). With the prefix "LABEL=", policies with the same label are treated as runs of
+            one method.
+        seed: random seed of the baselines "random" and "mppi".
         environment: arguments of the environment of a `.zip`, see `load_zip`.
         trust: load a `.zip` with Stable-Baselines3, which executes code from the file.
 
@@ -77,6 +79,7 @@ def load_policy_spec(
             "expert": ExpertPolicy,
             "random": PolicyFactory(lambda env: RandomPolicy(_single_action_space(env), seed)),
             "go-to-goal": GoToGoal,
+            **{name: PolicyFactory(partial(PlannerPolicy, planner=name, seed=seed)) for name in PLANNERS},
         }
         return PolicySpec(place, label, None, factories[place], {}, is_baseline=True)
     if is_zip(place):

@@ -148,7 +148,7 @@ def runs_cell(interval: Interval, factor: float, digits: int, interval_digits: i
 
 def markdown_cells(row: Score) -> str:
     """Return the `MARKDOWN_COLUMNS`, with intervals over the scenarios, as cells of a Markdown table."""
-    cells = [cell(getattr(row, name), *form) for _, name, *form in COLUMNS if name in MARKDOWN_COLUMNS]
+    cells = [cell(getattr(row, name), *form[:2], form[1]) for _, name, *form in COLUMNS if name in MARKDOWN_COLUMNS]
     return " | ".join(cells).replace("\n", " ")
 
 

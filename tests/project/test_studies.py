@@ -1,0 +1,56 @@
+"""The studies: their tables in the documentation, and their scripts with a tiny budget."""
+
+import importlib.util
+import sys
+
+import pytest
+from helpers import ROOT
+
+STUDIES = sorted(path.parent.name for path in (ROOT / "studies").glob("*/run.py"))
+# Words of a run with a tiny budget, of which a part may stand for all.
+WORDS = {"included_policies": ["open", "--train"], "planners": ["lattice", "mppi"]}
+
+
+def load(path, name):
+    specification = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def write_tables():
+    return load(ROOT / "scripts" / "write_tables.py", "write_tables")
+
+
+def test_the_tables_of_the_documentation_are_those_of_the_results(write_tables, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["write_tables.py", "--check"])
+    write_tables.main()
+    assert "all tables" in capsys.readouterr().out
+
+
+def test_a_table_that_differs_is_found(write_tables):
+    text = "a\n<!-- table: x -->\n\n| 1 |\n\n<!-- end of table -->\nb\n"
+    assert write_tables.with_table(text, "x", "| 1 |\n") == text
+    assert "| 2 |" in write_tables.with_table(text, "x", "| 2 |\n")
+    with pytest.raises(ValueError, match="table y: expected one place for it, found 0"):
+        write_tables.with_table(text, "y", "")
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_runs_with_a_tiny_budget_and_gives_the_same_bytes_again(name, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    found = []
+    for number in (0, 1):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        study = load(ROOT / "studies" / name / "run.py", f"study_{name}")
+        monkeypatch.setattr(sys, "argv", ["run.py", *WORDS.get(name, []), "--tiny", "--out", "results"])
+        study.main()
+        files = sorted((folder / "results").glob("*.jsonl.gz"))
+        assert files
+        found.append({path.name: path.read_bytes() for path in files})
+        assert all("| open | " in table or "`open`" in table for table in study.tables(folder / "results").values())
+    assert found[0] == found[1]
