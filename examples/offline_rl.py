@@ -1,18 +1,24 @@
-"""Offline reinforcement learning on the expert's demonstrations, with TD3+BC of d3rlpy, scored against the optimum.
+"""Offline reinforcement learning with d3rlpy, scored against the optimum: BC, TD3+BC or IQL on recorded episodes.
 
 pip install leapnav d3rlpy
-python examples/offline_rl.py --scenarios 500 --steps 20000
+python examples/offline_rl.py --policies random open --episodes 500 --algorithm iql --steps 20000
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import d3rlpy
+import minari
 import numpy as np
 import tyro
 
-from leapnav.experts import rollout
-from leapnav.training import Dataset, evaluate
+from leapnav.training import evaluate, record
+
+ALGORITHMS: dict[str, Any] = {
+    "bc": d3rlpy.algos.BCConfig(),
+    "td3+bc": d3rlpy.algos.TD3PlusBCConfig(gamma=0.999, alpha=2.5),
+    "iql": d3rlpy.algos.IQLConfig(gamma=0.999, expectile=0.9, weight_temp=3.0),
+}
 
 
 class OfflinePolicy:
@@ -29,40 +35,62 @@ class OfflinePolicy:
         return (actions if np.ndim(observation) > 1 else actions[0]), state
 
 
+def load(folder: Path) -> tuple[d3rlpy.dataset.MDPDataset, dict[str, Any], list[float]]:
+    """Return the transitions, the metadata and the returns of the Minari dataset below a directory."""
+    (metadata,) = folder.glob("**/data/metadata.json")
+    dataset = minari.MinariDataset(metadata.parent)
+    episodes = list(dataset.iterate_episodes())
+    transitions = d3rlpy.dataset.MDPDataset(
+        np.concatenate([episode.observations[:-1] for episode in episodes]),
+        np.concatenate([episode.actions for episode in episodes]),
+        np.concatenate([episode.rewards for episode in episodes]).astype(np.float32),
+        np.concatenate([episode.terminations for episode in episodes]).astype(np.float32),
+        np.concatenate([episode.truncations for episode in episodes]).astype(np.float32),
+    )
+    return transitions, dataset.storage.metadata, [float(np.sum(episode.rewards)) for episode in episodes]
+
+
 def main(
     family: str = "open",
-    scenarios: int = 500,
+    policies: tuple[str, ...] = ("expert",),
+    episodes: int = 500,
+    noise: float = 0.1,
+    algorithm: Literal["bc", "td3+bc", "iql"] = "td3+bc",
     steps: int = 20_000,
-    demos: Path = Path("demos"),
+    data: Path = Path("offline-data"),
     test_scenarios: int | None = None,
 ) -> None:
-    """Record demonstrations, learn from them, and score the policy.
+    """Record episodes of policies, learn from them, and score the result.
 
     Args:
         family: Family of the scenarios: open, clutter, polygons, rooms or slalom.
-        scenarios: Number of scenarios to demonstrate.
+        policies: Policies that are recorded in turn: expert, random, go-to-goal, dwa, mppi, lattice, an included policy
+            or a training run. They must observe the default, 32 lidar beams.
+        episodes: Number of recorded episodes.
+        noise: Standard deviation of the noise on the recorded actions, which are in [-1, 1].
+        algorithm: Algorithm that learns.
         steps: Number of gradient steps.
-        demos: Directory of the demonstrations; an existing dataset is used again.
+        data: Directory of the recorded episodes; an existing dataset is used again.
         test_scenarios: Number of test scenarios of the score; by default all.
 
     """
-    # With noise the executed actions differ from the expert's, and their rewards show which are better.
-    rollout(family, scenarios, demos, noise=0.1)
-    data = Dataset.of(demos)
-    is_last = np.append(np.diff(data.episodes) != 0, True)  # step of an episode
-    dataset = d3rlpy.dataset.MDPDataset(
-        data.observations, data.executed, data.rewards.astype(np.float32), is_last.astype(np.float32)
-    )
-    algorithm = d3rlpy.algos.TD3PlusBCConfig(gamma=0.999, alpha=2.5).create(device="cpu:0")
-    algorithm.fit(
-        dataset,
+    if not data.exists():
+        record(policies, family, episodes, data, noise=noise)
+    transitions, metadata, returns = load(data)
+    learner = ALGORITHMS[algorithm].create(device="cpu:0")
+    learner.fit(
+        transitions,
         n_steps=steps,
         n_steps_per_epoch=min(steps, 5000),
         show_progress=False,
         save_interval=10**9,  # epochs: save nothing
         logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
     )
-    score = evaluate(OfflinePolicy(algorithm), family, count=test_scenarios)
+    score = evaluate(OfflinePolicy(learner), family, count=test_scenarios)
+    low, high = metadata["ref_min_score"], metadata["ref_max_score"]
+    achieved = np.mean([episode.episode_return for episode in score])
+    print(f"normalised return: data {(np.mean(returns) - low) / (high - low):.3f}, ", end="")
+    print(f"{algorithm} {(achieved - low) / (high - low):.3f}")
     print(f"success {100 * score.success:.1f} %, collision {100 * score.collision:.1f} %, SOC {score.soc:.3f}")
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from leapnav.training.learning.cloning import EpochLoss, behaviour_clone
     from leapnav.training.learning.dagger import DAgger
     from leapnav.training.learning.dataset import Dataset
+    from leapnav.training.learning.recording import record
     from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
     from leapnav.training.learning.warm_start import WarmStart, warm_start
     from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
@@ -90,6 +91,7 @@ __all__ = [
     "print_scores",
     "profile",
     "read_episodes",
+    "record",
     "regret",
     "save_policy",
     "score",
@@ -109,6 +111,7 @@ _LAZY = {
     "learning.cloning": ("EpochLoss", "behaviour_clone"),
     "learning.dagger": ("DAgger",),
     "learning.dataset": ("Dataset",),
+    "learning.recording": ("record",),
     "learning.replay": ("DemonstrationReplayBuffer", "imitate"),
     "learning.warm_start": ("WarmStart", "warm_start"),
     "policies.baselines": ("GoToGoal", "RandomPolicy"),

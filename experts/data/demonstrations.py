@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
-import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
 
-import leapnav
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.bank import collection_name
-from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES, MAX_HORIZON
-from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
-from leapnav.envs.utils.files import digest
+from leapnav.envs.robots import RobotModel
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions
+from leapnav.experts.data.datasets import CONTROL_PERIOD, Task, dataset_id, open_dataset, write_episodes
 from leapnav.experts.hard_limits import without_barrier
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.solve import solve
 
-ENVIRONMENT = "leapnav/Navigate-v0"
-CHECKSUM = "leapnav_sha256"  # key of the metadata: checksum of the data file
-CONTROL_PERIOD = 0.05  # s, the default of the environment; demonstrations use it
 # A recovery starts from a perturbed state of the optimum.
 PERTURBATION = np.array([0.15, 0.15, 0.3])  # standard deviations (m, m, rad)
 MOTION_PERTURBATION = 0.1  # standard deviation of the further states (in their units)
@@ -43,13 +35,6 @@ MIN_RECOVERY_CLEARANCE = 0.02  # m
 # A recovery that costs more than this factor times the remaining cost of the optimum, plus this summand, follows
 # another local optimum and is dropped.
 MAX_RECOVERY_COST = (2.0, 1.0)
-# Step limit of a dataset's environment. No episode reaches it, but d3rlpy requires a limit.
-MAX_STEPS = {
-    "fixed": math.ceil(MAX_HORIZON / CONTROL_PERIOD) + 1,
-    "free": math.ceil(TIME_LIMIT_FACTOR * MAX_HORIZON / CONTROL_PERIOD) + 1,
-}
-STEPS_FACTOR = 10  # for families with larger arenas, and those whose horizons are not known
-N_SCORED = 100  # scenarios from which the score of random actions is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,57 +234,20 @@ def write_dataset(
         obstacles: "cost" or "hard".
 
     """
-    arguments: dict[str, Any] = {} if horizon == "fixed" else {"horizon": horizon, "split": "fresh"}
-    if obstacles != "cost":
-        arguments |= {"obstacles": obstacles, "split": "fresh"}
-    if robot != Unicycle():
-        fields = robot.model_dump(mode="json", exclude_none=True)
-        arguments |= {"robot": robot.model if robot == type(robot)() else fields, "split": "fresh"}
-    limit = MAX_STEPS[horizon] * (1 if family in (*ALL_FAMILIES, ALL) else STEPS_FACTOR)
-    env = gym.make(ENVIRONMENT, family=family, max_episode_steps=limit, **arguments)
-    scenarios: list[Scenario] = []
-    returns: list[float] = []
-
-    def episodes() -> Iterator[EpisodeBuffer]:
-        for number, demonstration in enumerate(demonstrations):
-            returns.append(-demonstration.reference_cost)
-            if number < N_SCORED:
-                scenarios.append(demonstration.scenario)
-            yield _episode(number, demonstration)
-
-    with _minari_root(str(root)):
-        dataset = minari.create_dataset_from_buffers(
-            dataset_id(family, robot.model, horizon, obstacles),
-            cast(list[EpisodeBuffer], episodes()),  # Minari declares a list, but any iterable works
-            env=env,
-            eval_env=env,
-            algorithm_name="leapnav.experts.find_optimum",
-            author="leapnav",
-            author_email="",
-            code_permalink="",
-            description="Certified optima driven in the environment. Infos: state (x, y, heading, further states of "
-            "the robot), control, expert_action, costate, cost_to_go, running_cost, reference_cost; the episode's "
-            "scenario is options['scenario'] as JSON. The actions are the executed ones; the expert's without noise "
-            "are in the infos. Reference scores: random actions and the optimum.",
-            requirements=[f"leapnav=={leapnav.__version__}"],
-        )
-        scores = {"ref_min_score": _random_score(env, scenarios), "ref_max_score": float(np.mean(returns))}
-        dataset.storage.update_metadata({**scores, CHECKSUM: digest(_data_file(dataset))})
-
-
-def _random_score(env: gym.Env, scenarios: Sequence[Scenario]) -> float:
-    """Mean return of uniformly random actions."""
-    rng = np.random.default_rng(0)
-    total = 0.0
-    for scenario in scenarios:
-        _, _, steps = play_episode(
-            env,
-            lambda *_: rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32),
-            options={"scenario": scenario},
-        )
-        for step in steps:
-            total += step.reward
-    return total / len(scenarios)
+    write_episodes(
+        (
+            (demonstration.scenario, demonstration.reference_cost, _episode(number, demonstration))
+            for number, demonstration in enumerate(demonstrations)
+        ),
+        root,
+        dataset_id(family, robot.model, horizon, obstacles),
+        Task(family, robot, horizon, obstacles),
+        algorithm="leapnav.experts.find_optimum",
+        description="Certified optima driven in the environment. Infos: state (x, y, heading, further states of the "
+        "robot), control, expert_action, costate, cost_to_go, running_cost, reference_cost; the episode's scenario is "
+        "options['scenario'] as JSON. The actions are the executed ones; the expert's without noise are in the infos. "
+        "Reference scores: random actions and the optimum in the scenarios of eval_env.",
+    )
 
 
 def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
@@ -328,55 +276,6 @@ def _episode(number: int, demonstration: Demonstration) -> EpisodeBuffer:
             "reference_cost": np.full(steps + 1, demonstration.reference_cost),
         },
     )
-
-
-def dataset_id(family: str, robot: str = "unicycle", horizon: str = "fixed", obstacles: str = "cost") -> str:
-    """The Minari dataset id of the demonstrations of a family, for a robot and kinds of horizon and obstacles."""
-    return f"leapnav/{collection_name(family, robot, horizon, obstacles)}/expert-v0"
-
-
-@contextmanager
-def _minari_root(directory: str) -> Iterator[None]:
-    """Set Minari's root directory, for which only an environment variable exists."""
-    name = "MINARI_DATASETS_PATH"
-    before = os.environ.get(name)
-    os.environ[name] = directory
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
-
-
-def open_dataset(folder: str | os.PathLike[str]) -> minari.MinariDataset:
-    """Open the only Minari dataset below a directory.
-
-    Raises:
-        FileNotFoundError: there is no dataset, or more than one.
-        ValueError: the dataset was not written by `rollout`, or has changed since.
-
-    """
-    found = sorted(path.parent for path in Path(folder).glob("**/data/metadata.json"))
-    if len(found) != 1:
-        raise FileNotFoundError(f"{os.fspath(folder)}: expected one Minari dataset, found {len(found)}")
-    try:
-        dataset = minari.MinariDataset(found[0])
-        expected = dataset.storage.metadata.get(CHECKSUM)
-    except OSError:
-        raise
-    except Exception as error:  # damaged metadata may raise any error in Minari and Gymnasium
-        raise ValueError(f"{found[0] / 'metadata.json'}: not that of a dataset: {error!r}") from None
-    if expected is None:
-        raise ValueError(f"{found[0]}: expected a dataset written by leapnav rollout, got one without a checksum")
-    if digest(_data_file(dataset)) != expected:
-        raise ValueError(f"{_data_file(dataset)}: damaged, or changed since it was written")
-    return dataset
-
-
-def _data_file(dataset: minari.MinariDataset) -> Path:
-    return Path(dataset.storage.data_path) / "main_data.hdf5"
 
 
 def load_demonstrations(folder: str | os.PathLike[str]) -> list[Demonstration]:

@@ -26,12 +26,12 @@ from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_choice
+from leapnav.experts.data.datasets import open_dataset
 from leapnav.experts.data.demonstrations import (
     Demonstration,
     demonstrate,
     demonstrate_disturbed,
     iterate_demonstrations,
-    open_dataset,
     recovery,
     state_of,
     write_dataset,

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from leapnav.commands.options import FamilyOrAll, ParallelOptions, TaskOptions
+from leapnav.commands.options import FamilyOrAll, ParallelOptions, PolicyName, TaskOptions
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 # Maximum deviation of a replay: other versions of the libraries may round the last digits differently.
@@ -19,7 +19,8 @@ REPLAY_TOLERANCE = 1e-6
 class Rollout(TaskOptions, ParallelOptions):
     """Sample scenarios, find their optima, execute them in the environment, and write a Minari dataset.
 
-    The same command resumes an interrupted rollout.
+    The same command resumes an interrupted rollout. With --policy, the episodes of policies are recorded instead, for
+    offline reinforcement learning; such a rollout begins again.
     """
 
     out: Path
@@ -34,6 +35,10 @@ class Rollout(TaskOptions, ParallelOptions):
     """Number of recoveries per scenario: demonstrations from perturbed states of the optimum."""
     noise: float = 0.0
     """Standard deviation of the noise on the actions. The infos contain the expert's actions without it."""
+    policy: tuple[PolicyName, ...] = ()
+    """Policies whose episodes are recorded instead of the optima, see leapnav evaluate --help; several take turns."""
+    name: str | None = None
+    """Last part of the Minari dataset id with --policy; by default the name of the policy, or "mixed"."""
     force: bool = False
     """Replace an existing dataset or unfinished rollout in the output directory."""
     json: Path | None = None
@@ -44,7 +49,11 @@ class Rollout(TaskOptions, ParallelOptions):
     def run(self) -> int:
         """Write the dataset."""
         check_outputs(self.json)
-        from leapnav.experts.data.demonstrations import dataset_id
+        if self.policy:
+            return self._record()
+        if self.name is not None:
+            raise ValueError(f"name: expected --policy with it, got only {self.name!r}")
+        from leapnav.experts.data.datasets import dataset_id
         from leapnav.experts.data.rollouts import rollout
 
         summary = rollout(
@@ -65,6 +74,22 @@ class Rollout(TaskOptions, ParallelOptions):
         )
         name = dataset_id(self.family, **self.task)
         print(f"load it with minari.load_dataset({name!r}) and MINARI_DATASETS_PATH={self.out}")
+        write_json(asdict(summary), self.json)
+        return 0
+
+    def _record(self) -> int:
+        """Write the dataset of the episodes of policies."""
+        from leapnav.training.learning.recording import record
+
+        if self.recoveries:
+            raise ValueError(f"recoveries: expected 0 with --policy, got {self.recoveries}")
+        options = {"name": self.name, "seed": self.seed, "noise": self.noise, "force": self.force}
+        summary = record(self.policy, self.family, self.count, self.out, **self.task, **options, **self.parallel)
+        print(
+            f"wrote {self.out}: {summary.episodes} episodes, {summary.steps} environment steps, success "
+            f"{100 * summary.success:.1f} %, mean return {summary.mean_return:.2f}"
+        )
+        print(f"load it with minari.load_dataset({summary.name!r}) and MINARI_DATASETS_PATH={self.out}")
         write_json(asdict(summary), self.json)
         return 0
 

@@ -14,7 +14,8 @@ from leapnav.envs.episodes import act_with, play_episode
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, observation_entries, parts_of
 from leapnav.experts import ExpertPolicy, build_bank, find_optimum, find_reached_optimum
-from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
+from leapnav.experts.data.datasets import dataset_id
+from leapnav.experts.data.demonstrations import load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
 from leapnav.training import Dataset, evaluate, load_policy, make_vec_env, save_policy
 from leapnav.training.config import CloningConfig, DAggerConfig, DAggerRunConfig, PPOConfig, SACConfig

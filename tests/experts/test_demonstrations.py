@@ -4,7 +4,8 @@ import pytest
 from leapnav.envs import FAMILIES, NavigateEnv, NavigateVectorEnv, Scenario, ScenarioBank, sample_scenario
 from leapnav.experts import ExpertPolicy, NoOptimumError, find_optimum
 from leapnav.experts.acting.policy import plan_actions
-from leapnav.experts.data.demonstrations import dataset_id, demonstrate, load_demonstrations, open_dataset
+from leapnav.experts.data.datasets import dataset_id, open_dataset
+from leapnav.experts.data.demonstrations import demonstrate, load_demonstrations
 from leapnav.experts.data.rollouts import rollout
 
 

@@ -15,7 +15,8 @@ from leapnav.envs.vector import NavigateVectorEnv
 from leapnav.experts import ExpertPolicy, build_bank, build_bank_of, find_optimum, minimum_time, solve
 from leapnav.experts.acting.barrier import barrier_integral, reference_problem
 from leapnav.experts.acting.feedback import Feedback
-from leapnav.experts.data.demonstrations import dataset_id, load_demonstrations
+from leapnav.experts.data.datasets import dataset_id
+from leapnav.experts.data.demonstrations import load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
 from leapnav.experts.hard_limits import barrier_integrals
 from leapnav.experts.optimum import find_reached_optimum

@@ -23,7 +23,7 @@ EXAMPLES = {
     ),
     "ppo_from_scratch": ("--total-timesteps 1024 --count 3", rf"<Evaluation: .*{SCORE}.*>\n"),
     "caves": ("--count 1", r"caves-0: certified, horizon .* s, J = \d+\.\d+\n"),
-    "offline_rl": ("--scenarios 10 --steps 50 --test-scenarios 5", rf"(.*\n)*{SCORE}\n"),
+    "offline_rl": ("--episodes 10 --steps 50 --test-scenarios 5", rf"(.*\n)*{SCORE}\n"),
 }
 
 

@@ -20,7 +20,8 @@ from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.files import atomic_path
-from leapnav.experts.data.demonstrations import CONTROL_PERIOD, ENVIRONMENT, Demonstration, open_dataset
+from leapnav.experts.data.datasets import CONTROL_PERIOD, ENVIRONMENT, open_dataset
+from leapnav.experts.data.demonstrations import Demonstration
 
 FORMAT = 3  # version of the file format
 # Arguments of the environment that select the scenarios; the meaning of an observation does not depend on them.

@@ -25,7 +25,7 @@ from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.validation import suggestion
-from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.experts.data.datasets import ENVIRONMENT
 from leapnav.training.policies.actors import policy_of
 from leapnav.training.policies.architecture import KINDS, Architecture, is_actor_weight
 from leapnav.training.policies.zips import is_zip, load_zip

@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, frame_size, parts_of
-from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.experts.data.datasets import ENVIRONMENT
 from leapnav.training.policies.navigation_policy import NavigationPolicy
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers

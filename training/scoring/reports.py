@@ -18,7 +18,7 @@ from leapnav.envs.utils.colors import CURVES, FAILURE, OPTIMUM, POLICY
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.envs.utils.tables import print_table
-from leapnav.experts.data.demonstrations import ENVIRONMENT
+from leapnav.experts.data.datasets import ENVIRONMENT
 from leapnav.experts.plotting.scenes import draw_scenario
 from leapnav.training.scoring.barn import BarnScore
 from leapnav.training.scoring.comparison import Comparison
@@ -148,7 +148,8 @@ def runs_cell(interval: Interval, factor: float, digits: int, interval_digits: i
 
 def markdown_cells(row: Score) -> str:
     """Return the `MARKDOWN_COLUMNS`, with intervals over the scenarios, as cells of a Markdown table."""
-    cells = [cell(getattr(row, name), *form[:2], form[1]) for _, name, *form in COLUMNS if name in MARKDOWN_COLUMNS]
+    columns = [(name, factor, digits) for _, name, factor, digits, _ in COLUMNS if name in MARKDOWN_COLUMNS]
+    cells = [cell(getattr(row, name), factor, digits, digits) for name, factor, digits in columns]
     return " | ".join(cells).replace("\n", " ")
 
 
