@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from leapnav.training.learning.cloning import EpochLoss, behaviour_clone
     from leapnav.training.learning.dagger import DAgger
     from leapnav.training.learning.dataset import Dataset
-    from leapnav.training.learning.recording import record
     from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
     from leapnav.training.learning.warm_start import WarmStart, warm_start
     from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from leapnav.training.policies.network import NavigationFeatures, make_policy, network
     from leapnav.training.policies.planners import PlannerPolicy
     from leapnav.training.runs.imitation import train_bc, train_dagger
+    from leapnav.training.runs.recording import record
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
     from leapnav.training.scoring.comparison import Comparison, compare
     from leapnav.training.scoring.decisions import Decisions, PolicyRegret, regret
@@ -111,7 +111,7 @@ _LAZY = {
     "learning.cloning": ("EpochLoss", "behaviour_clone"),
     "learning.dagger": ("DAgger",),
     "learning.dataset": ("Dataset",),
-    "learning.recording": ("record",),
+    "runs.recording": ("record",),
     "learning.replay": ("DemonstrationReplayBuffer", "imitate"),
     "learning.warm_start": ("WarmStart", "warm_start"),
     "policies.baselines": ("GoToGoal", "RandomPolicy"),

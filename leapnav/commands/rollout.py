@@ -79,7 +79,7 @@ class Rollout(TaskOptions, ParallelOptions):
 
     def _record(self) -> int:
         """Write the dataset of the episodes of policies."""
-        from leapnav.training.learning.recording import record
+        from leapnav.training.runs.recording import record
 
         if self.recoveries:
             raise ValueError(f"recoveries: expected 0 with --policy, got {self.recoveries}")
