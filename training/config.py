@@ -95,8 +95,7 @@ class WarmStartConfig:
     critic_batch_size: int = 4096
     """Samples per gradient step of the critic."""
     gradient_weight: float = 0.3
-    """Weight of the gradient error (with respect to the state; for Q functions also to the action) relative to the
-    value error, both in units of their spread."""
+    """Weight of the error of the gradient (of Q functions also by the action) relative to that of the value."""
     slopes: int = 200_000
     """Number of samples at which the gradient is fitted."""
     seed: int = 0
@@ -111,12 +110,12 @@ class RunConfig:
     """Run directory: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
     family: FamilyName = "clutter"
     """Family of the scenarios."""
-    robot: RobotName = "unicycle"
-    """Model of the robot."""
-    horizon: HorizonName = "fixed"
-    """Fixed horizon, or free: the episode ends at the goal, and the time is part of the cost."""
-    obstacles: ObstaclesName = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
+    robot: RobotName | None = None
+    """Model of the robot; by default that of the scenarios of a file, otherwise the unicycle."""
+    horizon: HorizonName | None = None
+    """Fixed horizon (default, unless a file has another), or free: the episode ends at the goal, and time costs."""
+    obstacles: ObstaclesName | None = None
+    """Obstacles with a proximity cost (default), or hard obstacles, which cost nothing."""
     seed: int = 0
     """Random seed."""
     resume: bool = False
@@ -126,9 +125,8 @@ class RunConfig:
     observation: ObservationName = "lidar"
     """Lidar alone, or with the geodesic distance to the goal and the detour along each beam, from the complete map."""
     lidar_beams: int | None = None
-    """Number of lidar beams, an even number; by default 64 with the geodesic observation and 128 with lidar alone. With
-    32 beams, narrow passages cannot be distinguished from wide ones. Demonstrations are observed again with these
-    beams; a policy to start from must have the same number."""
+    """Even number of lidar beams; by default 64 with the geodesic observation and 128 with lidar alone; 32 do not
+    resolve narrow passages. Demonstrations are observed again with them; a policy to start from must have as many."""
     velocities: bool | None = None
     """Whether the geodesic observation has the velocities of obstacles; by default if those of the family move."""
     history: tuple[float, ...] = ()
@@ -140,22 +138,29 @@ class RunConfig:
     """Scenarios per family of the training split in evaluations during the run; the last one plays the test split."""
 
     @property
+    def task(self) -> dict[str, str]:
+        """Model of the robot, horizon and obstacles, those that are not given as in `task_of`."""
+        from leapnav.envs.scenarios.families import task_of
+
+        robot, horizon, obstacles = task_of(self.family, self.robot, self.horizon, self.obstacles)
+        return {"robot": self.robot or robot.model, "horizon": horizon, "obstacles": obstacles}
+
+    @property
     def fresh_scenarios(self) -> dict[str, Any]:
         """Arguments of the environment that, with `environment`, select new scenarios of the family."""
-        return {"family": self.family, "split": "fresh", "obstacles": self.obstacles}
+        return {"family": self.family, "split": "fresh", "obstacles": self.task["obstacles"]}
 
     @property
     def environment(self) -> dict[str, Any]:
         """Arguments of the environment that determine the observation."""
-        robot = {} if self.robot == "unicycle" else {"robot": self.robot}
-        horizon = {} if self.horizon == "fixed" else {"horizon": self.horizon}
+        task = {name: value for name, value in self.task.items() if value not in ("unicycle", "fixed", "cost", "hard")}
         observation = {} if self.observation == "lidar" else {"observation": self.observation}
-        history = {"history": self.history} if self.history else {}
-        previous = {} if self.effort_weights is None else {"previous_action": True}
+        earlier: dict[str, Any] = {"history": self.history} if self.history else {}
+        earlier |= {} if self.effort_weights is None else {"previous_action": True}
         beams = (64 if self.observation == "geodesic" else 128) if self.lidar_beams is None else self.lidar_beams
         is_default = self.observation == "geodesic" and self.family in get_args(Moving)
         velocities = {"velocities": True} if self.velocities or (self.velocities is None and is_default) else {}
-        return {**observation, **velocities, "lidar_beams": beams, **robot, **horizon, **history, **previous}
+        return {**observation, **velocities, "lidar_beams": beams, **task, **earlier}
 
     @property
     def effort_weights(self) -> tuple[float, ...] | None:
@@ -165,21 +170,16 @@ class RunConfig:
             ValueError: momentum is not possible, but required by `previous_action`.
 
         """
-        if self.previous_action is False or (self.horizon == "fixed" and not self.previous_action):
+        is_default = self.task["horizon"] == "free" and not self.history
+        if not (is_default if self.previous_action is None else self.previous_action):
             return None
         from leapnav.envs.scenarios.families import sample_scenario
         from leapnav.training.effort import effort_weights
 
-        if self.previous_action is None and self.history:
-            return None
-        found = effort_weights(sample_scenario(self.family, 0, self.robot, self.horizon, self.obstacles))
+        found = effort_weights(sample_scenario(self.family, 0, **self.task))
         if self.previous_action and found is None:
             raise ValueError("previous_action: expected a free horizon and a robot without drift, got True")
         return found
-
-    def own_bank(self, folder: Path, family: str, split: str = "test") -> Path:
-        """Return the file of the bank that the run in a directory builds for a family without an included one."""
-        return folder / (f"{split}.bank" if family == self.family else f"{split}-{family}.bank")
 
     @classmethod
     def tuned(cls, family: str, *, warm: bool | None = None, start: Sequence[Path] = (), **changes: Any) -> Self:
@@ -337,7 +337,7 @@ class PPOConfig(_LearnerConfig):
     @property
     def discount(self) -> float:
         """Discount factor."""
-        return (1.0 if self.horizon == "fixed" else 0.995) if self.gamma is None else self.gamma
+        return (1.0 if self.task["horizon"] == "fixed" else 0.995) if self.gamma is None else self.gamma
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -380,7 +380,7 @@ class SACConfig(_LearnerConfig):
     @property
     def discount(self) -> float:
         """Discount factor."""
-        return (0.99 if self.horizon == "fixed" else 0.999) if self.gamma is None else self.gamma
+        return (0.99 if self.task["horizon"] == "fixed" else 0.999) if self.gamma is None else self.gamma
 
 
 def _as_paths(value: Any) -> list[Path]:

@@ -218,9 +218,9 @@ def families_of(family: str) -> tuple[str, ...]:
 def sample_scenario(
     family: str | CustomFamily,
     seed: int | np.random.Generator,
-    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
-    horizon: str = "fixed",
-    obstacles: str = "cost",
+    robot: RobotModel | Mapping[str, Any] | str | None = None,
+    horizon: str | None = None,
+    obstacles: str | None = None,
 ) -> Scenario:
     """Sample a random scenario; the same family and seed give the same scenario.
 
@@ -236,10 +236,10 @@ def sample_scenario(
             one scenario is drawn, with its name.
         seed: an integer, or a random generator.
         robot: name of a robot model, a dict of its fields with `model`, or a robot. Robots with the same footprint
-            get the same obstacles and poses.
-        horizon: "fixed" or "free"; both have the same obstacles and poses.
+            get the same obstacles and poses. None: see `task_of`.
+        horizon: "fixed" or "free"; both have the same obstacles and poses. None: see `task_of`.
         obstacles: "cost" for a proximity cost with the weight 1; "hard" for the weight 0, with which the obstacles are
-            hard constraints and cost nothing. Both have the same obstacles, poses and horizon.
+            hard constraints and cost nothing. Both have the same obstacles, poses and horizon. None: see `task_of`.
 
     Raises:
         TypeError: the function of the family returns something else.
@@ -248,9 +248,7 @@ def sample_scenario(
 
     """
     chosen = family if isinstance(family, CustomFamily) else find_family(family)
-    check_choice("horizon", horizon, HORIZONS)
-    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
-    body = check_robot(robot)
+    body, horizon, obstacles = task_of(chosen, robot, horizon, obstacles)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
     if chosen == ALL:
         chosen = ALL_FAMILIES[rng.integers(len(ALL_FAMILIES))]
@@ -269,6 +267,37 @@ def sample_scenario(
         if found is not None:
             return Scenario(name=name, arena=layout.arena, robot=body, obstacles=tuple(layout.obstacles), **found)
     raise ValueError(f"family: {custom.name!r}: no layout connects start and goal in {MAX_DRAWS} draws")
+
+
+def task_of(
+    family: str | CustomFamily,
+    robot: RobotModel | Mapping[str, Any] | str | None = None,
+    horizon: str | None = None,
+    obstacles: str | None = None,
+) -> tuple[RobotModel, str, str]:
+    """Return robot, kind of horizon and kind of obstacles of new scenarios of a family.
+
+    Those that are not given are those of the first scenario if the family is a file, otherwise the unicycle, "fixed"
+    and "cost". The name of the model of the stored robot selects that robot, whose parameters may differ from the
+    defaults.
+
+    Args:
+        family, robot, horizon, obstacles: see `sample_scenario`.
+
+    Raises:
+        FileNotFoundError, ValueError: an argument is invalid, or the file cannot be read.
+
+    """
+    chosen = family if isinstance(family, CustomFamily) else find_family(family)
+    if horizon is not None:
+        check_choice("horizon", horizon, HORIZONS)
+    if obstacles is not None:
+        check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+    if not isinstance(chosen, CustomFamily) or not isinstance(chosen.sample, StoredScenarios):
+        return check_robot("unicycle" if robot is None else robot), horizon or "fixed", obstacles or "cost"
+    first = _stored(chosen.sample.file)[0]
+    body = first.robot if robot in (None, first.robot.model) else check_robot(robot)
+    return body, horizon or first.horizon_kind, obstacles or first.cost.obstacles
 
 
 def random_cost(horizon: str, obstacles: str) -> Cost:

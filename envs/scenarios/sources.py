@@ -13,12 +13,19 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from leapnav.envs.robots import RobotModel, Unicycle
+from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, has_moving_obstacles, sample_scenario
+from leapnav.envs.scenarios.families import (
+    ALL,
+    CustomFamily,
+    find_family,
+    has_moving_obstacles,
+    sample_scenario,
+    task_of,
+)
 from leapnav.envs.scenarios.faults import ScenarioError
-from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS, Disturbance, Motor
+from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import Disturbance, Motor
 from leapnav.envs.utils.validation import check_choice, is_integer
 
 if TYPE_CHECKING:
@@ -117,13 +124,9 @@ class ScenarioSource:
             self.family = self.bank.family
             if len(self.bank) == 0:
                 raise ValueError(f"bank: expected at least one scenario, {self.bank.path} has none")
-        chosen = Unicycle() if robot is None else check_robot(robot)
-        if horizon is not None:
-            check_choice("horizon", horizon, HORIZONS)
-        if obstacles is not None:
-            check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+        chosen, *new_kinds = task_of(known_family, robot, horizon, obstacles)
         if self.bank is None and scenario is None and split != "fresh" and family != ALL and self._custom is None:
-            self.bank = _shipped_bank(family, split, chosen, horizon or "fixed", obstacles or "cost")
+            self.bank = _shipped_bank(family, split, chosen, *new_kinds)
         given_by = (
             self.scenario.robot if self.scenario is not None else self.bank.robot if self.bank is not None else None
         )
@@ -142,7 +145,7 @@ class ScenarioSource:
             for name, kind, known in zip(("horizon", "obstacles"), (horizon, obstacles), kinds, strict=True):
                 if kind not in (None, known):
                     raise ValueError(f"{name}: expected that of the {place}, {known!r}, got {kind!r}")
-        self.horizon, self.obstacles = kinds or (horizon or "fixed", obstacles or "cost")
+        self.horizon, self.obstacles = kinds or new_kinds
 
     @property
     def moves(self) -> bool:

@@ -19,12 +19,11 @@ import leapnav
 from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import VERSION, BankError, ScenarioBank, collection_name, digest
 from leapnav.envs.scenarios.bank_writing import BankEntry, point_times, write_bank
-from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario
+from leapnav.envs.scenarios.families import ALL, CustomFamily, find_family, sample_scenario, task_of
 from leapnav.envs.scenarios.files import PathLike, check_collection, read_scenarios
-from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario, check_robot
-from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
+from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
 from leapnav.envs.utils.progress import advance, progress_bar
-from leapnav.envs.utils.validation import check_at_least, check_choice
+from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.data.store import Arrays, Job, ResumableStore, discard
 from leapnav.experts.optimum import Optimum, find_optimum
 from leapnav.experts.pools import process_pool
@@ -148,9 +147,9 @@ def build_bank(
     count: int,
     out: str | os.PathLike[str],
     *,
-    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
-    horizon: str = "fixed",
-    obstacles: str = "cost",
+    robot: RobotModel | Mapping[str, Any] | str | None = None,
+    horizon: str | None = None,
+    obstacles: str | None = None,
     seed: int = 0,
     workers: int = 1,
     dask: str | None = None,
@@ -166,7 +165,8 @@ def build_bank(
         family: family of the scenarios.
         count: number of scenarios in the bank.
         out: file of the bank. A complete bank is returned unchanged.
-        robot: name of a robot model, a dict of its fields with `model`, or a robot.
+        robot: name of a robot model, a dict of its fields with `model`, or a robot; robot, horizon and obstacles that
+            are not given are as in `rollout`.
         horizon: "fixed" or "free", see `sample_scenario`. The time limit of a scenario with a free horizon is 3 times
             the duration of its optimum.
         obstacles: "cost" or "hard", see `sample_scenario`.
@@ -186,9 +186,7 @@ def build_bank(
     if family == ALL:
         raise ValueError(f"family: expected one family, got {family!r}")
     chosen = find_family(family)
-    body = check_robot(robot)
-    check_choice("horizon", horizon, HORIZONS)
-    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+    body, horizon, obstacles = task_of(chosen, robot, horizon, obstacles)
     check_at_least("count", count, 1)
     check_at_least("seed", seed, 0)
     draws = RandomDraws(chosen, seed, body, horizon, obstacles)

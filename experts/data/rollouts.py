@@ -19,13 +19,12 @@ import leapnav
 from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
-from leapnav.envs.scenarios.families import find_family, sample_scenario
-from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
+from leapnav.envs.scenarios.families import find_family, sample_scenario, task_of
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
-from leapnav.envs.utils.validation import check_at_least, check_choice
+from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.data.datasets import open_dataset
 from leapnav.experts.data.demonstrations import (
     Demonstration,
@@ -83,9 +82,9 @@ def rollout(
     count: int,
     out: str | os.PathLike[str],
     *,
-    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
-    horizon: str = "fixed",
-    obstacles: str = "cost",
+    robot: RobotModel | Mapping[str, Any] | str | None = None,
+    horizon: str | None = None,
+    obstacles: str | None = None,
     seed: int = 1000,
     recoveries: int = 0,
     noise: float = 0.0,
@@ -109,7 +108,8 @@ def rollout(
             obstacles))`.
         robot: name of a robot model, a dict of its fields with `model`, or a robot.
         horizon: "fixed" or "free", see `sample_scenario`.
-        obstacles: "cost" or "hard", see `sample_scenario`.
+        obstacles: "cost" or "hard", see `sample_scenario`. Robot, horizon and obstacles that are not given are those of
+            the stored scenarios if the family is a file, otherwise the unicycle, "fixed" and "cost".
         recoveries: number of additional demonstrations per scenario that start from perturbed states of the optimum.
         noise: standard deviation of the noise that is added to the executed actions, which are in [-1, 1]. The expert
             then acts in closed loop and the dataset contains its own actions, which show how to recover.
@@ -128,8 +128,7 @@ def rollout(
 
     """
     chosen = find_family(family)
-    check_choice("horizon", horizon, HORIZONS)
-    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+    body, horizon, obstacles = task_of(chosen, robot, horizon, obstacles)
     check_at_least("count", count, 1)
     check_at_least("recoveries", recoveries, 0)
     check_at_least("workers", workers, 1)
@@ -144,7 +143,6 @@ def rollout(
         "recoveries": recoveries,
         "noise": float(noise),
     }
-    body = check_robot(robot)
     if body != Unicycle():  # as before there were other robots
         settings["robot"] = body.model_dump(mode="json", exclude_none=True)
     if horizon != "fixed":

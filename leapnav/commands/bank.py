@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from leapnav.commands.options import Family, ParallelOptions, TaskOptions
+from leapnav.commands.options import Family, FamilyTaskOptions, ParallelOptions
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ RESUMPTION = "the same command resumes where it stopped"
 
 
 @dataclass(frozen=True)
-class Build(TaskOptions, ParallelOptions):
+class Build(FamilyTaskOptions, ParallelOptions):
     """Sample scenarios, or read them; find their optima; and write those with an unambiguous certificate to a bank.
 
     The same command resumes an interrupted build.

@@ -59,6 +59,23 @@ class TaskOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FamilyTaskOptions:
+    """Options of commands that make scenarios of a family, which may be the file of a bank."""
+
+    robot: Robot | None = None
+    """Model of the robot; by default that of the scenarios of a file, otherwise the unicycle."""
+    horizon: Horizon | None = None
+    """Fixed or free horizon; by default that of the scenarios of a file, otherwise fixed."""
+    obstacles: Obstacles | None = None
+    """Obstacles with a proximity cost (default), or hard obstacles, which cost nothing."""
+
+    @property
+    def task(self) -> dict[str, str | None]:
+        """The options as arguments of functions."""
+        return {"robot": self.robot, "horizon": self.horizon, "obstacles": self.obstacles}
+
+
+@dataclass(frozen=True, kw_only=True)
 class ParallelOptions:
     """Options of commands that use several processes."""
 

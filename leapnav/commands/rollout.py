@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from leapnav.commands.options import FamilyOrAll, ParallelOptions, PolicyName, TaskOptions
+from leapnav.commands.options import FamilyOrAll, FamilyTaskOptions, ParallelOptions, PolicyName
 from leapnav.outputs import FAILED, check_outputs, write_json
 
 # Maximum deviation of a replay: other versions of the libraries may round the last digits differently.
@@ -16,7 +16,7 @@ REPLAY_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class Rollout(TaskOptions, ParallelOptions):
+class Rollout(FamilyTaskOptions, ParallelOptions):
     """Sample scenarios, find their optima, execute them in the environment, and write a Minari dataset.
 
     The same command resumes an interrupted rollout. With --policy, the episodes of policies are recorded instead, for
@@ -53,6 +53,7 @@ class Rollout(TaskOptions, ParallelOptions):
             return self._record()
         if self.name is not None:
             raise ValueError(f"name: expected --policy with it, got only {self.name!r}")
+        from leapnav.envs.scenarios.families import task_of
         from leapnav.experts.data.datasets import dataset_id
         from leapnav.experts.data.rollouts import rollout
 
@@ -72,7 +73,8 @@ class Rollout(TaskOptions, ParallelOptions):
             f"({summary.unsolved} scenarios without a certified optimum and "
             f"{summary.failed_replays} failed replays left out)"
         )
-        name = dataset_id(self.family, **self.task)
+        robot, *kinds = task_of(self.family, **self.task)
+        name = dataset_id(self.family, robot.model, *kinds)
         print(f"load it with minari.load_dataset({name!r}) and MINARI_DATASETS_PATH={self.out}")
         write_json(asdict(summary), self.json)
         return 0

@@ -70,7 +70,7 @@ def _check_levels(config: PPOConfig) -> None:
         if config.level_bank is not None:
             raise ValueError(f"level_bank: expected none with levels='fresh', got {str(config.level_bank)!r}")
         return
-    included = ScenarioBank.shipped_families(config.robot, config.horizon, config.obstacles, "train")
+    included = ScenarioBank.shipped_families(**config.task, split="train")
     if config.level_bank is None and config.family not in included:
         raise ValueError(f"level_bank: expected a bank for levels={config.levels!r} of {config.family!r}, got none")
 

@@ -113,7 +113,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
         policy,
         config.family,
         replace(config.dagger, seed=config.seed),
-        environment={**config.environment, "obstacles": config.obstacles},
+        environment={**config.environment, "obstacles": config.task["obstacles"]},
         robots=config.n_envs,
         cloning=replace(config.cloning, seed=config.seed),
         dataset=dataset,
@@ -156,9 +156,8 @@ def _demonstrations(run: Run, count: int, workers: int, progress: bool) -> Datas
     if not any(folder.glob("**/metadata.json")):
         # The scenarios depend on the seed of the run.
         seed = environment_seed(run.config.seed, DEMONSTRATION_STREAM)
-        config = run.config
-        task: dict[str, Any] = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
-        rollout(config.family, count, folder, **task, seed=seed, workers=workers, progress=progress)
+        options: dict[str, Any] = {"seed": seed, "workers": workers, "progress": progress}
+        rollout(run.config.family, count, folder, **run.config.task, **options)
     return Dataset.of(folder)
 
 

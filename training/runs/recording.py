@@ -17,11 +17,10 @@ from minari.data_collector import EpisodeBuffer
 
 from leapnav.envs.episodes import Act, act_with, play_episode
 from leapnav.envs.robots import RobotModel
-from leapnav.envs.scenarios.families import find_family, sample_scenario
-from leapnav.envs.scenarios.scenario import Scenario, check_robot
-from leapnav.envs.settings import HORIZONS, OBSTACLE_KINDS
+from leapnav.envs.scenarios.families import find_family, sample_scenario, task_of
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.progress import progress_bar
-from leapnav.envs.utils.validation import check_at_least, check_choice
+from leapnav.envs.utils.validation import check_at_least
 from leapnav.experts.data.datasets import Task, dataset_id, write_episodes
 from leapnav.experts.data.demonstrations import state_of
 from leapnav.experts.data.rollouts import MIN_SEED
@@ -63,9 +62,9 @@ def record(
     out: str | os.PathLike[str],
     *,
     name: str | None = None,
-    robot: RobotModel | Mapping[str, Any] | str = "unicycle",
-    horizon: str = "fixed",
-    obstacles: str = "cost",
+    robot: RobotModel | Mapping[str, Any] | str | None = None,
+    horizon: str | None = None,
+    obstacles: str | None = None,
     environment: Mapping[str, Any] | None = None,
     seed: int = 1000,
     noise: float = 0.0,
@@ -104,9 +103,8 @@ def record(
     names = [policies] if isinstance(policies, str) else list(policies)
     if not names:
         raise ValueError("policies: expected at least one, got none")
-    chosen, body = find_family(family), check_robot(robot)
-    check_choice("horizon", horizon, HORIZONS)
-    check_choice("obstacles", obstacles, OBSTACLE_KINDS)
+    chosen = find_family(family)
+    body, horizon, obstacles = task_of(chosen, robot, horizon, obstacles)
     check_at_least("count", count, 1)
     check_at_least("seed", seed, MIN_SEED)
     check_at_least("noise", noise, 0.0)

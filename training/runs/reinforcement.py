@@ -245,10 +245,10 @@ def _scenarios(config: Config) -> dict[str, Any]:
         bank = ScenarioBank(config.level_bank)
         kinds = ("robot", bank.robot.model), ("horizon", bank.horizon), ("obstacles", bank.obstacles)
         for name, found in kinds:
-            if found != getattr(config, name):
-                raise ValueError(f"level_bank: {name}: expected {getattr(config, name)!r}, got {found!r}")
+            if found != config.task[name]:
+                raise ValueError(f"level_bank: {name}: expected {config.task[name]!r}, got {found!r}")
     else:
-        bank = ScenarioBank.shipped(config.family, "train", config.robot, config.horizon, config.obstacles)
+        bank = ScenarioBank.shipped(config.family, "train", **config.task)
     sampler = UniformSampler(bank) if config.levels == "uniform" else PrioritizedSampler(bank, config.levels)
     return {"bank": bank, "sampler": sampler}
 

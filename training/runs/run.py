@@ -19,13 +19,14 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import families_of
+from leapnav.envs.scenarios.families import BANK_ENDING, families_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
 from leapnav.training.config import RunConfig
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
+from leapnav.training.scoring.comparison import own_bank
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.results import Evaluation
 
@@ -142,12 +143,13 @@ class Run:
         return evaluations
 
     def _bank(self, family: str, split: str) -> ScenarioBank:
-        """Return the included bank of a family, or one that is built in the run directory if there is none."""
-        config = self.config
-        task: dict[str, Any] = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
+        """Return the included bank of a family, the family if it is a bank, or one built in the run directory."""
+        task: dict[str, Any] = self.config.task
+        if family.endswith(BANK_ENDING):
+            return ScenarioBank(family)
         if family in ScenarioBank.shipped_families(**task, split=split):
             return ScenarioBank.shipped(family, split, **task)
-        path, seed = config.own_bank(self.folder, family, split), BANK_SEEDS[split]
+        path, seed = own_bank(self.config, self.folder, family, split), BANK_SEEDS[split]
         return build_bank(family, BANK_COUNT, path, **task, seed=seed, progress=False)
 
     def _write_evaluations(self) -> None:

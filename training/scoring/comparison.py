@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import FAMILIES, check_family, families_of
-from leapnav.training.config import read_config
+from leapnav.envs.scenarios.families import BANK_ENDING, FAMILIES, check_family, families_of
+from leapnav.training.config import RunConfig, read_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.results import Evaluation, bank_identity
@@ -217,21 +217,31 @@ def default_banks(
         check_family(family)
     chosen = [family] if family is not None else [config.family for config in configs.values()] or ["clutter"]
     families = {name for one in chosen for name in families_of(one)}
-    kinds = {obstacles} if obstacles is not None else {config.obstacles for config in configs.values()} or {"cost"}
+    of_runs = {config.task["obstacles"] for config in configs.values()}
+    kinds = of_runs or {"cost"} if obstacles is None else {obstacles}
     included, own = [], {}  # those of the runs by their identity: runs can have the same bank, or several of a family
     for name in sorted(families, key=lambda name: (*FAMILIES, name).index(name)):
+        if name.endswith(BANK_ENDING):
+            bank = ScenarioBank(name)
+            own[bank_identity(bank)] = bank
+            continue
         for kind in sorted(kinds):
             found = [
                 ScenarioBank(path)
                 for folder, config in configs.items()
-                if config.obstacles == kind and split == "test"
-                if name not in ScenarioBank.shipped_families(config.robot, config.horizon, kind)
-                if (path := config.own_bank(folder, name)).exists()
+                if config.task["obstacles"] == kind and split == "test"
+                if name not in ScenarioBank.shipped_families(**config.task)
+                if (path := own_bank(config, folder, name)).exists()
             ]
             own |= {bank_identity(bank): bank for bank in found}
             if not found:
                 included += included_banks(specs, [name], split, robot, horizon, obstacles=kind)
     return [*included, *own.values()]
+
+
+def own_bank(config: RunConfig, folder: Path, family: str, split: str = "test") -> Path:
+    """Return the file of the bank that the run in a directory builds for a family without an included one."""
+    return folder / (f"{split}.bank" if family == config.family else f"{split}-{family}.bank")
 
 
 def _common(name: str, values: Sequence[str | None], given: str | None) -> str | None:
