@@ -33,7 +33,7 @@ class Evaluate(ParallelOptions):
 
     policies: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="POLICY...", help=POLICIES)]
     family: FamilyOrAll | None = None
-    """Family of the scenarios; by default those of the training runs, or clutter without any."""
+    """Family of the scenarios; by default those for which the policies were trained, or clutter without any."""
     robot: Robot | None = None
     """Model of the robot of the included banks; by default that of the policies."""
     horizon: Horizon | None = None

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import PPO
 
+from leapnav.cli import main
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training import Dataset, load_policy, make_policy, shipped_policies
 from leapnav.training.config import (
@@ -107,6 +109,34 @@ def test_what_is_finished_is_not_trained_again(tmp_path):
     assert weights(config.out) == before
     assert [line["step"] for line in lines(config.out)] == [line["step"] for line in evaluated]
     assert len(events) == 1
+
+
+def test_a_finished_run_is_extended_with_more_steps_and_another_learning_rate(tmp_path, capsys):
+    config = ppo(tmp_path / "run", total_timesteps=256)
+    train_ppo(config, progress=False)
+    before = weights(config.out)
+    words = ["--total-timesteps", "1024", "--learning-rate", "0.0001"]
+    assert main(["train", "ppo", "--out", str(config.out), "--resume", *words]) == 0
+    assert [line["step"] for line in lines(config.out) if line["final"]][-1] == 1024
+    assert weights(config.out) != before
+    record = json.loads((config.out / "config.json").read_text())
+    assert record["config"]["total_timesteps"] == 1024 and record["config"]["learning_rate"] == 1e-4
+    assert record["changes"][0]["before"] == {"total_timesteps": 256, "learning_rate": config.learning_rate}
+    rate = PPO.load(config.out / "checkpoint" / "model.zip", device="cpu").learning_rate
+    assert rate(1.0) == 1e-4
+    capsys.readouterr()
+    assert main(["train", "ppo", "--out", str(config.out), "--resume", "--total-timesteps", "300"]) == 2
+    assert "total_timesteps: expected at least 1024" in capsys.readouterr().err
+    assert main(["train", "ppo", "--out", str(config.out), "--resume", "--seed", "7"]) == 2
+    assert "apart from total_timesteps and learning_rate" in capsys.readouterr().err
+
+
+def test_without_a_family_policies_are_evaluated_in_their_own():
+    def families(*names):
+        return [bank.family for bank in default_banks([load_policy_spec(name) for name in names])]
+
+    assert families("crossing", "expert") == ["crossing"] and families("expert") == ["clutter"]
+    assert families("rooms", "open") == ["open", "rooms"] and len(families("all")) == 5
 
 
 def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):

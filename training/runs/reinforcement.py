@@ -293,7 +293,8 @@ def _load_model(kind: Any, folder: Path, venv: VecEnv, dataset: Dataset | None, 
     """Load the model of a checkpoint."""
     buffer = folder / "replay_buffer.pkl"
     arguments = _buffer_arguments(config, dataset) if isinstance(config, SACConfig) else {}
-    model = kind.load(folder / "model.zip", env=venv, device="cpu", **arguments)
+    schedule = LinearSchedule(config.learning_rate, 0.0, 1.0)  # of an extended run, it may be another one
+    model = kind.load(folder / "model.zip", env=venv, device="cpu", learning_rate=schedule, **arguments)
     if buffer.exists():
         model.load_replay_buffer(buffer)
         if isinstance(model.replay_buffer, DemonstrationReplayBuffer):

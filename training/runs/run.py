@@ -36,6 +36,8 @@ BANK_COUNT, BANK_SEEDS = 100, {"train": 0, "test": 1}
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
+# Settings by which a resumed run is extended; `config.json` records the changes.
+EXTENSIONS = ("total_timesteps", "learning_rate")
 MEASURES = ("success", "collision", "soc", "regret", "reached_regret")  # of an evaluation, for each family
 
 
@@ -44,7 +46,7 @@ class Run:
 
     | File | Content |
     |---|---|
-    | `config.json` | algorithm, configuration, versions of the libraries |
+    | `config.json` | algorithm, configuration, versions of the libraries, earlier values of changed settings |
     | `policy.json`, `weights.pt` | the policy of the last evaluation, see `load_policy` |
     | `evaluations.jsonl` | one line per evaluation: step, seconds, split; the `MEASURES` per family |
     | `tensorboard/` | logs |
@@ -96,22 +98,33 @@ class Run:
         return self._seconds_before + time.monotonic() - self._started
 
     def _check_settings(self, path: Path) -> None:
-        """Check that the stored configuration is that of this run."""
+        """Check that the stored configuration is that of this run, apart from `EXTENSIONS`, which are recorded."""
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such run to resume")
         try:
-            stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
+            record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            stored: dict[str, Any] = record["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
-        for name in sorted({*stored, *self._settings} - set(FREE_SETTINGS)):
-            if stored.get(name) != self._settings.get(name):
+        names = sorted({*stored, *self._settings} - set(FREE_SETTINGS))
+        changed = [name for name in names if stored.get(name) != self._settings.get(name)]
+        for name in changed:
+            old, new = stored.get(name), self._settings.get(name)
+            if name not in EXTENSIONS:
                 raise ValueError(
-                    f"{name}: the run in {self.folder} has {stored.get(name)!r}, got {self._settings.get(name)!r}; "
-                    "resume a run with its own configuration"
+                    f"{name}: the run in {self.folder} has {old!r}, got {new!r}; resume a run with its own "
+                    f"configuration, apart from {' and '.join(EXTENSIONS)}"
                 )
+            if name == "total_timesteps" and (old is None or new is None or new < old):
+                raise ValueError(f"{name}: expected at least {old!r}, those of the run in {self.folder}, got {new!r}")
+        if changed:
+            before = {name: stored.get(name) for name in changed}
+            record["changes"] = [*record.get("changes", []), {"before": before, "date": _now()}]
+            record["config"] = self._settings
+            write_text(path, encode(record, indent=1) + "\n")
 
     def evaluate(self, policy: PolicyOrFactory, step: int, *, final: bool = False) -> list[Evaluation]:
         """Evaluate a policy on the training splits of the run's families, at the end on the test splits; record it.
@@ -226,5 +239,9 @@ def _versions() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: version(name) for name in LIBRARIES},
         "threads": str(th.get_num_threads()),
-        "begun": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "begun": _now(),
     }
+
+
+def _now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="seconds")

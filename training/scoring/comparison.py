@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import BANK_ENDING, FAMILIES, check_family, families_of
+from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of
 from leapnav.training.config import RunConfig, read_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
@@ -203,7 +203,7 @@ def default_banks(
 
     Args:
         specs: the policies.
-        family: a family, or "all"; None: those of the training runs, or "clutter" without any.
+        family: a family, or "all"; None: those for which the policies were trained, or "clutter" without any.
         split: "train" or "test"; training runs have a test bank only.
         robot, horizon: see `included_banks`.
         obstacles: "cost" or "hard"; None: those of the training runs, or "cost" without any.
@@ -215,7 +215,9 @@ def default_banks(
     configs = {spec.run: read_config(spec.run)[1] for spec in specs if spec.run is not None}
     if family is not None:
         check_family(family)
-    chosen = [family] if family is not None else [config.family for config in configs.values()] or ["clutter"]
+    trained = [config.family for config in configs.values()]
+    trained += [spec.family for spec in specs if spec.run is None and spec.family in (*FAMILIES, ALL)]
+    chosen = [family] if family is not None else trained or ["clutter"]
     families = {name for one in chosen for name in families_of(one)}
     of_runs = {config.task["obstacles"] for config in configs.values()}
     kinds = of_runs or {"cost"} if obstacles is None else {obstacles}

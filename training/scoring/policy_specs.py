@@ -33,6 +33,7 @@ class PolicySpec:
         environment: arguments of the environment that determine the policy's observations.
         is_baseline: whether the policy drives any robot.
         run: directory of the training run; None for other policies.
+        family: family of the scenarios of the training; None if it is unknown.
 
     """
 
@@ -43,6 +44,7 @@ class PolicySpec:
     environment: Mapping[str, Any]
     is_baseline: bool = False
     run: Path | None = None
+    family: str | None = None
 
     @property
     def robot(self) -> str | None:
@@ -90,7 +92,8 @@ def load_policy_spec(
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
     method = json.dumps(training, sort_keys=True) if training else None
     run = Path(place) if (Path(place) / "config.json").is_file() else None
-    return PolicySpec(place, label, method, policy, policy_environment(place), run=run)
+    family = description["training"].get("family")
+    return PolicySpec(place, label, method, policy, policy_environment(place), run=run, family=family)
 
 
 def group_by_row(specs: Sequence[PolicySpec]) -> dict[str, list[PolicySpec]]:
