@@ -54,6 +54,9 @@ class Evaluate(ParallelOptions):
     from its observation space, for a lidar."""
     trust: bool = False
     """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
+    vecnormalize: Path | None = None
+    """File of the statistics of VecNormalize with which the models of Stable-Baselines3 were trained; a pickle file, so
+    that it needs --trust."""
     json: Path | None = None
     """JSON file of the table and of every episode; "-" for standard output."""
     html: Path | None = None
@@ -83,9 +86,8 @@ class Evaluate(ParallelOptions):
             check_outputs(self.json, plot, page=self.html)
         # All are loaded before the first episode, so that a damaged file is reported at once.
         environment = parse_environment(self.env)
-        specs = [
-            load_policy_spec(name, seed=self.seed, environment=environment, trust=self.trust) for name in self.policies
-        ]
+        options = {"environment": environment, "trust": self.trust, "vecnormalize": self.vecnormalize}
+        specs = [load_policy_spec(name, seed=self.seed, **options) for name in self.policies]
         if self.bank is not None:
             banks = [ScenarioBank(self.bank)]
         else:

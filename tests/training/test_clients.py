@@ -15,10 +15,12 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RescaleAction as RescaleActions
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from leapnav.cli import main
 from leapnav.envs import ScenarioBank
 from leapnav.experts import ExpertPolicy, rollout
 from leapnav.training import CloningConfig, Dataset, behaviour_clone, evaluate, network
 from leapnav.training.policies.zips import load_zip
+from leapnav.training.scoring.policy_specs import load_policy_spec
 
 ID = "leapnav/Navigate-v0"
 DOUBLE = np.float32(-2.0), np.float32(2.0)
@@ -169,3 +171,27 @@ def test_the_distance_from_the_goal_says_by_how_much_it_was_missed():
     assert episode.goal_distance == pytest.approx(np.hypot(last[0] - x, last[1] - y))
     assert episode.heading_error == pytest.approx(abs(np.remainder(last[2] - heading + np.pi, 2 * np.pi) - np.pi))
     assert episode.to_dict()["goal_distance"] == episode.goal_distance
+
+
+def test_statistics_of_vecnormalize_are_read_from_their_file(tmp_path, capsys):
+    """The score is that of the model in memory; without the file it is another one, with a warning."""
+    venv = VecNormalize(DummyVecEnv([open_env]))
+    model = sb3.PPO("MlpPolicy", venv, n_steps=64, batch_size=64, seed=0, device="cpu").learn(256)
+    model.save(tmp_path / "model.zip")
+    venv.save(tmp_path / "vecnormalize.pkl")
+    expected = evaluate(model, "open", count=3, timed=False, progress=False)
+    spec = load_policy_spec(str(tmp_path / "model.zip"), trust=True, vecnormalize=tmp_path / "vecnormalize.pkl")
+    found = evaluate(spec.policy, "open", count=3, timed=False, progress=False)
+    assert [episode.cost for episode in found] == [episode.cost for episode in expected]
+    with pytest.warns(UserWarning, match=r"vecnormalize\.pkl may contain statistics of VecNormalize"):
+        spec = load_policy_spec(str(tmp_path / "model.zip"))
+    other = evaluate(spec.policy, "open", count=3, timed=False, progress=False)
+    assert [episode.cost for episode in other] != [episode.cost for episode in expected]
+    words = ["evaluate", str(tmp_path / "model.zip"), "--family", "open", "--count", "2", "--workers", "1"]
+    words += ["--vecnormalize", str(tmp_path / "vecnormalize.pkl")]
+    assert main(words) == 2
+    assert "is a pickle file, which can execute code" in capsys.readouterr().err
+    assert main([*words, "--trust"]) == 0
+    (tmp_path / "vecnormalize.pkl").write_bytes(b"text")
+    assert main([*words, "--trust"]) == 2
+    assert "not a file of VecNormalize" in capsys.readouterr().err

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import pickle
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import VecNormalize
 
 from leapnav.training.policies.actors import action_range
 
@@ -68,6 +71,61 @@ def adapted(policy: Any) -> Any:
     """Return a policy with the interface of an evaluation: the policy itself, or an `AdaptedPolicy`."""
     adapter = AdaptedPolicy(policy)
     return policy if adapter.changes_nothing else adapter
+
+
+class NormalizedPolicy:
+    """A policy with the statistics of `VecNormalize`, by which an evaluation normalises its observations.
+
+    Args:
+        policy: the policy.
+        statistics: the `VecNormalize`, which needs no environment.
+
+    """
+
+    def __init__(self, policy: Any, statistics: VecNormalize) -> None:
+        self._policy, self._statistics = policy, statistics
+        self.observation_space, self.action_space = policy.observation_space, policy.action_space
+
+    def get_vec_normalize_env(self) -> VecNormalize:
+        """Return the statistics, as do models of Stable-Baselines3."""
+        return self._statistics
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions for normalised observations."""
+        return self._policy.predict(observation, state, episode_start, deterministic)
+
+
+def read_statistics(path: str | Path) -> VecNormalize:
+    """Read a file of `VecNormalize.save`. It is a pickle file: reading it can execute code.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it contains something else.
+
+    """
+    try:
+        statistics = pickle.loads(Path(path).read_bytes())
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # pickle raises many types of errors for a damaged file
+        raise ValueError(f"{path}: not a file of VecNormalize: {error!r}") from None
+    if not isinstance(statistics, VecNormalize):
+        raise ValueError(f"{path}: expected a file of VecNormalize, got {type(statistics).__name__}")
+    return statistics
+
+
+def statistics_beside(model: str | Path) -> Path | None:
+    """Return the file of statistics beside a model, where RL Zoo and `VecNormalize.save` commonly put it."""
+    path = Path(model)
+    names = [path.with_suffix("") / "vecnormalize.pkl"]
+    names += [path.parent / name for name in ("vecnormalize.pkl", "vec_normalize.pkl", f"{path.stem}_vecnormalize.pkl")]
+    return next((file for file in names if file.is_file()), None)
 
 
 def _statistics_of(policy: Any) -> Any:

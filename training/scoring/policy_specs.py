@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +19,7 @@ from leapnav.training.policies.files import BASELINES as BASELINES
 from leapnav.training.policies.files import load_policy, policy_environment, read_description
 from leapnav.training.policies.planners import PLANNERS, PlannerPolicy
 from leapnav.training.policies.zips import is_zip, load_zip
+from leapnav.training.scoring.adapters import NormalizedPolicy, read_statistics, statistics_beside
 from leapnav.training.scoring.evaluation import Policy, PolicyFactory, PolicyOrFactory
 
 
@@ -58,7 +60,12 @@ class PolicySpec:
 
 
 def load_policy_spec(
-    name: str, *, seed: int = 0, environment: Mapping[str, Any] | None = None, trust: bool = False
+    name: str,
+    *,
+    seed: int = 0,
+    environment: Mapping[str, Any] | None = None,
+    trust: bool = False,
+    vecnormalize: str | Path | None = None,
 ) -> PolicySpec:
     """Load a policy by its name.
 
@@ -69,6 +76,8 @@ def load_policy_spec(
         seed: random seed of the baselines "random" and "mppi".
         environment: arguments of the environment of a `.zip`, see `load_zip`.
         trust: load a `.zip` with Stable-Baselines3, which executes code from the file.
+        vecnormalize: file of the statistics of `VecNormalize` with which the model of a `.zip` was trained; a pickle
+            file, so that it needs `trust`.
 
     Raises:
         FileNotFoundError: there is no such policy.
@@ -86,6 +95,19 @@ def load_policy_spec(
         return PolicySpec(place, label, None, factories[place], {}, is_baseline=True)
     if is_zip(place):
         model, arguments = load_zip(place, environment, trust=trust)
+        beside = statistics_beside(place)
+        if vecnormalize is not None:
+            if not trust:
+                raise ValueError(
+                    f"vecnormalize: {vecnormalize} is a pickle file, which can execute code: it needs trust"
+                )
+            model = NormalizedPolicy(model, read_statistics(vecnormalize))
+        elif beside is not None:
+            warnings.warn(
+                f"{place}: {beside} may contain statistics of VecNormalize, without which the scores are wrong; pass "
+                "vecnormalize (--vecnormalize) if the model was trained with them",
+                stacklevel=2,
+            )
         return PolicySpec(place, label, None, model, arguments)
     policy, description = load_policy(place), read_description(place)
     # The method is the configuration of the run without the seed and the directory.
