@@ -141,6 +141,7 @@ def test_the_optimum_of_a_car_respects_the_limit_of_its_speed():
     assert np.abs(controls[:, 0]).max() <= 2.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_optima_respect_the_limits_of_states():
     scenario = task(LIMITED, horizon=None, cost={"time_weight": 1.0})
     assert json.loads(scenario.to_json())["robot"].keys() >= {"max_speed", "turn_rate"}

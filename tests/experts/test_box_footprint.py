@@ -48,6 +48,7 @@ def touches(scenario, states):
     return any(overlap(corners_of(scenario.outline[0], q), polygon) for q in states for polygon in vertices)
 
 
+@pytest.mark.slow
 def test_a_rectangle_passes_a_gap_that_is_hardly_wider():
     scenario = wall_with_gap(0.26, (1.5, 2.0, 0.0), (4.5, 2.0, 0.0))
     optimum = find_optimum(scenario)

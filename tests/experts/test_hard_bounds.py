@@ -13,7 +13,8 @@ from leapnav.experts.proofs.proof import ProofError
 
 
 @pytest.mark.parametrize(
-    ("weight", "horizon", "gap"), [(0.0, 6.5, 0.1), (0.0, None, 0.1), (0.01, None, 0.1), (0.01, 6.5, 0.1)]
+    ("weight", "horizon", "gap"),
+    [(0.0, 6.5, 0.1), (0.0, None, 0.1), (0.01, None, 0.1), pytest.param(0.01, 6.5, 0.1, marks=pytest.mark.slow)],
 )
 def test_obstacles_may_cost_nothing_or_little(weight: float, horizon: float | None, gap: float):
     """With the proximity weight 0 only the collision-free paths count; their cost excludes the barrier."""

@@ -24,7 +24,9 @@ def state_defect(problem, times, nodes):
 @pytest.mark.parametrize("polish", [True, False])
 @pytest.mark.parametrize("order", ["sequential", "red_black"])
 @pytest.mark.parametrize("update", ["mean_time", "half_cost"])
-@pytest.mark.parametrize("name", ["clutter-0", "clutter-3", "clutter-9", "polygons-9"])
+@pytest.mark.parametrize(
+    "name", ["clutter-3", "polygons-9", *(pytest.param(f"clutter-{k}", marks=pytest.mark.slow) for k in (0, 9))]
+)
 def test_every_path_of_leapfrog_is_feasible_and_its_cost_never_rises(name, update, order, polish):
     scenario, _ = SCENARIOS[name]
     extremal = solve(scenario, method="leapfrog", update=update, order=order, polish=polish)

@@ -102,6 +102,7 @@ def test_a_closed_passage_has_no_path():
     assert error.value.extremal.status is Status.NO_PATH
 
 
+@pytest.mark.slow
 def test_the_length_of_a_box_is_close_to_its_lower_bound():
     scenario = among(Circle(center=(3, 2.1), radius=0.5), robot=Unicycle(footprint=Box(length=0.5, width=0.3)))
     found = minimum_length(scenario, 5e-3)

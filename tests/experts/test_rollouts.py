@@ -55,6 +55,7 @@ def whole(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_a_killed_and_resumed_rollout_gives_the_same_dataset(whole, tmp_path):
     out = tmp_path / "out"
     arguments = ["rollout", "--family", "open", "--count", "40", "--seed", "3", "--recoveries", "1", "--workers", "1"]

@@ -101,6 +101,7 @@ def test_the_proximity_cost_of_a_rectangle_in_the_transcription_is_that_of_the_k
             )
 
 
+@pytest.mark.slow
 def test_ipopt_finds_the_same_optimum_by_other_means(scenario):
     pytest.importorskip("casadi")
     from leapnav.experts.ipopt import Transcription

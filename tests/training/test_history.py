@@ -165,7 +165,7 @@ def test_an_observer_is_copied_to_other_processes_without_its_arrays():
     np.testing.assert_array_equal(pickle.loads(stored).observe(*arguments), observer.observe(*arguments))
 
 
-@pytest.mark.parametrize("algorithm", [PPO, SAC])
+@pytest.mark.parametrize("algorithm", [PPO, pytest.param(SAC, marks=pytest.mark.slow)])
 def test_learners_with_a_history_are_warm_started_trained_saved_and_exported(algorithm, dataset, tmp_path):
     venv = make_vec_env(n_envs=2, family="open", split="fresh", **HISTORY)
     steps = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 150}

@@ -47,6 +47,7 @@ def test_the_settings_of_a_run_follow_the_bank(bank, tmp_path):
     assert BCConfig(out=tmp_path).task == {"robot": "unicycle", "horizon": "fixed", "obstacles": "cost"}
 
 
+@pytest.mark.usefixtures("coarse_decisions")
 def test_rollout_training_evaluation_and_report_need_no_robot(bank, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["rollout", "--family", bank, "--count", "4", "--out", "demos", "--workers", "1"]) == 0
