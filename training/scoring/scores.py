@@ -155,9 +155,9 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
     def interval(attribute: Callable[..., float], statistic: Statistic = _mean) -> Interval:
         return _interval(values_of(attribute), banks, statistic, rng)
 
-    def weighted(attribute: Callable[..., float]) -> Interval:
+    def weighted(attribute: Callable[..., float], *, partly: bool = False) -> Interval:
         values = values_of(attribute)
-        if np.isnan(values).any():
+        if np.isnan(values).any() and not partly:
             return Interval(math.nan, math.nan, math.nan, (math.nan,) * len(values))
         if set(values.flat) in ({0.0}, {1.0}):
             return _rate(values, banks)
@@ -172,7 +172,7 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
         soc=weighted(lambda e: e.soc),
         soc_iqm=_within_unit(interval(lambda e: e.soc, _interquartile_mean)),
         regret=interval(lambda e: e.regret, _median),
-        reached_soc=_within_unit(interval(lambda e: e.reached_soc)),
+        reached_soc=weighted(lambda e: e.reached_soc, partly=True),
         reached_regret=interval(lambda e: e.reached_regret, _median),
         unknown=sum(e.success and math.isnan(e.reached_reference) for evaluation in evaluations for e in evaluation),
         clearance=interval(lambda e: e.clearance, _median),
