@@ -433,7 +433,7 @@ def read_config(run: Path) -> tuple[str, RunConfig]:
     """
     from pydantic import TypeAdapter, ValidationError
 
-    path = run / "config.json" if run.is_dir() else run
+    path = run if run.is_file() else run / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run in this directory")
     try:
