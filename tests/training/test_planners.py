@@ -8,7 +8,7 @@ from gymnasium.wrappers import RescaleAction
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, Obstacle, Scenario, ScenarioBank
 from leapnav.envs.shapes import Circle
 from leapnav.training import PlannerPolicy, PolicyFactory, evaluate
-from leapnav.training.policies.planners import PLANNERS, Geodesics, PathIntegral, arcs
+from leapnav.training.policies.planners import PLANNERS, Geodesics, arcs
 
 POLICIES = {name: PolicyFactory(lambda env, name=name: PlannerPolicy(env, name)) for name in PLANNERS}
 
@@ -87,7 +87,6 @@ def test_the_samples_of_mppi_depend_on_the_seed_alone():
     env.reset(seed=0)
     first, same, other = (PlannerPolicy(env, "mppi", seed).predict(None)[0] for seed in (1, 1, 2))
     assert (first == same).all() and (first != other).any()
-    assert PathIntegral.SAMPLES > 100
 
 
 def test_other_robots_and_planners_are_refused():

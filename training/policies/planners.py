@@ -158,7 +158,7 @@ class DynamicWindow:
         self._times = np.linspace(0.0, self.LOOKAHEAD, self.POINTS + 1)[1:]
 
     def control(self, pose: np.ndarray, time: float) -> np.ndarray:
-        """Return the control of the best arc without contact; none is: turn towards the goal."""
+        """Return the control of the best arc without contact; if all touch something, of the one least deep in it."""
         scenario = self._scenario
         goal_x, goal_y, heading = scenario.goal
         if math.hypot(goal_x - pose[0], goal_y - pose[1]) < self.ARRIVED:
