@@ -19,7 +19,7 @@ N_POSITIONS = 6  # of a moving obstacle, evenly spaced in time
 
 
 def draw_scenario(axes: Axes, scenario: Scenario, time: float | None = None) -> None:
-    """Draw arena, obstacles, start and goal to scale, in metres.
+    """Draw arena, obstacles, start and goal in metres, with a bar that shows the scale.
 
     Args:
         axes: where to draw.
@@ -40,12 +40,23 @@ def draw_scenario(axes: Axes, scenario: Scenario, time: float | None = None) -> 
     axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=WALL, linewidth=1.5))
     for state, color in ((scenario.start_state, START), (scenario.goal_state, GOAL)):
         draw_robot(axes, state, scenario.outline, color)
-    margin = 0.02 * (x_max - x_min)
-    axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - margin, y_max + margin), aspect="equal")
+    width = x_max - x_min
+    margin, length = 0.02 * width, _round_length(width / 8)
+    # A bar with its length, below the arena
+    axes.plot([x_min, x_min + length], [y_min - 0.04 * width] * 2, color=WALL, linewidth=2.5, solid_capstyle="butt")
+    label = {"fontsize": "x-small", "color": WALL, "verticalalignment": "center"}
+    axes.text(x_min + length + margin, y_min - 0.04 * width, f"{length:g} m", **label)
+    axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - 0.07 * width, y_max + margin), aspect="equal")
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_visible(False)
+
+
+def _round_length(least: float) -> float:
+    """Return the smallest of the lengths 1, 2 and 5 times a power of ten that is at least a given one."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return power * next(factor for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least)
 
 
 def draw_robot(axes: Axes, state: Sequence[float | None], outline: np.ndarray, color: str, **style: Any) -> None:
