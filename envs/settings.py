@@ -247,6 +247,19 @@ class EnvironmentSettings:
         return self.observation in ("lidar", "geodesic")
 
     @property
+    def sensors(self) -> str:
+        """What is observed, in words, such as "lidar, 32 beams"."""
+        words = {
+            "lidar": f"lidar, {self.lidar_beams} beams",
+            "geodesic": f"lidar and geodesic distances, {self.lidar_beams} beams",
+            "map": f"map of {self.map_obstacles} obstacles",
+            "state": "goal and motion",
+        }
+        further = [("velocities of obstacles", self.velocities), ("last action", self.previous_action)]
+        ages = [f"observations of {', '.join(f'{age:g}' for age in self.history)} s before"] if self.history else []
+        return ", ".join([words[self.observation], *(text for text, given in further if given), *ages])
+
+    @property
     def free_horizon(self) -> bool:
         """Whether an episode ends when the robot reaches the goal, instead of after a fixed time."""
         return self.horizon == "free"

@@ -30,8 +30,10 @@ class TrainCommand:
 
     def run(self) -> int:
         """Train a policy and print its scores."""
-        for evaluation in self._train():
+        evaluations = self._train()
+        for evaluation in evaluations:
             print(_describe(evaluation))
+        print(f"observed: {evaluations[0].settings.sensors}")
         print(f"wrote {self.config.out} (next: leapnav evaluate {self.config.out} expert --html report.html)")
         return 0
 

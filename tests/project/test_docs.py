@@ -27,6 +27,7 @@ BLOCKS = [
     r"True \d\.\d+\n",
     r"(.*\n)*41 2 3\n",
     rf"(.*\n)*{RATE}\n",
+    r"",
     r"(.*\n)* expert +100\.0 +0\.0 +1\.000 (.*\n)*",
 ]
 # What the pages print; the blocks of a page build on each other.

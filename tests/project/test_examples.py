@@ -21,7 +21,7 @@ EXAMPLES = {
         "--total-timesteps 3000 --num-envs 16 --num-steps 64 --test-scenarios 5 --levels plr",
         rf"( +\d.*\n)+{SCORE}\n",
     ),
-    "ppo_from_scratch": ("--total-timesteps 1024 --count 3", rf"<Evaluation: .*{SCORE}.*>\n"),
+    "ppo_from_scratch": ("--total-timesteps 1024 --count 3", r"success \d+\.\d % in \d+ episodes\n"),
     "caves": ("--count 1", r"caves-0: certified, horizon .* s, J = \d+\.\d+\n"),
     "offline_rl": ("--episodes 10 --steps 50 --test-scenarios 5", rf"(.*\n)*{SCORE}\n"),
 }

@@ -39,6 +39,7 @@ from leapnav.training.scoring.reports import (
     plot_episodes,
     row_name,
     runs_cell,
+    sensors_of,
 )
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.scoring.scores import Score
@@ -92,7 +93,8 @@ def write_report(comparison: Comparison, path: str | os.PathLike[str], *, progre
         version=leapnav.__version__,
         date=datetime.now().astimezone().strftime("%Y-%m-%d"),
         episodes=scores[0].episodes,
-        families=families,
+        banks=[f"{bank.family}, {bank.path.name}" for bank in comparison.banks],
+        sensors=sensors_of(comparison),
         seeds=_seeds(scores),
         columns=[*_titles(COLUMNS), "unknown", "time ms"],
         rows=[

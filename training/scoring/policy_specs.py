@@ -92,7 +92,8 @@ def load_policy_spec(
             "go-to-goal": GoToGoal,
             **{name: PolicyFactory(partial(PlannerPolicy, planner=name, seed=seed)) for name in PLANNERS},
         }
-        return PolicySpec(place, label, None, factories[place], {}, is_baseline=True)
+        # A baseline reads the robot and the obstacles from the environment.
+        return PolicySpec(place, label, None, factories[place], {"observation": "state"}, is_baseline=True)
     if is_zip(place):
         model, arguments = load_zip(place, environment, trust=trust)
         beside = statistics_beside(place)

@@ -69,6 +69,8 @@ def print_scores(comparison: Comparison) -> None:
             (row_name(row), *(runs_cell(getattr(row, name), *form) for _, name, *form in columns)) for row in scores
         ]
         print_table(("policy", *(title for title, *_ in columns)), rows, title=RUNS_TITLE)
+    observed = [f"{sensors} ({', '.join(names)})" for sensors, names in sensors_of(comparison).items()]
+    print(f"Observed: {'; '.join(observed)}")
     if any(row.reached_regret.value < 0 for row in scores):
         print(NEGATIVE_REGRET)
     if any(row.true_regret.episodes for row in scores):
@@ -77,6 +79,15 @@ def print_scores(comparison: Comparison) -> None:
             print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
     if len(comparison.banks) > 1:
         _print_banks(comparison)
+
+
+def sensors_of(comparison: Comparison) -> dict[str, list[str]]:
+    """Return what policies observe, each with the names of the policies."""
+    found: dict[str, list[str]] = {}
+    for name, runs in comparison.runs.items():
+        for sensors in dict.fromkeys(run.settings.sensors for run in runs):
+            found.setdefault(sensors, []).append(name)
+    return found
 
 
 def _print_columns(
