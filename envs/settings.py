@@ -229,7 +229,7 @@ class EnvironmentSettings:
         for name in arguments:
             if name not in ARGUMENTS:
                 near = suggestion(name, ARGUMENTS)
-                raise TypeError(f"{type(env).__name__}: unexpected argument {name!r}{near}")
+                raise TypeError(f"{type(env).__name__}: got an unexpected keyword argument {name!r}{near}")
         given = dict(arguments)
         if given.get("observation") in WITH_VELOCITIES:
             given.setdefault("velocities", source.moves)

@@ -44,7 +44,7 @@ def draw_scenario(axes: Axes, scenario: Scenario, time: float | None = None) -> 
     margin, length = 0.02 * width, _round_length(width / 8)
     # A bar with its length, below the arena
     axes.plot([x_min, x_min + length], [y_min - 0.04 * width] * 2, color=WALL, linewidth=2.5, solid_capstyle="butt")
-    label = {"fontsize": "x-small", "color": WALL, "verticalalignment": "center"}
+    label: dict[str, Any] = {"fontsize": "x-small", "color": WALL, "verticalalignment": "center"}
     axes.text(x_min + length + margin, y_min - 0.04 * width, f"{length:g} m", **label)
     axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - 0.07 * width, y_max + margin), aspect="equal")
     axes.set_xticks([])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -91,7 +93,9 @@ class ParallelOptions:
 
 
 def parse_environment(words: Sequence[str]) -> dict[str, Any] | None:
-    """Return the arguments of an environment given as KEY=VALUE, with values in JSON or plain text; None without any.
+    """Return the arguments of an environment given as KEY=VALUE; None without any.
+
+    Values are literals of JSON or of Python, or plain text.
 
     Raises:
         ValueError: a word has no "=", or the argument is unknown.
@@ -108,8 +112,9 @@ def parse_environment(words: Sequence[str]) -> dict[str, Any] | None:
         if not equals:
             raise ValueError(f"env: expected KEY=VALUE, such as observation=map, got {word!r}")
         check_choice("env", name, [field.name for field in fields(EnvironmentSettings)])
-        try:
-            arguments[name] = json.loads(text)
-        except ValueError:
-            arguments[name] = text
+        arguments[name] = text
+        for parse in (json.loads, ast.literal_eval):
+            with suppress(ValueError, SyntaxError):
+                arguments[name] = parse(text)
+                break
     return arguments or None

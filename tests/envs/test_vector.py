@@ -256,7 +256,7 @@ def test_bad_arguments_are_named(call, message):
 
 
 def test_an_unknown_argument_is_named():
-    with pytest.raises(TypeError, match="NavigateVectorEnv: unexpected argument 'lidar'"):
+    with pytest.raises(TypeError, match="NavigateVectorEnv: got an unexpected keyword argument 'lidar'"):
         make(2, lidar=3)
 
 

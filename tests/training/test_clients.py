@@ -14,11 +14,21 @@ from gymnasium.wrappers import (
 )
 from gymnasium.wrappers.vector import RescaleAction as RescaleActions
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 
 from leapnav.cli import main
 from leapnav.envs import ScenarioBank
 from leapnav.experts import ExpertPolicy, rollout
-from leapnav.training import CloningConfig, Dataset, behaviour_clone, evaluate, network
+from leapnav.training import (
+    CloningConfig,
+    Dataset,
+    behaviour_clone,
+    evaluate,
+    load_policy,
+    network,
+    policy_environment,
+    save_policy,
+)
 from leapnav.training.policies.zips import load_zip
 from leapnav.training.scoring.policy_specs import load_policy_spec
 
@@ -195,3 +205,48 @@ def test_statistics_of_vecnormalize_are_read_from_their_file(tmp_path, capsys):
     (tmp_path / "vecnormalize.pkl").write_bytes(b"text")
     assert main([*words, "--trust"]) == 2
     assert "not a file of VecNormalize" in capsys.readouterr().err
+
+
+def test_unknown_arguments_are_named_in_python_s_words():
+    """TorchRL passes `frameskip` and tries again without it if the error has these words."""
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+        open_env(frameskip=1)
+
+
+def test_a_saved_policy_keeps_the_bounds_of_its_actions(tmp_path):
+    model = sb3.PPO("MlpPolicy", rescaled(), n_steps=64, batch_size=64, seed=0)
+    save_policy(model, tmp_path / "policy")
+    policy = load_policy(tmp_path / "policy")
+    assert policy.action_space == model.action_space
+    expected, found = (evaluate(one, "open", count=2, timed=False) for one in (model, policy))
+    assert [episode.cost for episode in found] == [episode.cost for episode in expected]
+
+
+def test_the_sensors_are_those_of_the_model_s_environment(tmp_path):
+    model = sb3.PPO("MlpPolicy", open_env(observation="geodesic", lidar_beams=16), n_steps=64, batch_size=64)
+    assert evaluate(model, "open", count=1, timed=False).settings.sensors == "lidar and geodesic distances, 16 beams"
+    save_policy(model, tmp_path / "policy")
+    assert policy_environment(tmp_path / "policy")["lidar_beams"] == 16
+
+
+@pytest.mark.parametrize("goal", [False, True], ids=["dictionary", "hindsight"])
+def test_models_with_observations_in_dictionaries_are_evaluated(goal, tmp_path, capsys):
+    if goal:
+        env = gym.make("leapnav/NavigateGoal-v0", family="open", lidar_beams=16)
+        buffer = {"replay_buffer_class": HerReplayBuffer, "buffer_size": 1000}
+        model = sb3.SAC("MultiInputPolicy", env, learning_starts=1000, seed=0, **buffer)
+    else:
+        env = open_env(dict_observation=True, lidar_beams=16)
+        model = sb3.PPO("MultiInputPolicy", env, n_steps=64, batch_size=64, seed=0)
+    expected = evaluate(model, "open", count=2, timed=False)
+    path = tmp_path / "model.zip"
+    model.save(path)
+    with pytest.raises(ValueError, match="not a vector; trust=True"):
+        load_zip(path)
+    policy, arguments = load_zip(path, trust=True)
+    found = evaluate(policy, "open", environment=arguments, count=2, timed=False)
+    assert [episode.cost for episode in found] == [episode.cost for episode in expected]
+    assert main(["evaluate", str(path), "--trust", "--family", "open", "--count", "1"]) == 0
+    assert "lidar, 16 beams" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="expected a Box, got Dict"):
+        sb3.PPO("MultiInputPolicy", env, policy_kwargs=network())

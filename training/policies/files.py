@@ -53,7 +53,8 @@ def save_policy(
         model: a Stable-Baselines3 algorithm with an "MlpPolicy" (PPO, A2C, SAC, TD3, DDPG or TQC), with the default
             network or that of `leapnav.training.network`, or its policy.
         folder: the directory; created if it does not exist.
-        environment: the arguments of `gym.make` for which the policy was trained, except the family.
+        environment: the arguments of `gym.make` for which the policy was trained, except the family; None: those of
+            the model's environment, if it has one.
         training: description of the training, as JSON.
         half: save only the actor, in half precision: about 1/5 of the size; the actions change by about 1e-3.
 
@@ -66,7 +67,9 @@ def save_policy(
     policy, folder = policy_of(model), Path(folder)
     architecture = Architecture.of(policy)
     assert isinstance(policy.observation_space, spaces.Box)  # checked above
-    space = NavigateEnv(split="fresh", **(environment or {})).observation_space
+    assert isinstance(policy.action_space, spaces.Box)
+    environment = environment_of(model) if environment is None else environment
+    space = NavigateEnv(split="fresh", **environment).observation_space
     if space != policy.observation_space:
         raise ValueError(
             f"environment: has observations {space.shape or 'in a dict'}, the policy's are "
@@ -85,9 +88,11 @@ def save_policy(
     description = {
         "format": FORMAT,
         "leapnav": leapnav.__version__,
-        "environment": {"id": ENVIRONMENT, **_as_dict(EnvironmentSettings(**(environment or {})))},
+        "environment": {"id": ENVIRONMENT, **_as_dict(EnvironmentSettings(**environment))},
         "observation_low": policy.observation_space.low.tolist(),
         "observation_high": policy.observation_space.high.tolist(),
+        "action_low": policy.action_space.low.tolist(),
+        "action_high": policy.action_space.high.tolist(),
         **asdict(architecture),
         "actor_only": half,
         "training": dict(training or {}),
@@ -162,6 +167,19 @@ def policy_environment(folder: str | Path) -> dict[str, Any]:
     return _observed(read_description(folder))
 
 
+def environment_of(model: Any) -> dict[str, Any]:
+    """Return the arguments of `gym.make` that determine the observations of a model's environment.
+
+    They are empty if the model has no environment, or not one of leapnav.
+    """
+    venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
+    try:
+        settings = unwrap(venv)[0].settings
+    except TypeError:
+        return {}
+    return {name: getattr(settings, name) for name in OBSERVED}
+
+
 def _observed(description: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of the environment in the description of a policy that determine the observation."""
     environment = description["environment"]
@@ -195,7 +213,12 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
     try:
         low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
         observation_space = spaces.Box(low, high, dtype=np.float32)
-        action_space = spaces.Box(-1.0, 1.0, (_n_controls(description["environment"]),), np.float32)
+        n_controls = _n_controls(description["environment"])
+        least, most = (  # older files do not contain these bounds, which are -1 and 1 without a wrapper of actions
+            np.array(description.get(name, [bound] * n_controls), np.float32)
+            for name, bound in (("action_low", -1.0), ("action_high", 1.0))
+        )
+        action_space = spaces.Box(least, most, dtype=np.float32)
         architecture = Architecture(**{field.name: description[field.name] for field in fields(Architecture)})
         policy = architecture.make(observation_space, action_space)
     except ModuleNotFoundError:

@@ -40,6 +40,11 @@ class NavigationFeatures(BaseFeaturesExtractor):
     DISPLACEMENT_FEATURES = 4  # features of the displacement from each observation of the history
 
     def __init__(self, observation_space: spaces.Box) -> None:
+        if not isinstance(observation_space, spaces.Box):
+            raise ValueError(
+                f"observation_space: expected a Box, got {type(observation_space).__name__}; use the environment with "
+                "dict_observation=False"
+            )
         parts = parts_of(observation_space)
         self._is_timed = parts["goal"].stop > TIME_LEFT
         self._motion, self._lidar = parts["motion"], parts["lidar"]

@@ -12,7 +12,8 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,10 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots.base import robot_class
-from leapnav.envs.settings import EnvironmentSettings
-from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES, ObservationLayout
+from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, GOAL_ENTRIES
 from leapnav.training.policies.architecture import ACTIVATIONS, EXTRACTORS, Architecture, is_actor_weight, widths
 
 # Kinds of policies by the module of their class, with the default widths of Stable-Baselines3.
@@ -41,6 +42,8 @@ IGNORED = frozenset({"log_std_init", "ortho_init", "optimizer_class", "optimizer
     *("n_critics", "n_quantiles"),  # of the critics, which are not loaded
     "quiet",  # of NavigationPolicy
 }
+# A replay buffer is not needed; that of hindsight experience replay would need an environment.
+NO_BUFFER = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
 ADVICE = "trust=True (--trust) loads it with Stable-Baselines3, which executes code from the file"
 
 
@@ -55,7 +58,8 @@ def load_zip(
     """Load the policy of a model saved by Stable-Baselines3.
 
     Args:
-        path: the file, written by `model.save` of PPO, A2C, SAC, TD3, DDPG or TQC; with `trust` also of CrossQ.
+        path: the file, written by `model.save` of PPO, A2C, SAC, TD3, DDPG or TQC; with `trust` also
+            of CrossQ, TRPO, RecurrentPPO and ARS, and with observations in a Dict.
         environment: arguments of the environment with which it was trained; None: derived from the observation space,
             for a lidar.
         trust: load with Stable-Baselines3, which executes code from the file; for models with custom classes.
@@ -81,10 +85,11 @@ def load_zip(
             )
     except Exception as error:  # zipfile, json and torch raise many types of errors for a damaged file
         raise ValueError(f"{path}: not a model of Stable-Baselines3, or damaged: {error}".splitlines()[0]) from None
-    arguments, space = _environment(path, data, environment)
     if trust:
-        policy = _algorithm(path, data).load(path, device="cpu").policy
+        policy = _algorithm(path, data).load(path, device="cpu", custom_objects=NO_BUFFER).policy
+        arguments, _ = _environment(path, _Space.of(policy.observation_space), environment)
     else:
+        arguments, space = _environment(path, _Space.described(data), environment)
         n_controls = robot_class(arguments.get("robot", "unicycle")).sizes()[1]
         policy = _architecture(path, data).make(space, _action_space(path, data, n_controls))
         _load_actor(path, policy, weights)
@@ -92,24 +97,74 @@ def load_zip(
     return policy, arguments
 
 
-def _environment(path: Path, data: Mapping[str, Any], given: Mapping[str, Any] | None) -> tuple[dict[str, Any], Any]:
-    """Return the arguments of the environment and its observation space, which is compared with the file's."""
-    stored = _described(data.get("observation_space"))
-    shape = stored.get("_shape")
-    arguments = dict(given or {})
-    if given is None and isinstance(shape, list) and len(shape) == 1 and shape[0] > FREE_GOAL_ENTRIES:
+@dataclass(frozen=True)
+class _Space:
+    """An observation space, or the description of one in a file.
+
+    Attributes:
+        keys: the keys of a Dict, none for a Box.
+        sizes: number of entries of each part of a Dict, or of the Box.
+        bounds: text of the bounds of each, low and high; NumPy shortens that of a long vector.
+
+    """
+
+    keys: tuple[str, ...]
+    sizes: tuple[int, ...]
+    bounds: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def of(cls, space: Any) -> _Space:
+        """Return the description of a space."""
+        parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+        boxes = [part for part in parts.values() if isinstance(part, spaces.Box) and len(part.shape) == 1]
+        keys = tuple(parts) if isinstance(space, spaces.Dict) else ()
+        if len(boxes) < len(parts):
+            return cls(keys, (), ())
+        return cls(keys, tuple(box.shape[0] for box in boxes), tuple((str(box.low), str(box.high)) for box in boxes))
+
+    @classmethod
+    def described(cls, data: Mapping[str, Any]) -> _Space:
+        """Return the description of a Box in a file; without entries if it is none."""
+        stored = _described(data.get("observation_space"))
+        shape = stored.get("_shape")
+        if not (isinstance(shape, list) and len(shape) == 1):
+            return cls((), (), ())
+        return cls((), (shape[0],), ((str(stored.get("low")), str(stored.get("high"))),))
+
+    @property
+    def is_goal(self) -> bool:
+        """Whether it is that of the goal-conditioned environment."""
+        return "achieved_goal" in self.keys
+
+    def guesses(self) -> Iterator[dict[str, Any]]:
+        """Yield arguments of an environment with a lidar that may have this space."""
+        sized = dict(zip(self.keys or ("observation",), zip(self.sizes, self.bounds, strict=True), strict=False))
+        if not sized:
+            return
+        size, (_, high) = sized.get("lidar") or sized.get("observation") or next(iter(sized.values()))
         # The range of the lidar is the last bound; NumPy's text of a long vector contains it, too.
-        high = [float(number) for number in re.findall(r"[-+]?\d[\d.e+-]*", str(stored.get("high")))] or [10.0]
+        numbers = [float(number) for number in re.findall(r"[-+]?\d[\d.e+-]*", high)] or [10.0]
+        form = {"dict_observation": True} if self.keys and not self.is_goal else {}
         for kind, n_goal in (({}, GOAL_ENTRIES), ({"horizon": "free"}, FREE_GOAL_ENTRIES)):
-            arguments = {"lidar_beams": max(shape[0] - n_goal, 0), "lidar_range": high[-1], **kind}
-            if _has_bounds(ObservationLayout(EnvironmentSettings(**arguments)).space, stored):
-                break
-    space: Any = NavigateEnv(split="fresh", **arguments).observation_space
-    is_box = isinstance(space, spaces.Box) and shape == list(space.shape)
-    if not is_box or not _has_bounds(space, stored):
-        kind = "a Box" if shape else "no Box"
+            others = 0 if form else int(not kind) if self.is_goal else n_goal  # entries that are not of the lidar
+            yield {"lidar_beams": max(size - others, 0), "lidar_range": numbers[-1], **kind, **form}
+
+
+def _environment(path: Path, stored: _Space, given: Mapping[str, Any] | None) -> tuple[dict[str, Any], Any]:
+    """Return the arguments of the environment and its observation space, which is compared with that of the model."""
+    arguments = dict(given or {})
+    make = NavigateGoalEnv if stored.is_goal else NavigateEnv
+    for guess in stored.guesses() if given is None else ():
+        if guess["lidar_beams"] > 0 and _Space.of(make(split="fresh", **guess).observation_space) == stored:
+            arguments = guess
+            break
+    space: Any = make(split="fresh", **arguments).observation_space
+    if not stored.sizes:
+        raise ValueError(f"{path}: its observations are not a vector; {ADVICE}")
+    if _Space.of(space) != stored:
+        shape = f"a Box of shape {stored.sizes}" if not stored.keys else f"a Dict of {', '.join(stored.keys)}"
         raise ValueError(
-            f"{path}: its observations ({kind} of shape {tuple(shape or ())}) are not those of the environment with "
+            f"{path}: its observations ({shape}) are not those of the environment with "
             f"{arguments or 'the defaults'}; give the arguments it was trained with (--env observation=map, ...)"
         )
     return arguments, space
@@ -127,11 +182,6 @@ def _action_space(path: Path, data: Mapping[str, Any], n_controls: int) -> space
         for side in ("low", "high")
     )
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), (n_controls,), np.float32)
-
-
-def _has_bounds(space: Any, stored: Mapping[str, Any]) -> bool:
-    """Return whether the bounds of a space are those that a file describes."""
-    return all(str(getattr(space, side)) == stored.get(side) for side in ("low", "high"))
 
 
 def _architecture(path: Path, data: Mapping[str, Any]) -> Architecture:
@@ -170,10 +220,11 @@ def _algorithm(path: Path, data: Mapping[str, Any]) -> type[BaseAlgorithm]:
     import stable_baselines3 as sb3
 
     module = str(_described(data.get("policy_class")).get("__module__"))
-    if module.startswith("sb3_contrib.crossq"):
-        from sb3_contrib import CrossQ  # from the extra `contrib`
+    contributed = {"sb3_contrib.crossq.policies": "CrossQ", "sb3_contrib.ars.policies": "ARS"}
+    if module in contributed:
+        import sb3_contrib  # from the extra `contrib`
 
-        return CrossQ
+        return getattr(sb3_contrib, contributed[module])
     if "clip_range" in data:
         return sb3.PPO
     if "gae_lambda" in data:

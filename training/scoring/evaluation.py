@@ -29,6 +29,7 @@ from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.training.environments.playing import PlayedEpisode, play_episodes
+from leapnav.training.policies.files import environment_of
 from leapnav.training.scoring.adapters import adapted, is_goal_conditioned
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.threads import limit_threads
@@ -147,7 +148,8 @@ def evaluate(
         bank: a bank, or the name of a family for its test split, with the robot, horizon and obstacles of
             `environment`.
         count: number of scenarios, from the first of the bank; None: all.
-        environment: arguments of the environment, such as `observation`.
+        environment: arguments of the environment, such as `observation`; None: those of the model's environment that
+            determine the observations, if it has one.
         seed: random seed of the disturbances.
         timed: measure the computation time of an action; otherwise `milliseconds` is NaN.
         workers: number of processes that search the optima for the poses reached, which takes most of the time; the
@@ -164,6 +166,7 @@ def evaluate(
 
     """
     check_at_least("workers", workers, 1)
+    environment = _environment_of(policy) if environment is None else environment
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
             "policy: expected an object with `predict`, a function of an observation, or a PolicyFactory, got "
@@ -173,10 +176,10 @@ def evaluate(
         if not isinstance(bank, str):
             raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
         check_family(bank)
-        bank = _named_bank(bank, environment or {})
+        bank = _named_bank(bank, environment)
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
-    arguments = {name: value for name, value in (environment or {}).items() if name != "obstacles"}
+    arguments = {name: value for name, value in environment.items() if name != "obstacles"}
     indices = list(range(len(bank) if count is None else min(count, len(bank))))
     episodes: list[Episode] = []
     with progress_bar(total=len(indices), label=label, unit="episodes", show=progress) as bar:
@@ -193,6 +196,14 @@ def evaluate(
     milliseconds = _median_milliseconds(policy, bank, arguments) if timed else math.nan
     task = {"robot": bank.robot.model, "horizon": bank.horizon}
     return Evaluation(tuple(episodes), milliseconds, EnvironmentSettings(**{**arguments, **task}))
+
+
+def _environment_of(policy: Any) -> dict[str, Any]:
+    """Return the arguments of the environment that determine the observations of a policy, as far as it knows them."""
+    found = environment_of(policy)
+    if not found and isinstance(getattr(policy, "observation_space", None), gym.spaces.Dict):
+        return {} if is_goal_conditioned(policy) else {"dict_observation": True}
+    return found
 
 
 def _named_bank(family: str, environment: Mapping[str, Any]) -> ScenarioBank:
