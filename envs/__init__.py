@@ -22,7 +22,7 @@ from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.layouts.layout import ScenarioLayout
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.scenarios.scenario import Scenario
-from leapnav.envs.settings import Disturbance, Motor
+from leapnav.envs.settings import Disturbance, EnvironmentSettings, Motor
 from leapnav.envs.shapes import Capsule, Circle, Polygon, Shape
 from leapnav.envs.vector import NavigateGoalVectorEnv, NavigateVectorEnv
 
@@ -39,6 +39,7 @@ __all__ = [
     "Disturbance",
     "DynamicCar",
     "DynamicUnicycle",
+    "EnvironmentSettings",
     "Motor",
     "NavigateEnv",
     "NavigateGoalEnv",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, cast, get_args
 
@@ -14,6 +15,7 @@ from leapnav.envs.kernels.compilation import GENERATED
 from leapnav.envs.kernels.decorator import kernels_of
 from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.scenarios.sources import as_scenario
 from leapnav.envs.utils.caching import computed_once
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 from leapnav.envs.utils.validation import check_choice, check_positive
@@ -151,7 +153,10 @@ EFFORTS: tuple[Effort, ...] = get_args(Effort)
 
 
 def find_optimum(
-    problem: Scenario | OptimalControlProblem, effort: Effort = "high", *, barrier_tolerance: float = BARRIER_TOLERANCE
+    problem: Scenario | Mapping[str, Any] | str | os.PathLike[str] | OptimalControlProblem,
+    effort: Effort = "high",
+    *,
+    barrier_tolerance: float = BARRIER_TOLERANCE,
 ) -> Optimum:
     """Find the minimum-cost certified extremal of a scenario or of another optimal control problem.
 
@@ -171,7 +176,7 @@ def find_optimum(
     `leapnav.experts.hard_limits`.
 
     Args:
-        problem: a scenario, or an optimal control problem.
+        problem: a scenario, also as a dict, JSON text or a file, or an optimal control problem.
         effort: "high" finds the optimum and its alternatives. "medium" finds the optimum: candidates and local optima
             that cost more are omitted, which takes 0.3 to 0.5 of the time, and `alternatives` contains only what was
             found on the way. "low" examines the first round of candidates only, of which there are 12, or 36 for a
@@ -187,12 +192,13 @@ def find_optimum(
     Raises:
         TypeError: `problem` is neither a scenario nor a problem.
         ValueError: the effort is unknown, or the tolerance is not positive.
+        ScenarioError, OSError: the scenario is invalid, or its file cannot be read.
 
     """
     check_choice("effort", effort, EFFORTS)
     check_positive("barrier_tolerance", barrier_tolerance)
-    if isinstance(problem, Scenario):
-        return _of_scenario(problem, effort, barrier_tolerance)
+    if isinstance(problem, (Scenario, Mapping, str, os.PathLike)):
+        return _of_scenario(as_scenario(problem), effort, barrier_tolerance)
     if not isinstance(cast(object, problem), OptimalControlProblem):
         expected = "a Scenario (see Scenario.from_dict) or an OptimalControlProblem"
         raise TypeError(f"problem: expected {expected}, got {type(problem).__name__}")

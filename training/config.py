@@ -288,7 +288,7 @@ class _LearnerConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig(_LearnerConfig):
-    """Proximal policy optimisation. The defaults are for training from scratch; `tuned` has those of a warm start."""
+    """Proximal policy optimisation. The defaults are for training from scratch; a warm start has others."""
 
     lidar_beams: int | None = 32
     """Number of lidar beams, an even number; with 128, learning takes twice as long."""

@@ -37,6 +37,7 @@ from leapnav.envs.scenarios.maps import check_discs, disc_arena, read_movingai, 
 from leapnav.envs.scenarios.obstacle import Obstacle
 from leapnav.envs.shapes import Circle, Polygon
 from leapnav.envs.shapes.base import KINDS
+from leapnav.envs.utils.json_utils import parse_json
 from leapnav.envs.utils.records import Finite, Frozen, Positive
 from leapnav.envs.utils.validation import as_vector, check_positive
 
@@ -409,19 +410,17 @@ class Scenario(Frozen):
 
 
 def check_robot(value: RobotModel | Mapping[str, Any] | str) -> RobotModel:
-    """Return a robot given by the name of its model, a dict of its fields with `model`, or itself.
+    """Return a robot given by the name of its model, a dict of its fields with `model` or its JSON text, or itself.
 
     Raises:
         ValueError: it is invalid; the message names the field and the value.
 
     """
-    if isinstance(value, RobotModel):
-        return value
     if isinstance(value, str):
-        value = {"model": value}
-    if not isinstance(value, Mapping):
+        value = parse_json("robot", value) if value.lstrip().startswith("{") else {"model": value}
+    if not isinstance(value, (RobotModel, Mapping)):
         raise ValueError(f"robot: expected the name of a model, a dict of its fields or a robot, got {shorten(value)}")
-    robot, faults = _read_robot(value)
+    robot, faults = (value, []) if isinstance(value, RobotModel) else _read_robot(value)
     if faults:
         raise ValueError("; ".join(faults))
     return robot

@@ -210,7 +210,7 @@ def _shipped_bank(
     return None
 
 
-def as_scenario(value: Scenario | Mapping[str, Any] | str) -> Scenario:
+def as_scenario(value: Scenario | Mapping[str, Any] | str | os.PathLike[str]) -> Scenario:
     """Return a scenario given in any of the forms that the environments accept.
 
     Raises:

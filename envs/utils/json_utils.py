@@ -1,7 +1,11 @@
-"""JSON encoding of results: dataclasses, paths and enums are supported; NaN and infinity become null."""
+"""JSON: parsing, and encoding of results.
+
+Dataclasses, paths and enums are supported; NaN and infinity become null.
+"""
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -31,3 +35,16 @@ def _from_numpy(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no representation in JSON")
+
+
+def parse_json(name: str, text: str) -> Any:
+    """Return the value of JSON text.
+
+    Raises:
+        ValueError: it is not valid JSON; the message contains the name.
+
+    """
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{name}: not valid JSON: {error}, got {text!r}") from None

@@ -19,6 +19,7 @@ import leapnav
 from leapnav.envs.episodes import play_episode, replay
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel, Unicycle
+from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import find_family, sample_scenario, task_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.files import write_text
@@ -78,7 +79,7 @@ class RolloutSummary:
 
 
 def rollout(
-    family: str,
+    family: str | ScenarioBank,
     count: int,
     out: str | os.PathLike[str],
     *,
@@ -99,7 +100,7 @@ def rollout(
     again with the same arguments; the dataset does not depend on interruptions. A finished rollout is not repeated.
 
     Args:
-        family: family of the scenarios.
+        family: family of the scenarios, or a bank.
         count: number of scenarios; scenario i has the seed `seed + i`. Scenarios without a certified optimum are
             replaced by following ones. Seeds 0 and 1 are refused: their scenarios are in the included banks, one of
             them in the test split.
@@ -127,6 +128,7 @@ def rollout(
         ModuleNotFoundError: `dask` is given without the extra `cluster`.
 
     """
+    family = str(family.path) if isinstance(family, ScenarioBank) else family
     chosen = find_family(family)
     body, horizon, obstacles = task_of(chosen, robot, horizon, obstacles)
     check_at_least("count", count, 1)

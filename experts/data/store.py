@@ -63,7 +63,7 @@ class ResumableStore:
     def _check_manifest(self) -> None:
         """Write the manifest, or compare the settings with those of the existing one."""
         manifest = self.directory / f"{self.kind}.json"
-        if not manifest.exists():
+        if not any(self.directory.glob("shard-*.npz")):  # nothing was finished, perhaps with wrong settings
             write_text(manifest, self._header + "\n")
             return
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
@@ -59,10 +60,11 @@ class TrainCommand:
 
 
 def _describe(evaluation: Evaluation) -> str:
+    regret = "-" if math.isnan(evaluation.regret) else f"{100 * evaluation.regret:.2f} %"  # without any success
     return (
         f"{evaluation.episodes[0].family}: success {100 * evaluation.success:.1f} %, "
         f"collision {100 * evaluation.collision:.1f} %, SOC {evaluation.soc:.3f}, "
-        f"median regret {100 * evaluation.regret:.2f} %"
+        f"median regret {regret}"
     )
 
 

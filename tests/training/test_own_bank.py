@@ -7,12 +7,12 @@ import gymnasium as gym
 import pytest
 
 from leapnav.cli import main
-from leapnav.envs import NavigateEnv
+from leapnav.envs import NavigateEnv, ScenarioBank
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.families import sample_scenario, task_of
-from leapnav.experts import build_bank
+from leapnav.experts import build_bank, find_optimum, rollout
 from leapnav.experts.data.demonstrations import load_demonstrations
-from leapnav.training import BCConfig, DAggerRunConfig
+from leapnav.training import BCConfig, CloningConfig, DAggerRunConfig, Dataset, train_bc, train_dagger
 
 WIDE = Unicycle(radius=0.3)
 SMALL = ["--hidden", "16", "16", "--lidar-beams", "8", "--evaluation-scenarios", "2", "--observation", "lidar"]
@@ -63,3 +63,50 @@ def test_rollout_training_evaluation_and_report_need_no_robot(bank, tmp_path, mo
     assert main(["evaluate", "clone", "lattice", "--html", "page.html", "--count", "2", "--workers", "1"]) == 0
     assert "2 scenarios" in capsys.readouterr().out
     assert main(["rollout", "--policy", "clone", "--family", bank, "--count", "1", "--out", "driven"]) == 0
+
+
+def test_a_robot_is_given_as_json_on_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    build = ["bank", "build", "--family", "open", "--count", "1", "--workers", "1", "--out", "own.bank", "--robot"]
+    assert main([*build, WIDE.model_dump_json(exclude_none=True)]) == 0
+    assert ScenarioBank("own.bank").robot == WIDE
+    assert main([*build, '{"model":']) == 2
+    assert "robot: not valid JSON" in capsys.readouterr().err
+
+
+def test_banks_and_files_are_accepted_where_a_scenario_or_a_family_is(bank, tmp_path):
+    stored, file = ScenarioBank(bank), tmp_path / "scenario.json"
+    stored[0].to_json(file)
+    cost = find_optimum(stored[0]).cost
+    assert find_optimum(file).cost == find_optimum(str(file)).cost == find_optimum(stored[0].to_dict()).cost == cost
+    summary = rollout(stored, 2, tmp_path / "demos", progress=False)
+    assert summary.demonstrations == 2
+    env = NavigateEnv(bank, lidar_beams=8)
+    assert Dataset.of(tmp_path / "demos").observed(env).observations.shape[1] == env.observation_space.shape[0]
+    # A rollout that has finished nothing does not block another one.
+    with pytest.raises(ValueError, match="horizon: expected that of the scenarios"):
+        rollout(stored, 2, tmp_path / "others", horizon="fixed", progress=False)
+    rollout(stored, 2, tmp_path / "others", progress=False)
+
+
+def test_demonstrations_of_another_robot_or_horizon_are_refused(bank, tmp_path, capsys):
+    rollout(ScenarioBank(bank), 2, tmp_path / "wide", progress=False)
+    rollout("open", 2, tmp_path / "open", progress=False)
+    small = {"hidden": (4,), "lidar_beams": 4, "evaluation_scenarios": 1}
+
+    def clone(family, demos, **others):
+        train_bc(BCConfig(out=tmp_path / "run", family=family, demos=(tmp_path / demos,), **small, **others))
+
+    with pytest.raises(ValueError, match=r"demos: expected a robot with radius 0\.25, got 0\.3"):
+        clone("open", "wide")
+    with pytest.raises(ValueError, match="demos: expected a robot with model 'car', got 'unicycle'"):
+        clone("open", "open", robot="car")
+    with pytest.raises(ValueError, match="demos: expected a free horizon, got a fixed one"):
+        clone("open", "open", horizon="free")
+    with pytest.raises(ValueError, match=r"robot: expected the name of a model, got .* build a bank"):
+        clone("open", "open", robot={"model": "unicycle", "radius": 0.3})
+    assert not (tmp_path / "run").exists()
+    clone("clutter", "open", cloning=CloningConfig(epochs=1))
+    assert "demonstrations of open for a policy of clutter" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="a run of BC, not of DAGGER; resume it by `leapnav train bc`"):
+        train_dagger(DAggerRunConfig(out=tmp_path / "run", resume=True))

@@ -19,6 +19,7 @@ from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
+from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.files import atomic_path
 from leapnav.experts.data.datasets import CONTROL_PERIOD, ENVIRONMENT, open_dataset
 from leapnav.experts.data.demonstrations import Demonstration
@@ -83,18 +84,21 @@ class Dataset:
         """Select samples by an index array, a mask or a slice."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
-    def observed(self, settings: EnvironmentSettings) -> Dataset:
+    def observed(self, settings: Any) -> Dataset:
         """Return the same samples with the observations of other sensors, without noise.
 
         The history of a sample and its last action are those of the samples before it in its episode.
 
         Args:
-            settings: settings of an environment with these sensors. Only its sensor settings are used.
+            settings: the `EnvironmentSettings` of an environment with these sensors, or the environment itself. Only
+                the settings of the sensors are used.
 
         Raises:
+            TypeError: the environment is not one of leapnav.
             ValueError: the environment has another actuation, whose state the samples do not contain.
 
         """
+        settings = settings if isinstance(settings, EnvironmentSettings) else unwrap(settings)[0].settings
         if settings.actuation != self.settings.actuation:
             expected, given = self.settings.actuation, settings.actuation
             raise ValueError(f"actuation: expected that of the samples, {expected!r}, got {given!r}")

@@ -117,8 +117,12 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
     if all(isinstance(extractor, NavigationFeatures) for extractor in extractors):
         tensors[0][0] = _with_motion(tensors[0][0], tensors[1][0], *cast(Any, extractors))
     if [t.shape for t in tensors[0]] != [t.shape for t in tensors[1]]:
-        shapes = [[tuple(t.shape) for t in of_one] for of_one in tensors]
-        raise ValueError(f"policy: its network has the shapes {shapes[0]}, the model's {shapes[1]}")
+        inputs, widths = zip(*(_sizes(of_one) for of_one in tensors), strict=True)
+        name, (found, expected) = ("features", inputs) if inputs[0] != inputs[1] else ("hidden", widths)
+        raise ValueError(
+            f"policy: its network has {name} {found}, that of the model {expected}; give the settings of the policy "
+            "(--hidden, --observation, --lidar-beams)"
+        )
     with th.no_grad():
         for a, b in zip(*tensors, strict=True):
             b.copy_(a)
@@ -157,3 +161,9 @@ def _actor_tensors(policy: BasePolicy) -> list[th.Tensor]:
     noise = getattr(_actor(policy), "log_std", None)
     skipped = {id(p) for p in noise.parameters()} if isinstance(noise, nn.Module) else set()
     return [p.data for p in _actor(policy).parameters() if id(p) not in skipped]
+
+
+def _sizes(tensors: list[th.Tensor]) -> tuple[int, tuple[int, ...]]:
+    """Return the number of inputs of a network, and the widths of its hidden layers."""
+    matrices = [tensor for tensor in tensors if tensor.ndim == 2]
+    return matrices[0].shape[1], tuple(len(matrix) for matrix in matrices[:-1])

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import partial
-from typing import Any, get_args
+from typing import Any, cast, get_args
+
+from tqdm.auto import tqdm
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import check_family
+from leapnav.envs.scenarios.families import check_family, is_built_in, task_of
+from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -29,6 +33,7 @@ from leapnav.training.config import (
 )
 from leapnav.training.learning.cloning import check_cloning
 from leapnav.training.learning.dagger import check_dagger
+from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.warm_start import check_warm_start
 
 
@@ -40,6 +45,11 @@ def check_config(config: RunConfig) -> None:
 
     """
     check_family(config.family)
+    if not isinstance(cast(object, config.robot), (str, type(None))):
+        raise ValueError(
+            f"robot: expected the name of a model, got {config.robot!r}; for a robot of your own build a bank of its "
+            "scenarios (`build_bank(robot=...)`), and give the file as family"
+        )
     if not config.hidden or min(config.hidden) < 1:
         raise ValueError(f"hidden: expected widths of at least 1, got {config.hidden!r}")
     check_integer("seed", config.seed, 0, 2**32 - 1)
@@ -61,6 +71,28 @@ def check_config(config: RunConfig) -> None:
             _check_nested(field.name, value)
         elif field.name in _CHECKS and value is not None:  # None: determined by other settings
             _CHECKS[field.name](field.name, value)
+
+
+def check_demonstrations(config: RunConfig, dataset: Dataset, progress: bool) -> None:
+    """Check that demonstrations are for the robot and the horizon of a run, and say if they are of other families.
+
+    Raises:
+        ValueError: they are not.
+
+    """
+    body, horizon, _ = task_of(config.family, config.robot, config.horizon, config.obstacles)
+    scenarios = [Scenario.from_json(dataset.scenarios[k]) for k in (0, -1)]
+    for scenario in scenarios:
+        expected, found = (one.model_dump(mode="json") for one in (body, scenario.robot))
+        different = [name for name in found if found[name] != expected.get(name)]
+        if different:
+            name = different[0]
+            raise ValueError(f"demos: expected a robot with {name} {expected.get(name)!r}, got {found[name]!r}")
+        if scenario.horizon_kind != horizon:
+            raise ValueError(f"demos: expected a {horizon} horizon, got a {scenario.horizon_kind} one")
+    families = sorted({re.sub(r"(-\d+)+$", "", scenario.name) for scenario in scenarios})
+    if progress and is_built_in(config.family) and config.family not in families:
+        tqdm.write(f"demonstrations of {', '.join(families)} for a policy of {config.family}")
 
 
 def _check_levels(config: PPOConfig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -22,7 +23,7 @@ from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import copy_actor
 from leapnav.training.policies.files import load_policy
 from leapnav.training.policies.network import make_policy
-from leapnav.training.runs.checks import check_config
+from leapnav.training.runs.checks import check_config, check_demonstrations
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
 from leapnav.training.threads import limit_threads
@@ -51,6 +52,8 @@ def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> li
     # Invalid arguments are reported before the run directory is created.
     check_config(config)
     given = Dataset.of(config.demos) if config.demos else None
+    if given is not None:
+        check_demonstrations(config, given, progress)
     run = Run("bc", config)
     policy = _new_policy(config)
     checkpoint = run.load_checkpoint() if config.resume else None
@@ -74,7 +77,8 @@ def _clone(run: Run, policy: ActorCriticPolicy, dataset: Dataset, config: BCConf
         run.logger.record("loss/validation", loss.validation)
         evaluations = run.evaluate(policy, loss.epoch * len(dataset))
         if progress:
-            tqdm.write(f"epoch {loss.epoch}: {_scores(evaluations)}, loss {loss.validation:.4f}")
+            validation = "" if math.isnan(loss.validation) else f", loss {loss.validation:.4f}"  # nothing held out
+            tqdm.write(f"epoch {loss.epoch}: {_scores(evaluations)}{validation}")
         run.save_policy(policy)
 
     settings = replace(config.cloning, seed=config.seed)
@@ -103,6 +107,8 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     """
     check_config(config)
     dataset = Dataset.of(config.demos) if config.demos else None
+    if dataset is not None:
+        check_demonstrations(config, dataset, progress)
     policy = _new_policy(config)
     if config.policy is not None:
         copy_actor(load_policy(config.policy, make_env(config)), policy)

@@ -34,7 +34,7 @@ from leapnav.training.policies.actors import actor_parameters, copy_actor, set_n
 from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy
 from leapnav.training.policies.network import network
-from leapnav.training.runs.checks import check_config
+from leapnav.training.runs.checks import check_config, check_demonstrations
 from leapnav.training.runs.imitation import mean_scores, observed_settings
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
@@ -162,7 +162,10 @@ def _train(
     demos, start = _resolve_warm_start(config)
     if demos and config.reward != "cost":
         raise ValueError(f"reward: expected 'cost', the reward of demonstrations, got {config.reward!r}")
-    dataset = Dataset.of(demos).observed(observed_settings(config)) if demos else None
+    dataset = Dataset.of(demos) if demos else None
+    if dataset is not None:
+        check_demonstrations(config, dataset, progress)
+        dataset = dataset.observed(observed_settings(config))
     venv = make_training_env(config)
     if wrapper is not None:
         venv = wrapper(venv)

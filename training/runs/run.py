@@ -106,6 +106,11 @@ class Run:
             stored: dict[str, Any] = record["config"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not the configuration of a run: {error!r}") from None
+        if stored.get("algorithm") != self.algorithm:
+            raise ValueError(
+                f"{self.folder}: a run of {str(stored.get('algorithm')).upper()}, not of {self.algorithm.upper()}; "
+                f"resume it by `leapnav train {stored.get('algorithm')}`"
+            )
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")

@@ -170,7 +170,7 @@ def evaluate(
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
             "policy: expected an object with `predict`, a function of an observation, or a PolicyFactory, got "
-            f"{type(policy).__name__}"
+            f"{type(policy).__name__}; `compare` takes the names of policies"
         )
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str):
