@@ -118,7 +118,7 @@ def tables(results: Path) -> dict[str, str]:
         "| policy | scenarios | success (%) | collision (%) | SOC | regret, pose reached (%) | unknown |",
         "|---|---|---|---|---|---|---|",
     ]
-    for path in sorted(results.glob("*.jsonl.gz")):
+    for path in sorted(results.glob("*.jsonl.gz"), key=lambda path: path.name.partition(".")[0]):
         for name, (evaluation,) in read_episodes(path).items():
             families = list(dict.fromkeys(episode.family for episode in evaluation))
             for family in families:

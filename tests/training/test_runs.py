@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 
 from leapnav.cli import main
 from leapnav.experts.data.rollouts import rollout
-from leapnav.training import Dataset, load_policy, make_policy, shipped_policies
+from leapnav.training import Dataset, load_policy, make_policy, policy_environment, shipped_policies
 from leapnav.training.config import (
     BCConfig,
     CloningConfig,
@@ -151,8 +151,8 @@ def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):
 
 @pytest.mark.parametrize("name", shipped_policies())
 def test_a_policy_that_ships_starts_a_run_with_the_defaults(name, tmp_path):
-    prefix, _, family = name.rpartition("-")
-    task = {"horizon": "free"} if prefix == "free" else {"robot": prefix or "unicycle"}
+    family, environment = read_description(name)["training"]["family"], policy_environment(name)
+    task = {setting: environment[setting] for setting in ("robot", "horizon")}
     config = PPOConfig.tuned(family, **task, out=tmp_path, warm_start=(Path(name),))
     demos, start = _resolve_warm_start(config)
     assert demos == []

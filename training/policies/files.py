@@ -281,7 +281,11 @@ def _check_environment(folder: Path, description: dict[str, Any], space: spaces.
 
 
 def shipped_policies() -> list[str]:
-    """Return the names of the policies included in leapnav: families, and "all" for a policy for all families."""
+    """Return the names of the policies included in leapnav.
+
+    A name is that of a family, or "all" for a policy for all families, with a prefix for a free horizon ("free") or
+    another robot, and the suffix "lidar" if the policy does not know the map.
+    """
     names = [path.parent.name for path in SHIPPED.glob("*/policy.json")]
     known = (*FAMILIES, ALL)
     return sorted(names, key=lambda name: (name not in known, known.index(name) if name in known else 0, name))

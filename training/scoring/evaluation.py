@@ -168,9 +168,10 @@ def evaluate(
     check_at_least("workers", workers, 1)
     environment = _environment_of(policy) if environment is None else environment
     if not (hasattr(policy, "predict") or callable(policy)):
+        names = "; `compare` takes names of policies" if isinstance(policy, str) else ""
         raise TypeError(
             "policy: expected an object with `predict`, a function of an observation, or a PolicyFactory, got "
-            f"{type(policy).__name__}; `compare` takes the names of policies"
+            f"{type(policy).__name__}{names}"
         )
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str):
