@@ -273,7 +273,8 @@ def extremes(episodes: Sequence[Episode], count: int) -> dict[str, list[Episode]
     failures = sorted((e for e in episodes if not e.success), key=lambda e: not e.collision)
     middle = max(0, len(successes) // 2 - count // 2)
     worst = failures[:count] + successes[::-1][: max(0, count - len(failures))]
-    rows = {"best": successes[:count], "median": successes[middle : middle + count], "worst": worst}
+    median = successes[middle : middle + count] if len(successes) > count else []  # otherwise those of the first row
+    rows = {"best": successes[:count], "median": median, "worst": worst}
     return {title: chosen for title, chosen in rows.items() if chosen}
 
 
@@ -287,7 +288,8 @@ def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) ->
     draw_scenario(axes, bank[episode.index])
     axes.plot(*bank.states(episode.index)[:, :2].T, color=OPTIMUM, linewidth=1.2, linestyle="--")
     axes.plot(*episode.states[:, :2].T, color=POLICY if episode.success else FAILURE, linewidth=1.8)
-    outcome = "collision" if episode.collision else "missed"
+    missed = f"missed by {episode.goal_distance:.2f} m, {episode.heading_error:.2f} rad"
+    outcome = "collision" if episode.collision else missed
     if episode.success:
         outcome = (
             "regret unknown" if math.isnan(episode.reached_regret) else f"regret {100 * episode.reached_regret:z.1f} %"
