@@ -141,9 +141,9 @@ def test_bad_arguments_are_named():
     env = NavigateEnv("open", lidar_beams=16)
     policy = PPO("MlpPolicy", env, policy_kwargs=network((16,)))
     with pytest.raises(ValueError, match=r"policy: expected observations \(25,\), got \(41,\)"):
-        evaluate(policy, "open", count=1, progress=False)
-    found = evaluate(policy, "open", count=1, environment={"lidar_beams": 16}, progress=False)
-    assert len(found) == 1
+        evaluate(policy.policy, "open", count=1, progress=False)
+    assert len(evaluate(policy.policy, "open", count=1, environment={"lidar_beams": 16}, progress=False)) == 1
+    assert len(evaluate(policy, "open", count=1, progress=False)) == 1  # the model knows its environment
     with pytest.raises(ValueError, match=r"family: expected .* got 'moon'"):
         evaluate(policy, "moon")
     with pytest.raises(ValueError, match="count: expected at least one scenario, got 0"):
