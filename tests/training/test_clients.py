@@ -227,6 +227,10 @@ def test_the_sensors_are_those_of_the_model_s_environment(tmp_path):
     assert evaluate(model, "open", count=1, timed=False).settings.sensors == "lidar and geodesic distances, 16 beams"
     save_policy(model, tmp_path / "policy")
     assert policy_environment(tmp_path / "policy")["lidar_beams"] == 16
+    rollout("open", 1, tmp_path / "demos", progress=False)
+    before = model.policy.state_dict()["action_net.weight"].clone()
+    behaviour_clone(model, tmp_path / "demos", CloningConfig(epochs=1, batch_size=32), progress=False)
+    assert not before.equal(model.policy.state_dict()["action_net.weight"])
 
 
 @pytest.mark.parametrize("goal", [False, True], ids=["dictionary", "hindsight"])

@@ -155,7 +155,7 @@ def test_ppo_can_go_on_from_a_clone(clone, env):
         clone[0].predict(observation, deterministic=True)[0], abs=1e-6
     )
     model.learn(64)
-    with pytest.raises(ValueError, match="its network has the shapes"):
+    with pytest.raises(ValueError, match="its network has hidden"):
         copy_actor(clone[0], fresh(env))
     squashing = SAC("MlpPolicy", env, policy_kwargs=network(), device="cpu")
     with pytest.raises(ValueError, match="expected the same squashing of the actions"):

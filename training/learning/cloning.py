@@ -16,6 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
 from torch.optim.lr_scheduler import LambdaLR
 
+from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar, stop_early
 from leapnav.envs.utils.validation import (
     check_choice,
@@ -78,7 +79,8 @@ def behaviour_clone(
 
     Args:
         model: a Stable-Baselines3 algorithm with continuous actions (PPO, A2C, SAC, TQC, TD3, ...) or its policy.
-        dataset: a `Dataset`, a directory written by `leapnav rollout`, or demonstrations.
+        dataset: a `Dataset`, a directory written by `leapnav rollout`, or demonstrations; observed again if the
+            environment of the model has other sensors.
         config: settings.
         progress: show a progress bar.
         label: label of the progress bar.
@@ -94,7 +96,7 @@ def behaviour_clone(
         ValueError: the dataset is empty or damaged, its observations do not fit the policy, or a setting is invalid.
 
     """
-    fit = _Fit(policy_of(model), Dataset.of(dataset), config or CloningConfig(), stream)
+    fit = _Fit(policy_of(model), samples_for(model, dataset), config or CloningConfig(), stream)
     with progress_bar(total=fit.epochs * fit.batches, label=label, unit="batches", show=progress) as bar:
         while not fit.finished:
             loss = fit.run_epoch(bar.update)
@@ -277,6 +279,19 @@ def _scale(samples: Samples, loss: str) -> th.Tensor:
     if loss == "action":
         return 0.5 / _action_loss(error).mean(dim=0).clamp(min=1e-6)
     return (1.0 / _hamiltonian_loss(error, slopes, weights).sum(dim=1).mean()).clamp(max=1e6).repeat(actions.shape[1])
+
+
+def samples_for(
+    model: BaseAlgorithm | BasePolicy, dataset: Dataset | str | os.PathLike[str] | Sequence[Demonstration]
+) -> Dataset:
+    """Return samples with the observations of a model's environment, if that is one of leapnav."""
+    samples = Dataset.of(dataset)
+    venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
+    try:
+        settings = unwrap(venv)[0].settings
+    except TypeError:  # another environment, or none
+        return samples
+    return samples.observed(settings)
 
 
 def check_observations(policy: BasePolicy, dataset: Dataset) -> None:

@@ -27,6 +27,7 @@ from leapnav.training.learning.cloning import (
     behaviour_clone,
     check_observations,
     cosine_decay,
+    samples_for,
 )
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.samples import action_slopes
@@ -100,7 +101,7 @@ def warm_start(
     config = config or WarmStartConfig()
     check_warm_start(config)
     check_positive("reward_scale", reward_scale)
-    samples, target = Dataset.of(dataset), policy_of(model)
+    samples, target = samples_for(model, dataset), policy_of(model)
     check_observations(target, samples)
     valued = _valued(samples) if config.critic else None
     losses: list[EpochLoss] = []
