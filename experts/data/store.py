@@ -57,13 +57,15 @@ class ResumableStore:
             self._open = stack.pop_all()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: object, *_: object) -> None:
+        if error is not None and not any(self.directory.glob("shard-*.npz")):  # perhaps the settings are wrong
+            (self.directory / f"{self.kind}.json").unlink(missing_ok=True)
         self._open.close()
 
     def _check_manifest(self) -> None:
         """Write the manifest, or compare the settings with those of the existing one."""
         manifest = self.directory / f"{self.kind}.json"
-        if not any(self.directory.glob("shard-*.npz")):  # nothing was finished, perhaps with wrong settings
+        if not manifest.exists():
             write_text(manifest, self._header + "\n")
             return
         try:

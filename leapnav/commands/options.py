@@ -37,6 +37,9 @@ PolicyName = (
         "dynamic_unicycle-clutter",
         "all",
         "free-clutter",
+        "clutter-lidar",
+        "polygons-lidar",
+        "rooms-lidar",
     ]
     | str
 )
