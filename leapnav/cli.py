@@ -8,8 +8,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
+from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import tyro
@@ -113,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         words = sys.argv[1:] if arguments is None else arguments
         command = parse(words)
-        with json_on_stdout(getattr(command, "json", None)):
+        with json_on_stdout(getattr(command, "json", None)), _warnings_in_one_line():
             return command.run()
     except BrokenPipeError:  # the process that read the output has ended, as in `leapnav bank show ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -128,6 +130,21 @@ def main(arguments: list[str] | None = None) -> int:
         resumption = getattr(command, "resumption", None)
         print(f"leapnav: interrupted{f'; {resumption}' if resumption else ''}", file=sys.stderr)
         return INTERRUPTED
+
+
+@contextmanager
+def _warnings_in_one_line() -> Iterator[None]:
+    """Print a warning to the user without the place in the code; those to developers as usual."""
+    usual = warnings.formatwarning
+
+    def formatted(message: Warning | str, category: type[Warning], *place: Any, **line: Any) -> str:
+        return f"leapnav: warning: {message}\n" if category is UserWarning else usual(message, category, *place, **line)
+
+    warnings.formatwarning = formatted
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _message(error: Exception) -> str:

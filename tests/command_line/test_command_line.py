@@ -3,11 +3,12 @@
 import shutil
 import subprocess
 import sys
+import warnings
 from typing import get_args
 
 import pytest
 
-from leapnav.cli import COMMANDS, main
+from leapnav.cli import COMMANDS, _warnings_in_one_line, main
 from leapnav.commands.options import Family, FamilyOrAll, Horizon, PolicyName, parse_environment
 from leapnav.envs import FAMILIES
 from leapnav.envs.settings import HORIZONS
@@ -98,3 +99,10 @@ def test_shells_complete_commands_and_options(shell, capsys):
     printed = capsys.readouterr().out
     assert end.value.code in (0, None)
     assert all(word in printed for word in ("solve", "evaluate", "--episodes-plot", "play"))
+
+
+def test_a_warning_to_the_user_is_one_line_without_a_place():
+    with _warnings_in_one_line():
+        assert warnings.formatwarning("text", UserWarning, "file.py", 3) == "leapnav: warning: text\n"
+        assert "file.py:3: DeprecationWarning" in warnings.formatwarning("text", DeprecationWarning, "file.py", 3)
+    assert "file.py:3: UserWarning" in warnings.formatwarning("text", UserWarning, "file.py", 3)

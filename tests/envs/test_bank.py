@@ -325,7 +325,7 @@ def test_the_included_banks_are_certified_and_complete(family):
         assert drift.max() <= 1e-7  # at the vertices of polygons the curvature of the level lines jumps
         assert clearance.min() > 0
         assert (np.isnan(shipped.second_costs) | (shipped.second_costs >= shipped.costs)).all()
-        for index in range(0, count, 9):
+        for index in range(0, count, 50):
             scenario, reference = shipped[index], shipped.reference(index)
             timed = np.column_stack([reference.states, reference.times])
             assert footprint_clearances(timed, scenario.outline, scenario.field).min() > 0

@@ -48,10 +48,10 @@ def test_clutter_is_6_to_12_discs_and_open_is_empty():
 def test_families_whose_obstacles_move():
     """Robots start and arrive undisturbed, and nothing moves in the other families."""
     for family in FAMILIES:
-        scenarios = [sample_scenario(family, seed) for seed in range(8)]
+        scenarios = [sample_scenario(family, seed) for seed in range(3)]
         assert all(scenario.moves == (family in MOVING_LAYOUTS) for scenario in scenarios)
     for family in MOVING_LAYOUTS:
-        for seed in range(8):
+        for seed in range(3):
             scenario = sample_scenario(family, seed)
             for pose, first in ((scenario.start, 0.0), (scenario.goal, scenario.horizon - 1.0)):
                 states = np.array([[*pose, first + share] for share in np.linspace(0.0, 1.0, 11)])

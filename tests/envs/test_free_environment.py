@@ -296,7 +296,9 @@ def test_the_expert_and_the_controller_are_evaluated():
     assert controller.success > 0.5 and 0.0 < controller.regret < 1.0
 
 
-@pytest.mark.parametrize(("kind", "train"), [(PPOConfig, train_ppo), (SACConfig, train_sac)])
+@pytest.mark.parametrize(
+    ("kind", "train"), [(PPOConfig, train_ppo), pytest.param(SACConfig, train_sac, marks=pytest.mark.slow)]
+)
 def test_reinforcement_learning_runs(kind, train, tmp_path):
     changes = {"hidden": SMALL, "lidar_beams": 8, "evaluation_scenarios": 2, "total_timesteps": 512, "n_envs": 4}
     if kind is SACConfig:

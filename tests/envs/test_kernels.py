@@ -54,7 +54,7 @@ def run(code, *arguments, **variables):
     [
         ("from leapnav.package.called import SCALE, called", ""),
         pytest.param("from .called import SCALE, called", "", marks=pytest.mark.slow),
-        ("from leapnav.package.nested.again import SCALE, called", ""),
+        pytest.param("from leapnav.package.nested.again import SCALE, called", "", marks=pytest.mark.slow),
     ],
     ids=["absolute", "relative", "through another module"],
 )

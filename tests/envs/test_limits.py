@@ -131,6 +131,7 @@ def test_a_car_does_not_accelerate_beyond_the_limits_of_its_speed(acceleration, 
     assert new == pytest.approx([*position, heading[-1], steering[-1], speed[-1]], abs=1e-8)
 
 
+@pytest.mark.slow
 def test_the_optimum_of_a_car_respects_the_limit_of_its_speed():
     robot = {"model": "dynamic_car", "max_speed": 0.9, "max_acceleration": 2.0}
     scenario = task(robot, horizon=None, cost={"time_weight": 1.0})

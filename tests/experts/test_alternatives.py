@@ -43,6 +43,7 @@ def test_low_and_medium_effort_find_the_best_only():
     assert find_optimum(problem, "medium").cost == solve(problem, "multiple_shooting").cost
 
 
+@pytest.mark.slow
 def test_limits_of_states_are_reached_by_the_best():
     entry = KNOWN["clamped-beam-load-60"]
     optimum = find_optimum(entry.problem)

@@ -154,7 +154,9 @@ def test_a_wrong_solution_is_not_certified():
         assert max(found.certificate.residual, found.certificate.defect) > 1e-7
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [pytest.param("leapfrog", marks=pytest.mark.slow) if m == "leapfrog" else m for m in METHODS]
+)
 def test_a_conjugate_point_of_even_multiplicity_is_seen(method):
     # Two identical oscillators: det dq(t)/dlambda(0) is a square, and vanishes without a change of sign.
     x, y = sp.symbols("x y")

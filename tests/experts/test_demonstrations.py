@@ -32,8 +32,8 @@ def test_replaying_the_optimum_succeeds_at_its_cost():
 @pytest.mark.parametrize("family", FAMILIES)
 def test_replaying_the_optimum_succeeds_in_the_vector_form_too(family):
     bank = ScenarioBank.shipped(family, "test")
-    robots = 12
-    plans = [plan_actions(find_optimum(bank[i]), bank[i], 0.05) for i in range(robots)]
+    robots = 4
+    plans = [plan_actions(find_optimum(bank[i], "medium"), bank[i], 0.05) for i in range(robots)]
     venv = NavigateVectorEnv(robots, bank=bank, observation="state")
     venv.reset(options={"index": list(range(robots))})
     ended = np.zeros(robots, dtype=bool)

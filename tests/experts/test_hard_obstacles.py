@@ -179,8 +179,14 @@ def test_banks_are_built_and_checked(tmp_path):
 
 
 @pytest.mark.parametrize("horizon", ["fixed", "free"])
-@pytest.mark.parametrize("robot", ["unicycle", "car", "dynamic_unicycle"])
-@pytest.mark.parametrize("family", ["clutter", "rooms"])
+@pytest.mark.parametrize(
+    ("family", "robot"),
+    [
+        ("clutter", "unicycle"),
+        ("rooms", "dynamic_unicycle"),
+        *(pytest.param(*task, marks=pytest.mark.slow) for task in [("clutter", "car"), ("rooms", "unicycle")]),
+    ],
+)
 def test_the_expert_reaches_the_goal_from_perturbed_starts(family, robot, horizon):
     scenario = sample_scenario(family, 6001, robot, horizon, "hard")
     optimum = find_optimum(scenario, "medium")

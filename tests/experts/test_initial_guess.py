@@ -36,7 +36,7 @@ def easy(model, horizon, **changes):
     return Scenario.from_dict({**fields, **changes})
 
 
-@pytest.mark.parametrize("horizon", [2.0, None])
+@pytest.mark.parametrize("horizon", [2.0, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("robot", WITH_WAGON)
 def test_every_method_solves_an_easy_scenario_without_a_guess(robot, method, horizon):
@@ -56,8 +56,8 @@ def test_a_free_final_motion_is_lifted(method):
     assert solve(scenario, method).success
 
 
-def test_the_command_solves_for_every_robot(tmp_path, capsys):
-    for robot in WITH_WAGON:
+def test_the_command_solves_by_all_methods(tmp_path, capsys):
+    for robot in ("unicycle", "trailer"):
         path = tmp_path / f"{robot}.json"
         path.write_text(easy(robot, 2.0).to_json())
         assert main(["solve", str(path), "--method", "all"]) == 0

@@ -59,7 +59,6 @@ def random_cells(size, percentage, rng):
 # Maker, size, and width or percentage.
 SMALL = [
     (rooms, 64, 7),
-    (rooms, 512, 31),
     (maze, 512, 7),
     (maze, 64, 5),
     (random_cells, 64, 20),

@@ -225,7 +225,9 @@ def test_an_extremal_beyond_the_bounds_is_not_certified():
     assert extremal.certificate.state_margin == pytest.approx((0.2 - 0.25) / 0.2, rel=1e-4)  # of points along the path
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", ["multiple_shooting", pytest.param("leapfrog", marks=pytest.mark.slow), "collocation"]
+)
 def test_bounds_that_cannot_be_met_are_no_success(method):
     assert not solve(drive_at_most(0.9), method).success
 

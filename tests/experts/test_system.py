@@ -143,7 +143,7 @@ def test_a_slip_in_the_generated_code_is_found_before_it_is_used():
         (sp.sqrt(x**2 + v**2), ((1, 0), (0, 1)), (0, 0), (1, 1), None),
         (sp.log(x), ((1, 0), (0, 1)), (0, 0), (1, 1), None),
         # The singularity is crossed: Leapfrog searches for each arc around it, with 32 segments for a minute.
-        (0, ((1, 0), (0, 1 / x)), (-1, 0), (1, 1), 2),
+        pytest.param(0, ((1, 0), (0, 1 / x)), (-1, 0), (1, 1), 2, marks=pytest.mark.slow),
         (0, ((1, sp.sqrt(x)), (0, 1)), (0, 0), (1, 1), None),
     ],
 )

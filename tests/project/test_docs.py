@@ -53,6 +53,8 @@ PRINTED = {
     "guides/robots.md": r"1\.7322 \[ 4\. +1\. +-?0\. +-0\.2402\] \[-0\.7902 -0\.2627 +0\.0862 +-?0\. *\]\n",
 }
 
+SLOW = ("training.md", "lower_bounds.md", "guides/compare.md")  # their blocks take more than 5 s
+
 
 def blocks_of(text):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -83,7 +85,9 @@ def test_every_page_with_code_is_run():
 
 
 @pytest.mark.usefixtures("coarse_decisions")
-@pytest.mark.parametrize("page", PRINTED)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=pytest.mark.slow if page in SLOW else ()) for page in PRINTED]
+)
 def test_the_blocks_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     printed = output_of("\n".join(blocks_of((ROOT / "docs" / page).read_text())), page)
@@ -103,6 +107,7 @@ def test_every_command_that_the_pages_show_is_one(tmp_path, monkeypatch):
     assert shown > 30
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)

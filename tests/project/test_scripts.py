@@ -71,20 +71,10 @@ def rows(printed):
     return [line for line in printed.splitlines() if line.startswith("| ") and not line.startswith("|--")]
 
 
+@pytest.mark.slow
 def test_the_ablation_of_the_warm_start(script, capsys):
-    script("ablate_warm_start", "--only", "gradient", "--workers", "1", DEMONSTRATIONS=4, PPO_STEPS=800, SAC_STEPS=800)
+    script("ablate_warm_start", "--only", "gradient", "--workers", "1", DEMONSTRATIONS=4, PPO_STEPS=200, SAC_STEPS=200)
     assert [row.split("|")[1].strip()[:4] for row in rows(capsys.readouterr().out)[1:]] == ["PPO:", *["SAC:"] * 3]
-
-
-def test_the_comparison_of_methods(script, capsys):
-    few = {
-        "DEMONSTRATIONS": {"open": 4},
-        "STEPS": {"open": 128},
-        "SAC_STEPS": {"sac": 64, "sacwarm": 64},
-        "N_EVALUATIONS": 1,
-    }
-    script("compare_methods", "--families", "open", "--seeds", "1", **few)
-    assert len(rows(capsys.readouterr().out)) == 1 + 7  # five methods, the included policy and go-to-goal
 
 
 def test_the_study_of_curricula(script, capsys, tmp_path):

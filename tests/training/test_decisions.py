@@ -61,7 +61,7 @@ def test_failures_cost_the_penalties_and_are_lost_before_they_end(tmp_path, caps
     assert decisions[0].episode.scenario in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("decisions", [False, True])
+@pytest.mark.parametrize("decisions", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_regret_of_a_failure_is_that_of_the_returns(decisions):
     """Also of episodes that continue after a contact, until the time limit of a free horizon."""
     environment = {"horizon": "free", "terminate_on_collision": False}

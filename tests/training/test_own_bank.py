@@ -60,7 +60,7 @@ def test_rollout_training_evaluation_and_report_need_no_robot(bank, tmp_path, mo
     lines = [json.loads(line) for line in Path("dagger/evaluations.jsonl").read_text().splitlines()]
     assert [line["split"] for line in lines] == ["train", "test"]
     capsys.readouterr()
-    assert main(["evaluate", "clone", "lattice", "--html", "page.html", "--count", "2", "--workers", "1"]) == 0
+    assert main(["evaluate", "clone", "--html", "page.html", "--count", "2", "--workers", "1"]) == 0
     assert "2 scenarios" in capsys.readouterr().out
     assert main(["rollout", "--policy", "clone", "--family", bank, "--count", "1", "--out", "driven"]) == 0
 

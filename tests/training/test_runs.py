@@ -313,12 +313,12 @@ def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
     assert weights(tmp_path / "stopped") == weights(tmp_path / "straight")
 
 
-def test_sac_and_tqc_train_and_their_policies_load(tmp_path):
-    for algorithm in ("sac", "tqc"):
-        config = sac(tmp_path / algorithm, algorithm=algorithm)
-        train_sac(config, progress=False)
-        policy = load_policy(config.out)
-        assert policy.predict(np.zeros((2, 25), np.float32), deterministic=True)[0].shape == (2, 2)
+@pytest.mark.parametrize("algorithm", [pytest.param("sac", marks=pytest.mark.slow), "tqc"])
+def test_sac_and_tqc_train_and_their_policies_load(algorithm, tmp_path):
+    config = sac(tmp_path / algorithm, algorithm=algorithm)
+    train_sac(config, progress=False)
+    policy = load_policy(config.out)
+    assert policy.predict(np.zeros((2, 25), np.float32), deterministic=True)[0].shape == (2, 2)
 
 
 def test_a_warm_start_takes_demonstrations_or_a_policy(demos, tmp_path):

@@ -63,6 +63,7 @@ def test_the_critic_of_ppo_is_the_cost_to_go(dataset):
     assert np.mean((values - 0.1 * dataset.returns) ** 2) < 0.02 * np.var(0.1 * dataset.returns)
 
 
+@pytest.mark.slow
 def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
     """Fitting the costates reduces the error of the value's gradient on unseen scenarios."""
     test = [sample_scenario("open", seed) for seed in range(900, 906)]
@@ -86,6 +87,7 @@ def test_fitting_the_costate_makes_the_critics_slope_better(dataset):
     assert errors[0] < 0.7 * errors[1]
 
 
+@pytest.mark.slow
 def test_the_q_functions_of_sac_know_what_an_action_costs(dataset):
     """Q is the value at the expert's action, and lower at other actions by the cost according to the Hamiltonian."""
     model = SAC("MlpPolicy", make_vec_env(n_envs=1, family="open"), policy_kwargs=small(), gamma=1.0, seed=0)
@@ -189,7 +191,7 @@ def test_batches_hold_their_share_of_demonstrations(dataset):
         buffer.sample(8, env=VecNormalize(venv))
 
 
-@pytest.mark.parametrize("kind", [SAC, TD3])
+@pytest.mark.parametrize("kind", [SAC, pytest.param(TD3, marks=pytest.mark.slow)])
 def test_imitation_holds_an_actor_to_the_demonstrations(kind, dataset):
     """With an untrained critic the actor drifts away from a clone, unless its loss has the imitation term."""
     error = {}

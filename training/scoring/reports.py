@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import IO, Any
 
@@ -159,8 +159,17 @@ def runs_cell(interval: Interval, factor: float, digits: int, interval_digits: i
 
 def markdown_cells(row: Score) -> str:
     """Return the `MARKDOWN_COLUMNS`, with intervals over the scenarios, as cells of a Markdown table."""
+    return _markdown(row, cell)
+
+
+def markdown_run_cells(row: Score) -> str:
+    """Return the `MARKDOWN_COLUMNS`, with the values of each run and intervals over runs and scenarios."""
+    return _markdown(row, runs_cell)
+
+
+def _markdown(row: Score, form: Callable[[Interval, float, int, int], str]) -> str:
     columns = [(name, factor, digits) for _, name, factor, digits, _ in COLUMNS if name in MARKDOWN_COLUMNS]
-    cells = [cell(getattr(row, name), factor, digits, digits) for name, factor, digits in columns]
+    cells = [form(getattr(row, name), factor, digits, digits) for name, factor, digits in columns]
     return " | ".join(cells).replace("\n", " ")
 
 
