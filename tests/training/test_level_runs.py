@@ -1,5 +1,6 @@
 """Training runs with level samplers, callbacks and wrappers."""
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -12,6 +13,7 @@ from leapnav.envs.unwrapping import unwrap
 from leapnav.training.config import LevelsName, PPOConfig
 from leapnav.training.environments.level_samplers import SCORES, UniformSampler
 from leapnav.training.runs.reinforcement import make_training_env, train_ppo
+from leapnav.training.scoring.comparison import _trains_on
 
 
 def ppo(out, **changes):
@@ -80,3 +82,11 @@ def test_a_bank_of_levels_has_the_robot_and_the_horizon_of_the_run(tmp_path):
         with pytest.raises(ValueError, match=message):
             train_ppo(ppo(tmp_path / "run", levels="uniform", level_bank=bank.path), progress=False)
     assert not (tmp_path / "run").exists()
+
+
+def test_banks_that_were_used_for_training_are_named(tmp_path):
+    train, test = (ScenarioBank.shipped("open", split) for split in ("train", "test"))
+    levels = PPOConfig(out=tmp_path, family="open", levels="uniform")
+    assert _trains_on(levels, train) and not _trains_on(levels, test)
+    assert not _trains_on(PPOConfig(out=tmp_path, family="open"), train)
+    assert _trains_on(replace(levels, level_bank=test.path), test)

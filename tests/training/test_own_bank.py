@@ -61,7 +61,9 @@ def test_rollout_training_evaluation_and_report_need_no_robot(bank, tmp_path, mo
     assert [line["split"] for line in lines] == ["train", "test"]
     capsys.readouterr()
     assert main(["evaluate", "clone", "--html", "page.html", "--count", "2", "--workers", "1"]) == 0
-    assert "2 scenarios" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "2 scenarios" in printed and "open: clone trained in these scenarios" in printed
+    assert "open: clone trained in these scenarios." in Path("page.html").read_text()
     assert main(["rollout", "--policy", "clone", "--family", bank, "--count", "1", "--out", "driven"]) == 0
 
 

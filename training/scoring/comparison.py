@@ -11,7 +11,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of
-from leapnav.training.config import RunConfig, read_config
+from leapnav.training.config import PPOConfig, RunConfig, read_config
 from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.results import Evaluation, bank_identity
@@ -92,6 +92,19 @@ class Comparison:
             for name, evaluations in self.runs.items()
         }
         return Comparison(banks, runs, self.seed, self.folders)
+
+    def trained_on(self, bank: ScenarioBank) -> list[str]:
+        """Return the rows with a run that was trained in the scenarios of a bank."""
+        rows = self.folders.items()
+        return [row for row, folders in rows if any(_trains_on(read_config(folder)[1], bank) for folder in folders)]
+
+
+def _trains_on(config: RunConfig, bank: ScenarioBank) -> bool:
+    """Return whether the training scenarios of a run are those of a bank."""
+    given: list[str | Path] = [config.family]
+    if isinstance(config, PPOConfig) and config.levels != "fresh":
+        given.append(config.level_bank or ScenarioBank.shipped(config.family, "train", **config.task).path)
+    return any(Path(path).resolve() == bank.path.resolve() for path in given)
 
 
 # A policy to compare: a name, an object or a function (see `evaluate`), one of these with the arguments of its

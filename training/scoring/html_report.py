@@ -40,6 +40,7 @@ from leapnav.training.scoring.reports import (
     row_name,
     runs_cell,
     sensors_of,
+    training_notes,
 )
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.scoring.scores import Score
@@ -95,6 +96,7 @@ def write_report(comparison: Comparison, path: str | os.PathLike[str], *, progre
         episodes=scores[0].episodes,
         banks=[f"{bank.family}, {bank.path.name}" for bank in comparison.banks],
         sensors=sensors_of(comparison),
+        notes=training_notes(comparison),
         seeds=_seeds(scores),
         columns=[*_titles(COLUMNS), "unknown", "time ms"],
         rows=[

@@ -71,6 +71,8 @@ def print_scores(comparison: Comparison) -> None:
         print_table(("policy", *(title for title, *_ in columns)), rows, title=RUNS_TITLE)
     observed = [f"{sensors} ({', '.join(names)})" for sensors, names in sensors_of(comparison).items()]
     print(f"Observed: {'; '.join(observed)}")
+    for note in training_notes(comparison):
+        print(note)
     if any(row.reached_regret.value < 0 for row in scores):
         print(NEGATIVE_REGRET)
     if any(row.true_regret.episodes for row in scores):
@@ -79,6 +81,14 @@ def print_scores(comparison: Comparison) -> None:
             print(f"  {row_name(row)}: {_bracket_text(row.true_regret)}")
     if len(comparison.banks) > 1:
         _print_banks(comparison)
+
+
+def training_notes(comparison: Comparison) -> list[str]:
+    """Return a sentence for each bank whose scenarios some of the policies were trained in."""
+    trained = {
+        name: comparison.trained_on(bank) for name, bank in zip(comparison.bank_names, comparison.banks, strict=True)
+    }
+    return [f"{name}: {', '.join(rows)} trained in these scenarios" for name, rows in trained.items() if rows]
 
 
 def sensors_of(comparison: Comparison) -> dict[str, list[str]]:
