@@ -12,6 +12,7 @@ import yaml
 from helpers import ROOT
 
 import leapnav
+import leapnav.training
 from leapnav.cli import parse
 from leapnav.envs import Scenario
 
@@ -80,6 +81,14 @@ def test_the_readme_s_examples_run_as_printed(tmp_path, monkeypatch):
         assert re.fullmatch(expected, printed), (block, printed)
 
 
+def test_every_public_name_of_the_training_is_in_the_reference():
+    texts = (
+        (ROOT / "docs" / "reference" / f"{page}.md").read_text() for page in ("training", "learning", "evaluation")
+    )
+    members = [re.search(r"::: leapnav\.training\n(?: .*\n)*? +members: \[([^]]*)\]", text)[1] for text in texts]
+    assert sorted(re.findall(r"\w+", " ".join(members))) == sorted(leapnav.training.__all__)
+
+
 def test_every_page_with_code_is_run():
     pages = [path for path in (ROOT / "docs").rglob("*.md") if "```python" in path.read_text()]
     assert {str(path.relative_to(ROOT / "docs")) for path in pages} == set(PRINTED)
@@ -115,18 +124,22 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     checked = subprocess.run([sys.executable, CHECK_LINKS, tmp_path], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout + checked.stderr
-    theory, reference, training, commands, changes = (
+    theory, reference, learning, evaluation, commands, changes = (
         (tmp_path / page / "index.html").read_text()
-        for page in ("theory", "reference/experts", "reference/training", "reference/cli", "changelog")
+        for page in (
+            "theory",
+            *(f"reference/{name}" for name in ("experts", "learning", "evaluation", "cli")),
+            "changelog",
+        )
     )
     assert theory.count('class="formula formula--') > 50
     assert "arithmatex" not in theory
     for name in ("solve.solve", "find_optimum", "ExpertPolicy", "rollout"):
         assert f'id="leapnav.experts.{name}"' in reference
     for row in (("family", "str"), ("index", "int"), ("scenario", "str"), ("states", "ndarray")):
-        assert row in documented(training, "leapnav.training.Episode")
+        assert row in documented(evaluation, "leapnav.training.Episode")
     assert ("costates", "ndarray") in documented(reference, "leapnav.experts.Extremal")
-    assert ("max_failures", "int") in documented(training, "leapnav.training.DAggerConfig")
+    assert ("max_failures", "int") in documented(learning, "leapnav.training.DAggerConfig")
     assert "usage: leapnav train ppo" in commands
     assert "::help" not in commands
     assert 'href="../contributing/"' in changes
