@@ -1,5 +1,7 @@
 """Clients of the environments and the policies: wrappers of Gymnasium, models of Stable-Baselines3, recorders."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from gymnasium.wrappers import (
     RescaleAction,
 )
 from gymnasium.wrappers.vector import RescaleAction as RescaleActions
+from onnxruntime import InferenceSession
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
@@ -22,13 +25,16 @@ from leapnav.experts import ExpertPolicy, rollout
 from leapnav.training import (
     CloningConfig,
     Dataset,
+    WarmStartConfig,
     behaviour_clone,
     evaluate,
     load_policy,
     network,
     policy_environment,
     save_policy,
+    warm_start,
 )
+from leapnav.training.policies.onnx_export import export_onnx
 from leapnav.training.policies.zips import load_zip
 from leapnav.training.scoring.policy_specs import load_policy_spec
 
@@ -254,3 +260,37 @@ def test_models_with_observations_in_dictionaries_are_evaluated(goal, tmp_path, 
     assert "lidar, 16 beams" in capsys.readouterr().out
     with pytest.raises(ValueError, match="expected a Box, got Dict"):
         sb3.PPO("MultiInputPolicy", env, policy_kwargs=network())
+
+
+@pytest.mark.parametrize("kind", [sb3.PPO, sb3.SAC])
+def test_models_with_observations_in_dictionaries_are_cloned_warm_started_saved_and_exported(kind, dataset, tmp_path):
+    arguments = {"dict_observation": True, "lidar_beams": 16}
+    env = open_env(**arguments)
+    steps = {"n_steps": 64, "batch_size": 64} if kind is sb3.PPO else {"learning_starts": 1000}
+    model = kind("MultiInputPolicy", env, seed=0, device="cpu", **steps)
+    losses = behaviour_clone(model, dataset, CloningConfig(epochs=3, batch_size=256), progress=False)
+    assert losses[-1].training < 0.8 * losses[0].training
+    found = warm_start(model, dataset, WarmStartConfig(actor=False, critic_epochs=1, slopes=100), progress=False)
+    assert np.isfinite(found.value_error)
+    save_policy(model, tmp_path / "policy")
+    assert policy_environment(tmp_path / "policy")["dict_observation"]
+    loaded = load_policy(tmp_path / "policy", env)
+    description = json.loads(export_onnx(tmp_path / "policy", tmp_path / "policy.onnx").read_text())
+    session = InferenceSession(str(tmp_path / "policy.onnx"))
+    rows = []
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        expected = model.predict(observation, deterministic=True)[0]
+        np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], expected)
+        flat = open_env(lidar_beams=16).reset(seed=seed)[0]
+        np.testing.assert_allclose(session.run(None, {"observation": flat[None]})[0][0], expected, atol=1e-5)
+        rows.append(flat)
+    assert len(description["observation"]) == len(rows[0])
+    costs = [
+        [episode.cost for episode in evaluate(policy, "open", environment=settings, count=2, timed=False)]
+        for policy, settings in ((model, None), (loaded, policy_environment(tmp_path / "policy")))
+    ]
+    assert costs[0] == costs[1]
+    goal = gym.make("leapnav/NavigateGoal-v0", family="open")
+    with pytest.raises(ValueError, match="expected the parts of an observation of dict_observation=True, got achieved"):
+        save_policy(kind("MultiInputPolicy", goal), tmp_path / "goal")

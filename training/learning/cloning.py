@@ -6,11 +6,12 @@ import copy
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from torch.nn import functional
@@ -30,7 +31,7 @@ from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.samples import Batch, Samples, Symmetry, split_courses
 from leapnav.training.learning.symmetries import mirror, time_reverse
-from leapnav.training.policies.actors import actor_parameters, policy_of, set_noise, update_target
+from leapnav.training.policies.actors import actor_parameters, parts_of_dict, policy_of, set_noise, update_target
 from leapnav.training.threads import limit_threads
 
 # Gradient steps of a fit with the default epochs, and bounds of the default batch size. A network that has learned from
@@ -291,14 +292,17 @@ def samples_for(
         settings = unwrap(venv)[0].settings
     except TypeError:  # another environment, or none
         return samples
-    return samples.observed(settings)
+    if settings.goal_conditioned:  # refused by `check_observations`
+        return samples
+    return samples.observed(replace(settings, dict_observation=False))
 
 
 def check_observations(policy: BasePolicy, dataset: Dataset) -> None:
     """Raise ValueError unless the observations of a dataset have the shape that a policy expects."""
-    shape, width = policy.observation_space.shape, dataset.observations.shape[1]
+    space, width = policy.observation_space, dataset.observations.shape[1]
+    shape = (sum(parts_of_dict(space).values()),) if isinstance(space, spaces.Dict) else space.shape or ()
     if shape != (width,):
-        expected = "a dict" if shape is None else " x ".join(map(str, shape))
+        expected = " x ".join(map(str, shape))
         raise ValueError(f"dataset: its observations have {width} numbers, the policy's {expected}")
 
 

@@ -31,7 +31,7 @@ from leapnav.training.learning.cloning import (
 )
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.samples import action_slopes
-from leapnav.training.policies.actors import copy_actor, policy_of
+from leapnav.training.policies.actors import as_observation, copy_actor, policy_of
 from leapnav.training.threads import limit_threads
 
 # Standard deviations (m, m, rad) of the random state offsets over which the slope of the cost-to-go is fitted: small
@@ -242,8 +242,8 @@ class _Critic:
     def values(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Compute estimates (B, n) of the value network, of each Q function, or of the quantiles of all Q functions."""
         if isinstance(self._policy, ActorCriticPolicy):
-            return self._policy.predict_values(observations)
-        estimates = self._functions(observations, actions)
+            return self._policy.predict_values(as_observation(self._policy, observations))
+        estimates = self._functions(as_observation(self._policy, observations), actions)
         if isinstance(estimates, tuple):
             return th.cat(estimates, dim=1)
         return estimates.flatten(start_dim=1)

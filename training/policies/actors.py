@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.sac.policies import Actor
 from torch import nn
 
+from leapnav.envs.simulation.observations import OFFSETS
 from leapnav.training.policies.navigation_policy import MomentumActor
 from leapnav.training.policies.network import NavigationFeatures
 
@@ -58,6 +61,29 @@ def action_range(space: Any) -> tuple[np.ndarray, np.ndarray]:
     return (space.high + space.low) / np.float32(2), (space.high - space.low) / np.float32(2)
 
 
+def parts_of_dict(space: spaces.Dict) -> dict[str, int]:
+    """Return the sizes of the parts of an observation in a Dict, in the order of the observation in one vector.
+
+    Raises:
+        ValueError: the Dict is not that of `dict_observation=True`, but for example that of `NavigateGoalEnv`.
+
+    """
+    sizes = {name: spaces.flatdim(space[name]) for name in OFFSETS.names or () if name in space.spaces}
+    if set(sizes) != set(space.spaces) or "goal" not in sizes:
+        names = ", ".join(space.spaces)
+        raise ValueError(f"model: expected the parts of an observation of dict_observation=True, got {names}")
+    return sizes
+
+
+def as_observation(policy: BasePolicy, rows: Any) -> Any:
+    """Return observations (B, d) in one vector as those of a policy, which may be a Dict of the parts."""
+    space = policy.observation_space
+    if not isinstance(space, spaces.Dict) or isinstance(rows, Mapping):
+        return rows
+    sizes = parts_of_dict(space)
+    return dict(zip(sizes, rows.split(list(sizes.values()), dim=1), strict=True))
+
+
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     """Compute the deterministic actions of a policy without momentum, not clipped, with gradients.
 
@@ -66,12 +92,13 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
 
     Args:
         policy: the policy.
-        observations: (B, d).
+        observations: (B, d), or a dictionary of their parts.
 
     Returns:
         The actions (B, m).
 
     """
+    observations = as_observation(policy, observations)
     if isinstance(policy, ActorCriticPolicy):
         features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
         middle, half = (th.as_tensor(part, device=features.device) for part in action_range(policy.action_space))

@@ -9,28 +9,30 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from leapnav.envs.utils.validation import check_choice
+from leapnav.training.policies.actors import parts_of_dict
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, has_momentum
 from leapnav.training.policies.network import NavigationFeatures, check_spaces
 
 KINDS = ("actor-critic", "sac", "td3", "tqc")
-EXTRACTORS = {"navigation": NavigationFeatures, "flatten": FlattenExtractor}
+EXTRACTORS = {"navigation": NavigationFeatures, "flatten": FlattenExtractor, "combined": CombinedExtractor}
 ACTIVATIONS = {kind.__name__: kind for kind in (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.LeakyReLU, nn.SiLU, nn.Sigmoid)}
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """The architecture of an `MlpPolicy`, as JSON values.
+    """The architecture of an `MlpPolicy` or `MultiInputPolicy`, as JSON values.
 
     Attributes:
         kind: "actor-critic" (PPO, A2C), "sac", "td3" (also DDPG) or "tqc".
         hidden, critic: widths of the hidden layers of the actor and of the critic.
-        extractor: "navigation" (`NavigationFeatures`) or "flatten" (the observation itself).
+        extractor: "navigation" (`NavigationFeatures`), "flatten" (the observation itself) or "combined" (the parts of
+            an observation in a Dict).
         activation: name of the activation function in `torch.nn`.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`, or None.
 
@@ -43,7 +45,7 @@ class Architecture:
     activation: str = "ReLU"
     effort_weights: tuple[float, ...] | None = None
 
-    def make(self, observation_space: spaces.Box, action_space: spaces.Space) -> BasePolicy:
+    def make(self, observation_space: spaces.Box | spaces.Dict, action_space: spaces.Space) -> BasePolicy:
         """Create an untrained policy on the CPU.
 
         Raises:
@@ -56,6 +58,8 @@ class Architecture:
         check_choice("activation", self.activation, ACTIVATIONS)
         if self.extractor == "navigation":
             check_spaces(observation_space, action_space)
+        if isinstance(observation_space, spaces.Dict) != (self.extractor == "combined"):
+            raise ValueError(f"extractor: expected that of the observations, got {self.extractor!r}")
         arguments: dict[str, Any] = {
             "net_arch": {"pi": list(self.hidden), "vf": list(self.critic), "qf": list(self.critic)},
             "activation_fn": ACTIVATIONS[self.activation],
@@ -80,9 +84,8 @@ class Architecture:
                 f"model: expected a policy of PPO, A2C, SAC, TD3, DDPG or TQC, got {type(policy).__name__}"
             )
         given: Any = policy
-        if not isinstance(policy.observation_space, spaces.Box):
-            got = type(policy.observation_space).__name__
-            raise ValueError(f"model: expected an MlpPolicy for observations in a Box, got a {got}")
+        if isinstance(policy.observation_space, spaces.Dict):
+            parts_of_dict(policy.observation_space)
         extractor = _name_of("features extractor", EXTRACTORS, policy.features_extractor_class)
         activation = _name_of("activation function", ACTIVATIONS, given.activation_fn)
         if getattr(given, "use_sde", False):

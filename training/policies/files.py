@@ -50,8 +50,9 @@ def save_policy(
     """Save a policy as `policy.json` (description) and `weights.pt` (tensors only) in a directory.
 
     Args:
-        model: a Stable-Baselines3 algorithm with an "MlpPolicy" (PPO, A2C, SAC, TD3, DDPG or TQC), with the default
-            network or that of `leapnav.training.network`, or its policy.
+        model: a Stable-Baselines3 algorithm (PPO, A2C, SAC, TD3, DDPG or TQC) with an "MlpPolicy", with the default
+            network or that of `leapnav.training.network`, or with a "MultiInputPolicy" for `dict_observation=True`; or
+            its policy.
         folder: the directory; created if it does not exist.
         environment: the arguments of `gym.make` for which the policy was trained, except the family; None: those of
             the model's environment, if it has one.
@@ -66,15 +67,14 @@ def save_policy(
     """
     policy, folder = policy_of(model), Path(folder)
     architecture = Architecture.of(policy)
-    assert isinstance(policy.observation_space, spaces.Box)  # checked above
-    assert isinstance(policy.action_space, spaces.Box)
+    assert isinstance(policy.action_space, spaces.Box)  # checked above
     environment = environment_of(model) if environment is None else environment
     space = NavigateEnv(split="fresh", **environment).observation_space
     if space != policy.observation_space:
         raise ValueError(
             f"environment: has observations {space.shape or 'in a dict'}, the policy's are "
-            f"{policy.observation_space.shape} or have other bounds; pass the arguments of gym.make that it was "
-            "trained with"
+            f"{policy.observation_space.shape or 'in a dict'} or have other bounds; pass the arguments of gym.make "
+            "that it was trained with"
         )
     folder.mkdir(parents=True, exist_ok=True)
     weights = policy.state_dict()
@@ -89,8 +89,8 @@ def save_policy(
         "format": FORMAT,
         "leapnav": leapnav.__version__,
         "environment": {"id": ENVIRONMENT, **_as_dict(EnvironmentSettings(**environment))},
-        "observation_low": policy.observation_space.low.tolist(),
-        "observation_high": policy.observation_space.high.tolist(),
+        "observation_low": _bounds(policy.observation_space, "low"),
+        "observation_high": _bounds(policy.observation_space, "high"),
         "action_low": policy.action_space.low.tolist(),
         "action_high": policy.action_space.high.tolist(),
         **asdict(architecture),
@@ -99,6 +99,20 @@ def save_policy(
     }
     description["sha256"] = _checksum(folder, description)
     write_text(folder / "policy.json", encode(description, indent=1) + "\n")
+
+
+def _bounds(space: spaces.Space, side: str) -> Any:
+    """Return the bounds of a Box as a list, those of a Dict by their names."""
+    if isinstance(space, spaces.Dict):
+        return {name: _bounds(part, side) for name, part in space.spaces.items()}
+    return getattr(space, side).tolist()
+
+
+def _space(low: Any, high: Any) -> Any:
+    """Return the space with the given `_bounds`."""
+    if isinstance(low, dict):
+        return spaces.Dict({name: _space(low[name], high[name]) for name in low})
+    return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
 def _checksum(folder: Path, description: Mapping[str, Any]) -> str:
@@ -211,8 +225,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
     description = read_description(folder)
     folder = policy_folder(folder)
     try:
-        low, high = (np.array(description[name], np.float32) for name in ("observation_low", "observation_high"))
-        observation_space = spaces.Box(low, high, dtype=np.float32)
+        observation_space = _space(description["observation_low"], description["observation_high"])
         n_controls = _n_controls(description["environment"])
         least, most = (  # older files do not contain these bounds, which are -1 and 1 without a wrapper of actions
             np.array(description.get(name, [bound] * n_controls), np.float32)
@@ -265,7 +278,7 @@ def _n_controls(environment: Mapping[str, Any]) -> int:
     return robot_class(environment["robot"]).sizes()[1]
 
 
-def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Box, env: Any) -> None:
+def _check_environment(folder: Path, description: dict[str, Any], space: spaces.Space, env: Any) -> None:
     """Check that an environment has the observations that the policy was trained with."""
     trained = _observed(description)
     for inner in unwrap(env):

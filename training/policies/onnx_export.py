@@ -6,13 +6,14 @@ import logging
 import warnings
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
@@ -22,7 +23,7 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.observations import Entry, observation_entries
 from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
-from leapnav.training.policies.actors import mean_action, policy_of
+from leapnav.training.policies.actors import mean_action, parts_of_dict, policy_of
 from leapnav.training.policies.files import load_policy, policy_environment
 from leapnav.training.policies.navigation_policy import deterministic_action
 
@@ -49,10 +50,10 @@ def export_onnx(
 ) -> Path:
     """Export the deterministic actor of a policy to an ONNX file, with a description of its observations beside it.
 
-    The model has the input "observation" (N, d), float32, and the output "action" (N, 2) in [-1, 1]: speed and turn
-    rate in units of the robot's limits. The description, `FILE.json`, lists names, units, order and bounds of the
-    entries of an observation, and the arguments of the environment. After the export, the actions are compared with
-    those of torch.
+    The model has the input "observation" (N, d), float32, also for a policy with observations in a Dict, and the output
+    "action" (N, 2) in [-1, 1]: speed and turn rate in units of the robot's limits. The description, `FILE.json`, lists
+    names, units, order and bounds of the entries of an observation, and the arguments of the environment. After the
+    export, the actions are compared with those of torch.
 
     Args:
         policy: a policy or model of Stable-Baselines3, or the name of one, see `load_policy`.
@@ -79,10 +80,13 @@ def export_onnx(
         policy = load_policy(policy)
     actor = _Actor(policy_of(policy)).eval().to("cpu")
     settings = EnvironmentSettings(**(environment or {}))
-    entries = observation_entries(settings)
-    shape = actor.policy.observation_space.shape
-    if shape != (len(entries),):
-        raise ValueError(f"environment: has observations ({len(entries)},), the policy's are {shape}")
+    entries = observation_entries(replace(settings, dict_observation=False))
+    space = actor.policy.observation_space
+    if isinstance(space, spaces.Dict):
+        parts_of_dict(space)
+    if spaces.flatdim(space) != len(entries):
+        expected = spaces.flatdim(space)
+        raise ValueError(f"environment: has observations of {len(entries)} numbers, the policy's {expected}")
     low, high = (np.array([getattr(entry, side) for entry in entries], np.float32) for side in ("low", "high"))
     examples = np.random.default_rng(0).uniform(np.maximum(low, -10), np.minimum(high, 10), (N_CHECKED, len(entries)))
     observations = th.as_tensor(examples.astype(np.float32))
