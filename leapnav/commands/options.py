@@ -40,6 +40,7 @@ PolicyName = (
         "clutter-lidar",
         "polygons-lidar",
         "rooms-lidar",
+        "slalom-lidar",
     ]
     | str
 )

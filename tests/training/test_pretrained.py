@@ -24,6 +24,7 @@ SOC = {
     "rooms": 0.993,
     "rooms-lidar": 0.828,
     "slalom": 0.991,
+    "slalom-lidar": 0.979,
 }
 
 
