@@ -80,10 +80,11 @@ def export_onnx(
         policy = load_policy(policy)
     actor = _Actor(policy_of(policy)).eval().to("cpu")
     settings = EnvironmentSettings(**(environment or {}))
-    entries = observation_entries(replace(settings, dict_observation=False))
-    space = actor.policy.observation_space
+    space, flat = actor.policy.observation_space, settings
     if isinstance(space, spaces.Dict):
         parts_of_dict(space)
+        flat = replace(settings, dict_observation=False)
+    entries = observation_entries(flat)
     if spaces.flatdim(space) != len(entries):
         expected = spaces.flatdim(space)
         raise ValueError(f"environment: has observations of {len(entries)} numbers, the policy's {expected}")
