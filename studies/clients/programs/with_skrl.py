@@ -1,4 +1,4 @@
-"""skrl: PPO's memory and trainer are not tried, its wrappers of single and vector environments are."""
+"""skrl: the wrappers of single and vector environments; its memories and trainers are not tried."""
 
 import gymnasium as gym
 import torch
