@@ -117,12 +117,16 @@ def main() -> None:
         parser.error("--tiny: needs --out, so that the results in the repository are kept")
     results = arguments.out or HERE / "results"
     results.mkdir(parents=True, exist_ok=True)
+    differing = []
     for name in arguments.names or (TINY if arguments.tiny else CLIENTS):
         found = try_client(name, arguments.runs.absolute() / "clients" / name)
         (results / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         wrong = [line["what"] for line in found["tried"] if not is_right(line)]
         print(f"{name} {found['version']}: {'differs: ' + ', '.join(wrong) if wrong else 'right'}", flush=True)
+        differing += [name] if wrong else []
     print(tables(results)["clients"])
+    if differing:
+        sys.exit(f"other returns than evaluate: {', '.join(differing)}")
 
 
 if __name__ == "__main__":

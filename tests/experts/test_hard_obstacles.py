@@ -184,7 +184,10 @@ def test_banks_are_built_and_checked(tmp_path):
     [
         ("clutter", "unicycle"),
         ("rooms", "dynamic_unicycle"),
-        *(pytest.param(*task, marks=pytest.mark.slow) for task in [("clutter", "car"), ("rooms", "unicycle")]),
+        *(
+            pytest.param(*task, marks=pytest.mark.slow)
+            for task in [("clutter", "car"), ("clutter", "dynamic_unicycle"), ("rooms", "unicycle"), ("rooms", "car")]
+        ),
     ],
 )
 def test_the_expert_reaches_the_goal_from_perturbed_starts(family, robot, horizon):

@@ -112,7 +112,16 @@ def barrier_sums(points: np.ndarray, scenario: Scenario) -> tuple[np.ndarray, np
         return lengths.min(axis=0), (1.0 / np.expm1(lengths / scale)).sum(axis=0)
 
 
-@pytest.mark.parametrize(("spacing", "weight"), [(0.2, 0.0), (0.2, 1.0), (0.05, 0.0), (0.05, 0.03), (0.0125, 0.03)])
+@pytest.mark.parametrize(
+    ("spacing", "weight"),
+    [
+        *[(0.2, 0.0), (0.2, 1.0), (0.05, 0.0), (0.05, 0.03), (0.0125, 0.03)],
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [(0.2, 0.03), (0.05, 1.0), (0.0125, 0.0), (0.0125, 1.0)]
+        ),
+    ],
+)
 def test_the_running_cost_is_bounded_on_every_square(spacing: float, weight: float, rng: np.random.Generator):
     """At 49 points of each square, with its corners, and close to contact; Phi is computed without the kernels."""
     scenario = walls_and_corners(proximity_weight=weight)

@@ -226,7 +226,7 @@ def test_an_extremal_beyond_the_bounds_is_not_certified():
 
 
 @pytest.mark.parametrize(
-    "method", ["multiple_shooting", pytest.param("leapfrog", marks=pytest.mark.slow), "collocation"]
+    "method", [pytest.param(name, marks=pytest.mark.slow) if name == "leapfrog" else name for name in METHODS]
 )
 def test_bounds_that_cannot_be_met_are_no_success(method):
     assert not solve(drive_at_most(0.9), method).success
