@@ -354,13 +354,14 @@ class BatchSimulator:
 def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
     model = settings.model
-    kernels = [clearances, footprint_clearances, stepping.start_episodes, stepping.end_periods, observe_robots]
+    kernels = [clearances, footprint_clearance, footprint_clearances]  # also of the check of a scenario
+    kernels += [stepping.start_episodes, stepping.end_periods, observe_robots]
     if settings.motors:
         kernels += [stepping.begin_periods, stepping.push_bodies, coast, no_state_cost]
     else:
         kernels += [stepping.drive, model.advance, model.state_cost or no_state_cost]
     if settings.shaped:  # the optima of banks, which guide the robots, are checked
-        kernels += [footprint_clearance, footprint_value]
+        kernels.append(footprint_value)
     if settings.observation == "geodesic":
         kernels.append(solve_eikonal)
     if not settings.terminate_on_collision:

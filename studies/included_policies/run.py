@@ -9,107 +9,31 @@ python studies/included_policies/run.py clutter --train   # trains and includes 
 with a tiny budget, to try the script; it needs `--out`.
 """
 
-import argparse
-import json
-import os
 import shutil
-from dataclasses import dataclass, replace
+import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from leapnav.envs import ScenarioBank
-from leapnav.envs.scenarios.bank import collection_name
 from leapnav.envs.scenarios.families import families_of
-from leapnav.experts import build_bank
-from leapnav.training import (
-    CloningConfig,
-    DAggerConfig,
-    DAggerRunConfig,
-    Evaluation,
-    evaluate,
-    load_policy,
-    policy_environment,
-    read_episodes,
-    save_policy,
-    score,
-    train_dagger,
-    write_episodes,
-)
+from leapnav.training import DAggerRunConfig, load_policy, policy_environment, read_episodes, save_policy, score
 from leapnav.training.config import read_config
 from leapnav.training.policies.files import SHIPPED, read_description
 from leapnav.training.scoring.reports import markdown_cells
 
+sys.path.append(str(Path(__file__).parents[1]))
+from common import fresh_bank, load, play, read_arguments, train
+
 HERE = Path(__file__).parent
 NAMES = tuple(sorted(path.stem for path in (HERE / "configurations").glob("*.json")))
-SCENARIOS, SEED = 4000, 784  # of each bank of fresh scenarios
+SCENARIOS = 4000  # of each bank of fresh scenarios
 TABLES = {"included-policies": "docs/results.md"}  # with the files that contain them
 
 
-@dataclass(frozen=True)
-class Budget:
-    """How much is computed.
-
-    Attributes:
-        scenarios: number of fresh scenarios of each family.
-        training: changes of the settings of the training.
-
-    """
-
-    scenarios: int
-    training: dict[str, Any]
-
-
-FULL = Budget(SCENARIOS, {})
-TINY = Budget(
-    4,
-    {
-        "hidden": (16, 16),
-        "n_envs": 2,
-        "scenarios": 4,
-        "evaluation_scenarios": 2,
-        "cloning": CloningConfig(epochs=1, batch_size=64),
-        "dagger": DAggerConfig(rounds=1, max_episodes=4, max_failures=2, lead=0.5, epochs=1, last_epochs=1),
-    },
-)
-
-
-def configuration(name: str) -> DAggerRunConfig:
-    """Return the settings of a policy."""
-    _, config = read_config(HERE / "configurations" / f"{name}.json")
-    assert isinstance(config, DAggerRunConfig)
-    return config
-
-
-def train(name: str, runs: Path, included: Path, budget: Budget) -> None:
-    """Train a policy, or resume its run, and write the actor in half precision into the directory of the policies."""
-    run, shipped = runs / "included_policies" / name, included / name
-    resume = (run / "config.json").exists()
-    config = replace(configuration(name), **budget.training, out=run, resume=resume)
-    train_dagger(config, workers=os.cpu_count() or 1, progress=budget is FULL)
-    shutil.rmtree(shipped, ignore_errors=True)
+def include(run: Path, included: Path) -> None:
+    """Write the actor of a run, in half precision, into the directory of the policies."""
+    shutil.rmtree(included, ignore_errors=True)
     training = read_description(run)["training"]
-    save_policy(load_policy(run), shipped, policy_environment(run), training=training, half=True)
-
-
-def fresh_bank(family: str, config: DAggerRunConfig, runs: Path, count: int) -> ScenarioBank:
-    """Return the bank of fresh scenarios of a family, built at the first call."""
-    task = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
-    path = runs / "fresh" / f"{collection_name(family, *task.values())}-{count}.bank"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return build_bank(family, count, path, **task, seed=SEED, workers=os.cpu_count() or 1, progress=count == SCENARIOS)
-
-
-def score_policy(name: str, included: Path, runs: Path, results: Path, budget: Budget) -> None:
-    """Score a policy in fresh scenarios of its families, and write the episodes."""
-    config, found = configuration(name), []
-    policy, environment = load_policy(included / name), policy_environment(included / name)
-    for family in families_of(config.family):
-        bank = fresh_bank(family, config, runs, budget.scenarios)
-        workers = os.cpu_count() or 1
-        options = {"timed": False, "workers": workers, "progress": budget is FULL}
-        found += evaluate(policy, bank, environment=environment, **options).episodes
-    results.mkdir(parents=True, exist_ok=True)
-    write_episodes({name: [Evaluation(tuple(found), float("nan"))]}, results / f"{name}.jsonl.gz")
+    save_policy(load_policy(run), included, policy_environment(run), training=training, half=True)
 
 
 def tables(results: Path) -> dict[str, str]:
@@ -131,25 +55,19 @@ def tables(results: Path) -> dict[str, str]:
 
 def main() -> None:
     """Train and score the named policies."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"policies ({', '.join(NAMES)}); by default all")
-    parser.add_argument("--train", action="store_true", help="train the policies first, and include them")
-    parser.add_argument("--runs", type=Path, default=Path("runs/studies"), help="directory of the runs and the banks")
-    parser.add_argument("--out", type=Path, help="directory of the results; by default beside this file")
-    parser.add_argument("--tiny", action="store_true", help="train and score with a tiny budget")
-    arguments = parser.parse_args()
-    unknown = [name for name in arguments.names if name not in NAMES]
-    if unknown:
-        parser.error(f"NAME: expected one of {', '.join(NAMES)}, got {unknown[0]!r}")
-    if arguments.tiny and arguments.out is None:
-        parser.error("--tiny: needs --out, so that the results in the repository are kept")
-    budget, results = TINY if arguments.tiny else FULL, arguments.out or HERE / "results"
-    included = results / "policies" if arguments.tiny and arguments.train else SHIPPED
-    for name in arguments.names or NAMES:
+    arguments = read_arguments(__doc__, NAMES, HERE, train="train the policies first, and include them")
+    tiny, count = arguments.tiny, 4 if arguments.tiny else SCENARIOS
+    folder = arguments.results / "policies" if tiny and arguments.train else SHIPPED
+    for name in arguments.names:
+        settings = HERE / "configurations" / f"{name}.json"
+        _, config = read_config(settings)
+        assert isinstance(config, DAggerRunConfig)
         if arguments.train:
-            train(name, arguments.runs, included, budget)
-        score_policy(name, included, arguments.runs, results, budget)
-    print(json.dumps({"results": str(results)}) if arguments.tiny else tables(results)["included-policies"])
+            include(train(settings, arguments.runs / "included_policies" / name, tiny=tiny), folder / name)
+        task = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
+        banks = [fresh_bank(arguments.runs, one, count, tiny=tiny, **task) for one in families_of(config.family)]
+        play([load(folder / name)], banks, arguments.results, name, progress=not tiny)
+    print(tables(arguments.results)["included-policies"])
 
 
 if __name__ == "__main__":

@@ -9,33 +9,16 @@ The clones of a family share their demonstrations, and DAgger and PPO start from
 trains with a tiny budget, to try the script; it needs `--out`.
 """
 
-import argparse
-import json
-import os
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+import sys
 from pathlib import Path
 from typing import Any
 
 from leapnav.envs import ScenarioBank
-from leapnav.experts import rollout
-from leapnav.training import (
-    CloningConfig,
-    DAggerConfig,
-    Evaluation,
-    WarmStartConfig,
-    evaluate,
-    load_policy,
-    policy_environment,
-    read_episodes,
-    score,
-    train_bc,
-    train_dagger,
-    train_ppo,
-    write_episodes,
-)
-from leapnav.training.config import read_config
+from leapnav.training import read_episodes, score
 from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
+
+sys.path.append(str(Path(__file__).parents[1]))
+from common import demonstrate, load, play, read_arguments, train
 
 HERE = Path(__file__).parent
 TABLES = {"methods": "docs/results.md", "methods-runs": "docs/results.md"}
@@ -47,87 +30,24 @@ ROWS = {
 }
 FAMILIES = ("open", "clutter")
 NAMES = tuple(f"{family}-{method}" for family in FAMILIES for method in ROWS)
-DEMONSTRATIONS, DEMONSTRATION_SEED = 2000, 60_000
+SEEDS, DEMONSTRATIONS, DEMONSTRATION_SEED = 3, 2000, 60_000
 
 
-@dataclass(frozen=True)
-class Budget:
-    """How much is computed.
-
-    Attributes:
-        seeds: number of runs of each method.
-        demonstrations: number of demonstrated scenarios of each family.
-        scenarios: number of scenarios of the test split; None: all.
-        changes: changes of the settings, of those that have them.
-
-    """
-
-    seeds: int
-    demonstrations: int
-    scenarios: int | None
-    changes: dict[str, Any]
-
-
-FULL = Budget(3, DEMONSTRATIONS, None, {})
-TINY = Budget(
-    2,
-    4,
-    2,
-    {
-        "hidden": (16, 16),
-        "n_envs": 2,
-        "n_steps": 32,
-        "batch_size": 32,
-        "total_timesteps": 128,
-        "evaluation_scenarios": 2,
-        "cloning": CloningConfig(epochs=1, batch_size=64),
-        "dagger": DAggerConfig(rounds=1, max_episodes=4, max_failures=2, lead=0.5, epochs=1, last_epochs=1),
-        "start": WarmStartConfig(critic_epochs=1, slopes=50),
-    },
-)
-TRAIN: dict[str, Callable[..., Any]] = {"bc": train_bc, "dagger": train_dagger, "ppo": train_ppo}
-
-
-def train(name: str, seed: int, runs: Path, budget: Budget) -> Path:
+def train_method(name: str, seed: int, runs: Path, *, tiny: bool) -> Path:
     """Train a method, or resume its run, and return the directory of the run."""
     family, _, method = name.partition("-")
-    run, demonstrations = runs / f"{name}-{seed}", runs / f"{family}-demonstrations"
-    if _is_finished(run):
-        return run
     given: dict[str, Any] = {}
     if method != "ppo":
-        options = {"workers": os.cpu_count() or 1, "progress": budget is FULL}
-        rollout(family, budget.demonstrations, demonstrations, seed=DEMONSTRATION_SEED, **options)
-    if method in ("dagger", "ppo-clone"):
-        clone = train(f"{family}-bc", seed, runs, budget)
-        given = {"policy": clone, "demos": (demonstrations,)}
-        if method == "ppo-clone":
-            given = {"warm_start": (clone, demonstrations)}
-    elif method == "bc":
-        given = {"demos": (demonstrations,)}
-    algorithm, config = read_config(HERE / "configurations" / f"{name}.json")
-    names = {field.name for field in fields(config)}
-    given |= {setting: value for setting, value in budget.changes.items() if setting in names}
-    config = replace(config, **given, out=run, seed=seed, resume=(run / "config.json").exists())
-    TRAIN[algorithm](config, progress=budget is FULL)
-    return run
-
-
-def _is_finished(run: Path) -> bool:
-    evaluations = run / "evaluations.jsonl"
-    return evaluations.exists() and json.loads(evaluations.read_text(encoding="utf-8").splitlines()[-1])["final"]
-
-
-def score_method(name: str, runs: Path, results: Path, budget: Budget) -> None:
-    """Train and score all runs of a method, and write their episodes."""
-    bank, found = ScenarioBank.shipped(name.partition("-")[0], "test"), list[Evaluation]()
-    for seed in range(budget.seeds):
-        run = train(name, seed, runs, budget)
-        options = {"count": budget.scenarios, "timed": False, "workers": os.cpu_count() or 1}
-        environment = policy_environment(run)
-        found.append(evaluate(load_policy(run), bank, environment=environment, progress=budget is FULL, **options))
-    results.mkdir(parents=True, exist_ok=True)
-    write_episodes({name: found}, results / f"{name}.jsonl.gz")
+        count, folder = 4 if tiny else DEMONSTRATIONS, runs / f"{family}-demonstrations"
+        demonstrations = demonstrate(family, count, folder, seed=DEMONSTRATION_SEED, tiny=tiny)
+        if method == "bc":
+            given = {"demos": (demonstrations,)}
+        else:
+            clone = train_method(f"{family}-bc", seed, runs, tiny=tiny)
+            given = {"policy": clone, "demos": (demonstrations,)}
+            if method == "ppo-clone":
+                given = {"warm_start": (clone, demonstrations)}
+    return train(HERE / "configurations" / f"{name}.json", runs / f"{name}-{seed}", tiny=tiny, seed=seed, **given)
 
 
 def tables(results: Path) -> dict[str, str]:
@@ -148,21 +68,13 @@ def tables(results: Path) -> dict[str, str]:
 
 def main() -> None:
     """Train and score the named methods."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"methods ({', '.join(NAMES)}); by default all")
-    parser.add_argument("--runs", type=Path, default=Path("runs/studies/methods"), help="directory of the runs")
-    parser.add_argument("--out", type=Path, help="directory of the results; by default beside this file")
-    parser.add_argument("--tiny", action="store_true", help="train and score with a tiny budget")
-    arguments = parser.parse_args()
-    unknown = [name for name in arguments.names if name not in NAMES]
-    if unknown:
-        parser.error(f"NAME: expected one of {', '.join(NAMES)}, got {unknown[0]!r}")
-    if arguments.tiny and arguments.out is None:
-        parser.error("--tiny: needs --out, so that the results in the repository are kept")
-    budget, results = TINY if arguments.tiny else FULL, arguments.out or HERE / "results"
-    for name in arguments.names or NAMES:
-        score_method(name, arguments.runs, results, budget)
-    print("\n".join(tables(results).values()))
+    arguments = read_arguments(__doc__, NAMES, HERE)
+    tiny, seeds = arguments.tiny, range(2 if arguments.tiny else SEEDS)
+    for name in arguments.names:
+        runs = [train_method(name, seed, arguments.runs / "methods", tiny=tiny) for seed in seeds]
+        bank = ScenarioBank.shipped(name.partition("-")[0], "test")
+        play(map(load, runs), [bank], arguments.results, name, count=2 if tiny else None, progress=not tiny)
+    print("\n".join(tables(arguments.results).values()))
 
 
 if __name__ == "__main__":

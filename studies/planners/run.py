@@ -6,8 +6,7 @@ python studies/planners/run.py --tune  # scores of other constants on the traini
 `--tiny` plays with a tiny budget, to try the script; it needs `--out`.
 """
 
-import argparse
-import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,9 @@ from leapnav.training import (
 from leapnav.training.policies.planners import PLANNERS
 from leapnav.training.scoring.policy_specs import load_policy_spec
 from leapnav.training.scoring.reports import markdown_cells
+
+sys.path.append(str(Path(__file__).parents[1]))
+from common import read_arguments, workers
 
 HERE = Path(__file__).parent
 TABLES = {"planners": "docs/training.md"}
@@ -51,14 +53,13 @@ VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
 }
 
 
-def play(policies: tuple[str, ...], results: Path, count: int | None) -> None:
+def play(policies: list[str], results: Path, count: int | None) -> None:
     """Score policies on the test banks, and write the episodes."""
-    results.mkdir(parents=True, exist_ok=True)
     for name in policies:
         found = []
         for family in ALL_FAMILIES:
             bank, policy = ScenarioBank.shipped(family, "test"), load_policy_spec(name).policy
-            options = {"count": count, "timed": False, "workers": os.cpu_count() or 1, "progress": count is None}
+            options = {"count": count, "timed": False, "workers": workers(), "progress": count is None}
             found += evaluate(policy, bank, **options).episodes
         write_episodes({name: [Evaluation(tuple(found), float("nan"))]}, results / f"{name}.jsonl.gz")
 
@@ -99,23 +100,12 @@ def tables(results: Path) -> dict[str, str]:
 
 def main() -> None:
     """Score the planners, or compare their constants."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"policies ({', '.join(POLICIES)}); by default all")
-    parser.add_argument("--tune", action="store_true", help="compare the constants on the training banks")
-    parser.add_argument("--out", type=Path, help="directory of the results; by default beside this file")
-    parser.add_argument("--tiny", action="store_true", help="play with a tiny budget")
-    arguments = parser.parse_args()
-    unknown = [name for name in arguments.names if name not in POLICIES]
-    if unknown:
-        parser.error(f"NAME: expected one of {', '.join(POLICIES)}, got {unknown[0]!r}")
-    if arguments.tiny and arguments.out is None:
-        parser.error("--tiny: needs --out, so that the results in the repository are kept")
+    arguments = read_arguments(__doc__, POLICIES, HERE, tune="compare the constants on the training banks")
     if arguments.tune:
         tune(TINY if arguments.tiny else TUNING)
         return
-    results = arguments.out or HERE / "results"
-    play(tuple(arguments.names) or POLICIES, results, TINY if arguments.tiny else None)
-    print(tables(results)["planners"])
+    play(arguments.names, arguments.results, TINY if arguments.tiny else None)
+    print(tables(arguments.results)["planners"])
 
 
 if __name__ == "__main__":
