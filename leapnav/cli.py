@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import tyro
+from tyro import _strings as tyro_strings
 
 from leapnav.commands.bank import Bank
 from leapnav.commands.demo import Demo
@@ -40,7 +42,11 @@ from leapnav.commands.worlds.benchmark import Benchmark
 from leapnav.outputs import FAILED, json_on_stdout
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
-DESCRIPTION = "Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies."
+DESCRIPTION = """Wheeled-robot navigation in which the optimum is known: find optima, learn from them, score policies.
+
+Optima: solve, prove, proof. Banks and worlds: bank, worlds, benchmark. Demonstrations: rollout, dataset.
+
+Policies: train, evaluate, export, watch. To try: demo, play. Installation: compile, doctor, completion."""
 COMMANDS = {
     "solve": Solve,
     "prove": Prove,
@@ -99,6 +105,15 @@ def _parse(arguments: list[str], train: type[TrainCommand], *, console_outputs: 
         args=arguments,
         console_outputs=console_outputs,
     )
+
+
+def _as_paragraphs(text: str) -> str:
+    """Join the lines of each paragraph of a docstring; a terminal wraps them."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
+
+
+# tyro breaks help texts at indented lines, too, so that they are wrapped twice.
+tyro_strings.remove_single_line_breaks = _as_paragraphs
 
 
 def main(arguments: list[str] | None = None) -> int:

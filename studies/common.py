@@ -3,9 +3,10 @@
 import argparse
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from stable_baselines3.common.policies import BasePolicy
@@ -83,17 +84,26 @@ def workers() -> int:
     return os.cpu_count() or 1
 
 
-def train(settings: Path, run: Path, *, tiny: bool, **changes: Any) -> Path:
-    """Train with the settings of a file and changes of them, or resume the run, and return its directory.
+def train(
+    settings: Path, run: Path, *, tiny: bool, options: Mapping[str, Any] = MappingProxyType({}), **changes: Any
+) -> Path:
+    """Train with stored settings, or resume the run, and return its directory. A finished run is not repeated.
 
-    A finished run is not repeated.
+    Args:
+        settings: file of the settings.
+        run: directory of the run.
+        tiny: whether to use a tiny budget.
+        options: further arguments of the training function.
+        changes: changes of the settings.
+
     """
     if not is_finished(run):
         algorithm, config = read_config(settings)
         names = {field.name for field in fields(config)}
         budget = {name: value for name, value in TINY.items() if name in names} if tiny else {}
         config = replace(config, **{**budget, **changes}, out=run, resume=(run / "config.json").exists())
-        TRAIN[algorithm](config, progress=not tiny, **({"workers": workers()} if algorithm == "dagger" else {}))
+        parallel = {"workers": workers()} if algorithm == "dagger" else {}
+        TRAIN[algorithm](config, progress=not tiny, **parallel, **options)
     return run
 
 

@@ -56,7 +56,7 @@ def main() -> None:
     """Train and score clones of the given numbers of demonstrations."""
     arguments = read_arguments(__doc__, NAMES, HERE)
     tiny, runs = arguments.tiny, arguments.runs / "demonstrations"
-    bank = fresh_bank(arguments.runs, FAMILY, 4 if tiny else SCENARIOS, tiny=tiny)
+    bank = fresh_bank(arguments.runs, FAMILY, 2 if tiny else SCENARIOS, tiny=tiny)
     for name in arguments.names:
         demos = demonstrations(int(name), runs, tiny=tiny)
         clones = [

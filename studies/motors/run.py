@@ -61,7 +61,7 @@ def main() -> None:
     """Train, and score the policies with each disturbance."""
     arguments = read_arguments(__doc__, NAMES, HERE)
     tiny, settings = arguments.tiny, HERE / "configurations/ppo.json"
-    bank = fresh_bank(arguments.runs, FAMILY, 4 if tiny else SCENARIOS, tiny=tiny)
+    bank = fresh_bank(arguments.runs, FAMILY, 2 if tiny else SCENARIOS, tiny=tiny)
     for name in arguments.names:
         policies = [load_ideal()]
         if name == "ppo":

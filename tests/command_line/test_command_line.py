@@ -1,5 +1,6 @@
 """Help, choices, completion and interruptions of the command line."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from typing import get_args
 
 import pytest
 
-from leapnav.cli import COMMANDS, _warnings_in_one_line, main
+from leapnav.cli import COMMANDS, DESCRIPTION, _warnings_in_one_line, main
 from leapnav.commands.options import Family, FamilyOrAll, Horizon, PolicyName, parse_environment
 from leapnav.envs import FAMILIES
 from leapnav.envs.settings import HORIZONS
@@ -84,6 +85,19 @@ def test_every_command_has_help(command, capsys):
         main([*command, "--help"])
     assert end.value.code in (0, None)
     assert " ".join(["usage: leapnav", *command]) in capsys.readouterr().out
+
+
+def test_help_is_wrapped_only_at_the_width_of_the_terminal(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "dagger", "--help"])
+    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    first = lines.index("--lidar-beams {None}|INT") + 1
+    assert all(len(line) > 50 for line in lines[first : first + 3]), lines[first : first + 4]
+
+
+def test_the_overview_names_each_command_once_in_a_group():
+    groups = re.findall(r": ([a-z, ]+)\.", DESCRIPTION.partition("\n")[2])
+    assert sorted(name for group in groups for name in group.split(", ")) == sorted(COMMANDS)
 
 
 def test_the_package_is_a_command():

@@ -8,12 +8,23 @@ from helpers import ROOT
 
 STUDIES = sorted(path.parent.name for path in (ROOT / "studies").glob("*/run.py"))
 # Words of a run with a tiny budget, of which a part may stand for all.
-WORDS = {"included_policies": ["open", "--train"], "planners": ["lattice"], "methods": ["open-bc", "open-ppo"]}
+WORDS = {
+    "curricula": ["uniform"],
+    "demonstrations": ["100"],
+    "included_policies": ["open", "--train"],
+    "methods": ["open-bc", "open-ppo"],
+    "planners": ["lattice"],
+    "transfer": ["open", "clutter"],
+}
 ROWS = {
     "clients": "| gymnasium ",
+    "curricula": "0.0",
+    "demonstrations": "| 100 |",
     "methods": "| open | clone |",
     "included_policies": "| `open` ",
+    "motors": "PPO from it",
     "planners": "| open | ",
+    "transfer": "| `",
 }  # of the tables
 
 
