@@ -15,6 +15,7 @@ WORDS = {
     "methods": ["open-bc", "open-ppo"],
     "planners": ["lattice"],
     "transfer": ["open", "clutter"],
+    "warm_start": ["ppo-value", "sac-imitation"],
 }
 ROWS = {
     "clients": "| gymnasium ",
@@ -25,6 +26,7 @@ ROWS = {
     "motors": "PPO from it",
     "planners": "| open | ",
     "transfer": "| `",
+    "warm_start": "| the same",
 }  # of the tables
 
 
