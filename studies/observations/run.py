@@ -1,0 +1,63 @@
+"""What a clone can observe: the same demonstrations of `rooms` with lidar, with memory and with the map, several runs.
+
+python studies/observations/run.py           # trains and scores all
+python studies/observations/run.py geodesic  # only this observation
+
+`configurations/` contains the complete settings, in the format of `config.json` of a training run, and `results/` the
+episodes on the test split. A finished run is not repeated, an interrupted one resumes. `--tiny` trains with a tiny
+budget, to try the script; it needs `--out`.
+"""
+
+import sys
+from pathlib import Path
+
+from leapnav.envs import ScenarioBank
+from leapnav.training import read_episodes, score
+from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
+
+sys.path.append(str(Path(__file__).parents[1]))
+from common import demonstrate, load, play, read_arguments, train
+
+HERE = Path(__file__).parent
+FAMILY, DEMONSTRATIONS, DEMONSTRATION_SEED, SEEDS = "rooms", 1500, 62_000, 3
+ROWS = {
+    "lidar": "lidar",
+    "memory": "lidar, also 0.4, 1.2 and 2.8 s before",
+    "geodesic": "lidar and detours",
+}
+NAMES = tuple(ROWS)
+TABLES = dict.fromkeys(("observations", "observations-runs"), "docs/training.md")
+
+
+def tables(results: Path) -> dict[str, str]:
+    """Return the tables of the results, in Markdown."""
+    columns = "| observation | success (%) | collision (%) | SOC | regret, pose reached (%) |\n" + "|---" * 5 + "|\n"
+    texts = dict.fromkeys(TABLES, columns)
+    for name, label in ROWS.items():
+        path = results / f"{name}.jsonl.gz"
+        if path.exists():
+            ((_, found),) = read_episodes(path).items()
+            row = score(name, found)
+            texts["observations"] += f"| {label} | {markdown_cells(row)} |\n"
+            texts["observations-runs"] += f"| {label} | {markdown_run_cells(row)} |\n"
+    return texts
+
+
+def main() -> None:
+    """Train and score clones with the named observations."""
+    arguments = read_arguments(__doc__, NAMES, HERE)
+    tiny, runs, test = arguments.tiny, arguments.runs / "observations", ScenarioBank.shipped(FAMILY, "test")
+    count = 4 if tiny else DEMONSTRATIONS
+    demonstrations = demonstrate(FAMILY, count, runs / "demonstrations", seed=DEMONSTRATION_SEED, tiny=tiny)
+    for name in arguments.names:
+        settings, demos = HERE / "configurations" / f"{name}.json", (demonstrations,)
+        clones = [
+            train(settings, runs / f"{name}-{seed}", tiny=tiny, seed=seed, demos=demos)
+            for seed in range(2 if tiny else SEEDS)
+        ]
+        play(map(load, clones), [test], arguments.results, name, count=2 if tiny else None, progress=not tiny)
+    print("\n".join(tables(arguments.results).values()))
+
+
+if __name__ == "__main__":
+    main()
