@@ -80,7 +80,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `motion` (`"motor"` only) | 0, 1 | velocity in the robot's frame: ahead, to the left | m/s | -20 to 20 |
     | | 2 | turn rate | rad/s | -20 to 20 |
     | `action` (`previous_action=True` only) | k | the last action; 0 at the start of an episode | 1 | -1 to 1 |
-    | `lidar` (`"lidar"` and `"geodesic"`) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead | m | 0 to `lidar_range` |
+    | `lidar` (`"lidar"` and `"geodesic"`) | k | range of beam k from the robot's centre, counter-clockwise from straight ahead, or from the right end of the field of view | m | 0 to `lidar_range` |
     | `detours` (`"geodesic"` only) | k | how much longer than the shortest path to the goal a path is that starts along beam k, for 0.25 m or more, or as far as there is room | m | 0 to 3 |
     | `distance` (`"geodesic"` only) | 0 | geodesic distance: length of the shortest path among the obstacles to the goal position | m | 0 to 2000 |
     | `velocities` (`"geodesic"` with `velocities=True`) | k | velocity of the obstacle that beam k meets, in the robot's frame: all components ahead, then all to the left; 0 if it does not move | m/s | -20 to 20 |
@@ -194,6 +194,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `discount` | 0.99 | discount factor of the learner, for `"shaped"` |
     | `terminate_on_collision` | True | whether a collision ends the episode |
     | `lidar_beams`, `lidar_range` | 32, 10 | number of beams, and maximum range (m) |
+    | `lidar_fov` | 2 pi | field of view (rad), symmetric about straight ahead; a smaller one begins and ends with a beam |
     | `history` | () | ages of earlier observations in the observation, increasing (s); rounded to control periods |
     | `previous_action` | False | whether the observation contains the last action |
     | `map_obstacles`, `map_vertices` | 8, 8 | number of discs, capsules and polygons in the map, and of vertices of each; more vertices are an error |

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self, cast
@@ -31,9 +32,10 @@ GOAL_REWARDS, HORIZONS = ("sparse", "cost"), ("fixed", "free")
 OBSTACLE_KINDS = "cost", "hard"  # see `Cost.obstacles`
 # Arguments that determine what is observed.
 SENSORS = (
-    *("observation", "lidar_beams", "lidar_range", "map_obstacles", "map_vertices"),
+    *("observation", "lidar_beams", "lidar_range", "lidar_fov", "map_obstacles", "map_vertices"),
     *("velocities", "history", "previous_action"),
 )
+FULL_CIRCLE = 2 * math.pi  # rad
 MIN_PERIOD = 1e-4  # s
 MAX_COUNT = 10_000  # beams, obstacles in the map, vertices of each, or control periods of the history
 
@@ -128,6 +130,7 @@ class EnvironmentSettings:
     terminate_on_collision: bool = True
     lidar_beams: int = 32
     lidar_range: float = 10.0
+    lidar_fov: float = FULL_CIRCLE
     map_obstacles: int = 8
     map_vertices: int = 8
     velocities: bool = False
@@ -147,6 +150,7 @@ class EnvironmentSettings:
             "heading_tolerance",
             "motion_tolerance",
             "lidar_range",
+            "lidar_fov",
             "reward_scale",
         ):
             check_positive(name, getattr(self, name))
@@ -154,6 +158,8 @@ class EnvironmentSettings:
             check_not_negative(name, getattr(self, name))
         check_at_least("control_period", self.control_period, MIN_PERIOD, unit="s")
         check_fraction("discount", self.discount, zero=False)
+        if self.lidar_fov > FULL_CIRCLE:
+            raise ValueError(f"lidar_fov: expected an angle of at most 2 pi rad, got {self.lidar_fov:g}")
         for name, minimum in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
             check_integer(name, getattr(self, name), minimum, MAX_COUNT)
         for name in ("terminate_on_collision", "graded_miss", "dict_observation", "previous_action", "velocities"):
@@ -247,11 +253,29 @@ class EnvironmentSettings:
         return self.observation in ("lidar", "geodesic")
 
     @property
+    def has_full_circle(self) -> bool:
+        """Whether the beams of the lidar are distributed over the full circle."""
+        return self.lidar_fov == FULL_CIRCLE
+
+    @property
+    def beam_angles(self) -> np.ndarray:
+        """Angles (rad) of the beams, counter-clockwise from straight ahead, shape (lidar_beams,).
+
+        On the full circle the first beam points straight ahead. In a smaller field of view the first and the last beam
+        are at its right and left end.
+        """
+        count, half = self.lidar_beams, self.lidar_fov / 2
+        if self.has_full_circle:
+            return FULL_CIRCLE * np.arange(count) / max(count, 1)
+        return np.linspace(-half, half, count) if count > 1 else np.zeros(count)
+
+    @property
     def sensors(self) -> str:
         """What is observed, in words, such as "lidar, 32 beams"."""
+        view = "" if self.has_full_circle else f" in {math.degrees(self.lidar_fov):g} degrees"
         words = {
-            "lidar": f"lidar, {self.lidar_beams} beams",
-            "geodesic": f"lidar and geodesic distances, {self.lidar_beams} beams",
+            "lidar": f"lidar, {self.lidar_beams} beams{view}",
+            "geodesic": f"lidar and geodesic distances, {self.lidar_beams} beams{view}",
             "map": f"map of {self.map_obstacles} obstacles",
             "state": "goal and motion",
         }

@@ -1,6 +1,6 @@
 """Draw the figures of the README and the documentation that show scenarios, optima and episodes.
 
-python scripts/draw_figures.py            # writes docs/images/*.png, except overview, play and curves
+python scripts/draw_figures.py            # writes docs/images/*.png, except overview, play, decisions and curricula
 """
 
 from pathlib import Path

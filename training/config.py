@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, cast, get_args
 
 _FOLDER = files("leapnav.training")
+LATER_SENSORS = {"velocities": False, "lidar_fov": math.tau}  # those that older descriptions of policies do not contain
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
 PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
 
@@ -127,6 +129,8 @@ class RunConfig:
     lidar_beams: int | None = None
     """Even number of lidar beams; by default 64 with the geodesic observation and 128 with lidar alone; 32 do not
     resolve narrow passages. Demonstrations are observed again with them; a policy to start from must have as many."""
+    lidar_fov: float = math.tau
+    """Field of view of the lidar (rad)."""
     velocities: bool | None = None
     """Whether the geodesic observation has the velocities of obstacles; by default if those of the family move."""
     history: tuple[float, ...] = ()
@@ -160,7 +164,8 @@ class RunConfig:
         beams = (64 if self.observation == "geodesic" else 128) if self.lidar_beams is None else self.lidar_beams
         is_default = self.observation == "geodesic" and self.family in get_args(Moving)
         velocities = {"velocities": True} if self.velocities or (self.velocities is None and is_default) else {}
-        return {**observation, **velocities, "lidar_beams": beams, **task, **earlier}
+        view = {} if self.lidar_fov == math.tau else {"lidar_fov": self.lidar_fov}
+        return {**observation, **velocities, "lidar_beams": beams, **view, **task, **earlier}
 
     @property
     def effort_weights(self) -> tuple[float, ...] | None:
@@ -399,7 +404,7 @@ def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
                 description = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))
                 environment = description["environment"]
                 sensors = {name: environment[name] for name in ("observation", "lidar_beams", "previous_action")}
-                sensors["velocities"] = environment.get("velocities", False)
+                sensors |= {name: environment.get(name, value) for name, value in LATER_SENSORS.items()}
                 return {**sensors, "history": tuple(environment["history"])}
             except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
                 continue
@@ -415,12 +420,7 @@ def _replace_nested(config: Any, table: dict[str, Any]) -> Any:
     return replace(config, **changes)
 
 
-ALGORITHMS: dict[str, type[RunConfig]] = {
-    "bc": BCConfig,
-    "dagger": DAggerRunConfig,
-    "ppo": PPOConfig,
-    "sac": SACConfig,
-}
+ALGORITHMS: dict[str, type[RunConfig]] = {"bc": BCConfig, "dagger": DAggerRunConfig, "ppo": PPOConfig, "sac": SACConfig}
 
 
 def read_config(run: Path) -> tuple[str, RunConfig]:

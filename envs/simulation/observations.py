@@ -81,7 +81,7 @@ def _parts(settings: EnvironmentSettings) -> Iterator[tuple[str, list[Entry]]]:
     if settings.previous_action:
         yield "action", [Entry(f"action[{k}]", *_COSINE) for k in range(model.sizes()[1])]
     beams = settings.lidar_beams
-    angles = [f"{360 * k / beams:g} deg counter-clockwise from ahead" for k in range(beams)]
+    angles = [f"{math.degrees(angle):g} deg counter-clockwise from ahead" for angle in settings.beam_angles]
     if settings.has_lidar:
         yield "lidar", [Entry(f"lidar[{k}], {at}", "m", 0.0, settings.lidar_range) for k, at in enumerate(angles)]
     if settings.observation == "geodesic":
@@ -258,7 +258,7 @@ class ObservationLayout:
         self.size = self.frame * (1 + len(lags))
         self.actions = np.zeros((count, settings.model.sizes()[1]))
         self._bounds = np.array([[one.low for one in entries], [one.high for one in entries]], np.float32)
-        angles = 2 * math.pi * np.arange(settings.lidar_beams) / max(settings.lidar_beams, 1)
+        angles = settings.beam_angles
         further = settings.model.state_names[3:]
         offsets = [self.parts[name].start if name in self.parts else -1 for name in OFFSETS.names or ()]
         self._buffers = ObservationBuffers(
@@ -302,7 +302,8 @@ class ObservationLayout:
             return np.empty(0)
         x, y, heading = pose[:3].tolist()
         buffers = self._buffers
-        scan(x, y, heading, time, field, self._settings.lidar_range, buffers.beams, buffers.scratch)
+        reach, fov = self._settings.lidar_range, self._settings.lidar_fov
+        scan(x, y, heading, time, field, reach, fov, buffers.beams, buffers.scratch)
         return buffers.scratch[2, : self._settings.lidar_beams].copy()
 
     def fill(self, robots: np.ndarray, packed: tuple[np.ndarray, ...], out: np.ndarray) -> None:
@@ -333,7 +334,7 @@ def observe_robots(robots, packed, packed_buffers, out):
         cos, sin = math.cos(heading), math.sin(heading)
         noise = sim.noise[i, episode.steps % sim.noise.shape[1]]
         if at.lidar >= 0:  # from the true pose, not from the sensed one
-            scan(x, y, heading, episode.time, field, settings.lidar_range, beams, scratch)
+            scan(x, y, heading, episode.time, field, settings.lidar_range, settings.lidar_fov, beams, scratch)
         # Achieved goals are observed without noise, because they determine the reward.
         if deviation != 0.0 and not settings.goal_conditioned:
             x += deviation * noise[sensing]
@@ -389,7 +390,8 @@ def observe_robots(robots, packed, packed_buffers, out):
             obstacles, vertices = settings.map_obstacles, settings.map_vertices
             map_surroundings(x, y, heading, episode.time, field, obstacles, vertices, surroundings)
         elif at.velocities >= 0:
-            beam_velocities(sim.states[i], episode.time, field, beams, scratch, row[at.velocities :])
+            seen = row[at.velocities :]
+            beam_velocities(sim.states[i], episode.time, field, settings.lidar_fov, beams, scratch, seen)
         for k in range(len(row)):
             value = np.float32(row[k])
             value = bounds[0, k] if value < bounds[0, k] else value

@@ -36,7 +36,8 @@ class Scene:
         state: state (n,) of the robot; the first three entries are x, y (m) and the heading (rad).
         trail: the poses of the episode so far.
         optimum (N, 3): the reference path, or None.
-        ranges: lidar ranges (m), counter-clockwise from straight ahead; empty without a lidar.
+        ranges: lidar ranges (m); empty without a lidar.
+        beam_angles: their angles (rad), counter-clockwise from straight ahead.
         lidar_range: maximum range (m).
         cost: cost of the episode so far.
         reference_cost: cost of the optimum, or None.
@@ -51,6 +52,7 @@ class Scene:
     trail: Sequence[tuple[float, float, float]] = ()
     optimum: np.ndarray | None = None
     ranges: Sequence[float] = ()
+    beam_angles: Sequence[float] = ()
     lidar_range: float = math.inf
     cost: float = 0.0
     reference_cost: float | None = None
@@ -79,6 +81,7 @@ def make_scene(
         trail=trail,
         optimum=optimum,
         ranges=simulator.ranges(robot).tolist(),
+        beam_angles=simulator.settings.beam_angles.tolist(),
         lidar_range=simulator.settings.lidar_range,
         cost=episode.cost,
         reference_cost=reference_cost,
@@ -146,7 +149,7 @@ def draw_scene(scene: Scene) -> np.ndarray:
 def _lidar_ends(to_pixels: ToPixels, scene: Scene) -> list[tuple[tuple[float, float], bool]]:
     """Return the end of each beam on the canvas (pixels), and whether it has hit an obstacle or a wall."""
     x, y, heading = scene.state[:3]
-    angles = [heading + 2 * math.pi * k / len(scene.ranges) for k in range(len(scene.ranges))]
+    angles = [heading + angle for angle in scene.beam_angles[: len(scene.ranges)]]
     return [
         (to_pixels(x + reach * math.cos(angle), y + reach * math.sin(angle)), reach < scene.lidar_range)
         for angle, reach in zip(angles, scene.ranges, strict=True)

@@ -13,6 +13,7 @@ from leapnav.envs.field.packing import field_parts
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import part_of
 from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
+from leapnav.envs.settings import FULL_CIRCLE
 
 ROUNDING = 1e-9  # m, of two computations of the same range
 WALL_ENTRIES = 6  # of a map, before the obstacles
@@ -21,16 +22,17 @@ WALL_ENTRIES = 6  # of a map, before the obstacles
 MAX_VECTORISED_BEAMS = 64
 
 
-@kernel(types.UniTuple(int64, 2)(float64, float64, float64, int64))
-def _beams_towards(ahead, left, radius, count):
+@kernel(types.UniTuple(int64, 2)(float64, float64, float64, int64, float64))
+def _beams_towards(ahead, left, radius, count, fov):
     """Return the first beam that may meet a circle, and the number after the last one.
 
-    Beam k of `count` has the angle 2 pi k / count. The numbers are less than 2 count; beam count + k is beam k.
+    The numbers are less than 2 count; beam count + k is beam k.
 
     Args:
         ahead, left: centre of the circle (m) in the lidar's frame.
         radius: of the circle (m).
         count: number of beams.
+        fov: field of view (rad), see `EnvironmentSettings.beam_angles`.
 
     """
     distance = math.sqrt(ahead * ahead + left * left)
@@ -38,7 +40,16 @@ def _beams_towards(ahead, left, radius, count):
         return 0, count
     ratio = radius / distance
     half = ratio * (1.0 + ratio * ratio * (math.pi / 2 - 1.0))  # at least asin(ratio)
-    bearing, density = math.atan2(left, ahead), count / (2 * math.pi)
+    bearing = math.atan2(left, ahead)
+    if fov < FULL_CIRCLE:
+        if count == 1 or abs(bearing) + half > math.pi:  # the circle is behind, on both sides
+            return 0, count
+        spacing = fov / (count - 1)
+        first = math.floor((bearing - half + fov / 2) / spacing)
+        last = math.ceil((bearing + half + fov / 2) / spacing)
+        first, last = max(first, 0), min(last + 1, count)
+        return (first, last) if first < last else (0, 0)
+    density = count / FULL_CIRCLE
     first, last = math.floor((bearing - half) * density), math.ceil((bearing + half) * density)
     if last - first >= count:
         return 0, count
@@ -102,8 +113,8 @@ def _shorten(cx, cy, r, reach, dxs, dys, nearest):
         nearest[k] = hit if hit < nearest[k] else nearest[k]
 
 
-@kernel(NOTHING(float64, float64, float64, float64, CONSTANT, float64, MATRIX, MATRIX))
-def scan(x, y, heading, time, field, reach, beams, scratch):
+@kernel(NOTHING(float64, float64, float64, float64, CONSTANT, float64, float64, MATRIX, MATRIX))
+def scan(x, y, heading, time, field, reach, fov, beams, scratch):
     """Compute lidar ranges (m).
 
     Polygons are intersected only with the beams that may meet a circle around them, and so are circles if there are
@@ -114,7 +125,9 @@ def scan(x, y, heading, time, field, reach, beams, scratch):
         time: of the episode (s), for the positions of moving obstacles.
         field: the packed field of the scenario.
         reach: maximum range (m).
-        beams (2, n): cosines and sines of the angles 2 pi k / n of the beams in the lidar's frame.
+        fov: field of view (rad).
+        beams (2, n): cosines and sines of the angles of the beams in the lidar's frame, see
+            `EnvironmentSettings.beam_angles`.
         scratch (3, 2 n): working memory; the first n entries of row 2 are the ranges afterwards.
 
     """
@@ -144,7 +157,7 @@ def scan(x, y, heading, time, field, reach, beams, scratch):
             continue
         first, size = 0, count
         if part.edges > 0 or count > MAX_VECTORISED_BEAMS:
-            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, part.rim, count)
+            first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, part.rim, count, fov)
             size = last - first
         if part.edges == 0:
             rays = part_of(dxs, first, size), part_of(dys, first, size), part_of(nearest, first, size)
@@ -159,14 +172,15 @@ def scan(x, y, heading, time, field, reach, beams, scratch):
         nearest[k] = hit if hit > 0.0 else 0.0
 
 
-@kernel(NOTHING(VECTOR, float64, CONSTANT, MATRIX, MATRIX, VECTOR))
-def beam_velocities(state, time, field, beams, scratch, out):
+@kernel(NOTHING(VECTOR, float64, CONSTANT, float64, MATRIX, MATRIX, VECTOR))
+def beam_velocities(state, time, field, fov, beams, scratch, out):
     """Compute the velocity of the obstacle that each beam of a lidar meets, in the lidar's frame.
 
     Args:
         state: x, y (m) and heading (rad) of the lidar, and further entries.
         time: of the episode (s).
         field: the packed field of the scenario.
+        fov: field of view (rad).
         beams (2, n): see `scan`.
         scratch (3, 2 n): the working memory after `scan`.
         out (2 n or more,): overwritten by the components ahead of all beams, then those to the left (m/s); 0 where a
@@ -182,7 +196,7 @@ def beam_velocities(state, time, field, beams, scratch, out):
         moved_x, moved_y, vx, vy = motion_of(field, part, time)
         px, py = x - moved_x, y - moved_y
         cx, cy = part.x - px, part.y - py
-        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, part.rim, count)
+        first, last = _beams_towards(cos * cx + sin * cy, cos * cy - sin * cx, part.rim, count, fov)
         for beam in range(first, last):
             k = beam % count
             if part.edges == 0:

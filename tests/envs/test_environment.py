@@ -261,6 +261,30 @@ def test_a_beam_does_not_depend_on_the_number_of_others(family):
             assert ranges == pytest.approx(everywhere[:: 360 // count], abs=1e-6)
 
 
+@pytest.mark.parametrize("family", ["clutter", "polygons", "crossing"])
+def test_a_smaller_field_of_view_has_the_beams_of_the_full_circle(family):
+    """The ranges, the detours and the velocities of obstacles, from the right end to the left end."""
+    for seed in range(6):
+        task = sample_scenario(family, seed)
+        given = {"scenario": task, "observation": "geodesic", "dict_observation": True}
+        everywhere = NavigateEnv(lidar_beams=360, **given).reset()[0]
+        for degrees, count in ((180, 5), (270, 271), (90, 2), (359, 360), (60, 1)):
+            env = NavigateEnv(lidar_beams=count, lidar_fov=math.radians(degrees), **given)
+            found = env.reset()[0]
+            angles = np.linspace(-degrees / 2, degrees / 2, count) if count > 1 else np.zeros(1)
+            assert env.settings.beam_angles == pytest.approx(np.radians(angles))
+            if (angles % 1).any():  # between two of the 360 beams
+                continue
+            indices = angles.astype(int) % 360
+            assert found["lidar"] == pytest.approx(everywhere["lidar"][indices], abs=1e-6)
+            assert found["detours"] == pytest.approx(everywhere["detours"][indices], abs=1e-5)
+            if family == "crossing":
+                pairs = everywhere["velocities"].reshape(2, 360)[:, indices].ravel()
+                assert found["velocities"] == pytest.approx(pairs, abs=1e-6)
+    with pytest.raises(ValueError, match="lidar_fov: expected an angle of at most 2 pi rad, got 270"):
+        NavigateEnv(lidar_fov=270)
+
+
 @pytest.mark.parametrize("heading", [0.0, -0.0, math.pi / 2, math.pi, -math.pi / 2, 1e-12])
 def test_beams_along_the_axes_see_what_is_there(heading):
     disc = {"circle": {"center": [4.0, 1.0], "radius": 0.8}}

@@ -62,7 +62,8 @@ def test_datasets_that_cannot_be_learned_from_are_refused(demonstrated, dataset,
         behaviour_clone(fresh(fewer), dataset, QUICK, progress=False)
 
 
-def test_mirroring_and_time_reversal_are_symmetries_of_the_environment():
+@pytest.mark.parametrize("fov", [2 * math.pi, 4.0])
+def test_mirroring_and_time_reversal_are_symmetries_of_the_environment(fov):
     fields = sample_scenario("clutter", 5).to_dict()
 
     def mirrored(pose):
@@ -83,13 +84,15 @@ def test_mirroring_and_time_reversal_are_symmetries_of_the_environment():
         },
         time_reverse: {**fields, "start": rotated(fields["start"]), "goal": rotated(fields["goal"])},
     }
+    if fov < 2 * math.pi:
+        del transformed[time_reverse]  # the robot does not see what is behind it
     for transform, other_fields in transformed.items():
-        env = NavigateEnv(scenario=Scenario.from_dict(fields))
-        other = NavigateEnv(scenario=Scenario.from_dict(other_fields))
+        env = NavigateEnv(scenario=Scenario.from_dict(fields), lidar_fov=fov)
+        other = NavigateEnv(scenario=Scenario.from_dict(other_fields), lidar_fov=fov)
         observation, other_observation = env.reset()[0], other.reset()[0]
         for step in range(20):
             action = np.array([0.2, 0.3 * math.cos(step)], np.float32)
-            inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None])
+            inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None], env.settings)
             assert inputs[0].numpy() == pytest.approx(other_observation, abs=1e-4)
             observation, reward, *_ = env.step(action)
             other_observation, other_reward, *_ = other.step(targets[0].numpy())
@@ -129,6 +132,8 @@ def test_the_velocities_of_obstacles_have_the_symmetries_too():
 def test_time_reversal_needs_an_even_number_of_beams():
     with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
         time_reverse(th.zeros(1, 12), th.zeros(1, 2), EnvironmentSettings(lidar_beams=3))
+    with pytest.raises(ValueError, match="lidar_fov of 2 pi rad, got 4"):
+        time_reverse(th.zeros(1, 41), th.zeros(1, 2), EnvironmentSettings(lidar_fov=4.0))
 
 
 def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):

@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnvStepReturn,
 )
 
-from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv, select_robot
 
 ENVIRONMENT = "leapnav/Navigate-v0"
@@ -149,23 +148,6 @@ class NavigateVecEnv(VecEnv):
                 }
                 self._returns[i], self._lengths[i] = 0.0, 0
         return observations, rewards.astype(np.float32), ended, rows
-
-    def restart(self, mask: np.ndarray, scenarios: Sequence[Scenario | None]) -> VecEnvObs:
-        """Replace episodes that have just started.
-
-        Args:
-            mask (n_envs,): bool, the robots to restart.
-            scenarios: one for each robot, or None for a scenario of the environment; those of other robots are ignored.
-
-        Returns:
-            The observations of all robots.
-
-        """
-        observations, infos = self.venv.reset(options={"reset_mask": mask, "scenario": scenarios})
-        for i in np.flatnonzero(mask).tolist():
-            self.reset_infos[i] = select_robot(infos, i)
-            self._returns[i], self._lengths[i] = 0.0, 0
-        return observations
 
     def close(self) -> None:
         """Close the environment."""

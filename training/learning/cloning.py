@@ -127,7 +127,7 @@ class _Fit:
         check_observations(policy, dataset)
         settings = dataset.settings
         is_map = settings.observation == "map"  # whose rows have no such symmetry
-        can_reverse = dataset.is_reversible and not is_map
+        can_reverse = dataset.is_reversible and not is_map and (settings.has_full_circle or not settings.has_lidar)
         self._symmetries = [
             *([partial(mirror, settings=settings)] if dataset.is_mirrored and not is_map else []),
             *([partial(time_reverse, settings=settings)] if can_reverse else []),

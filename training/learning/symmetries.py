@@ -43,6 +43,8 @@ def mirror(
     symmetry = _require(settings, "mirror", settings.model.mirror)
 
     def reflected(values: th.Tensor) -> th.Tensor:
+        if not settings.has_full_circle:
+            return values.flip(1)
         return th.cat([values[:, :1], values[:, 1:].flip(1)], dim=1)
 
     return _transformed(observations, actions, settings, _MIRROR_SIGNS, symmetry, reflected)
@@ -62,11 +64,14 @@ def time_reverse(
         The transformed observations and actions.
 
     Raises:
-        ValueError: the number of lidar beams is odd, or the model has no such symmetry.
+        ValueError: the number of lidar beams is odd, their field of view is not the full circle, or the model has no
+            such symmetry.
 
     """
     settings = settings or EnvironmentSettings()
     symmetry = _require(settings, "reversal", settings.model.reversal)
+    if not settings.has_full_circle:
+        raise ValueError(f"time reversal needs a lidar_fov of 2 pi rad, got {settings.lidar_fov:g}")
 
     def rotated(values: th.Tensor) -> th.Tensor:
         if values.shape[1] % 2:

@@ -26,6 +26,7 @@ from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.validation import suggestion
 from leapnav.experts.data.datasets import ENVIRONMENT
+from leapnav.training.config import LATER_SENSORS
 from leapnav.training.policies.actors import policy_of
 from leapnav.training.policies.architecture import KINDS, Architecture, is_actor_weight
 from leapnav.training.policies.zips import is_zip, load_zip
@@ -197,8 +198,8 @@ def environment_of(model: Any) -> dict[str, Any]:
 def _observed(description: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of the environment in the description of a policy that determine the observation."""
     environment = description["environment"]
-    # A policy that is older than the setting observes no velocities, in whichever scenario.
-    return {"velocities": False, **{name: environment[name] for name in OBSERVED if name in environment}}
+    # A policy that is older than one of these settings observes what was observed without it.
+    return {**LATER_SENSORS, **{name: environment[name] for name in OBSERVED if name in environment}}
 
 
 def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
