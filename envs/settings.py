@@ -272,7 +272,7 @@ class EnvironmentSettings:
     @property
     def sensors(self) -> str:
         """What is observed, in words, such as "lidar, 32 beams"."""
-        view = "" if self.has_full_circle else f" in {math.degrees(self.lidar_fov):g} degrees"
+        view = "" if self.has_full_circle else f" in {math.degrees(self.lidar_fov):.0f} degrees"
         words = {
             "lidar": f"lidar, {self.lidar_beams} beams{view}",
             "geodesic": f"lidar and geodesic distances, {self.lidar_beams} beams{view}",

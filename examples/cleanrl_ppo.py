@@ -3,7 +3,7 @@
 S. Huang et al., CleanRL: High-quality single-file implementations of deep RL algorithms, JMLR 23 (2022).
 
 python examples/cleanrl_ppo.py --total-timesteps 1000000
-python examples/cleanrl_ppo.py --family clutter --levels exact_regret
+python examples/cleanrl_ppo.py --family clutter --levels regret
 """
 
 from typing import Any, Literal
@@ -66,7 +66,7 @@ def main(
     num_envs: int = 64,
     num_steps: int = 64,
     seed: int = 0,
-    levels: Literal["fresh", "uniform", "plr", "learnability", "exact_regret"] = "fresh",
+    levels: Literal["fresh", "uniform", "plr", "learnability", "regret"] = "fresh",
     test_scenarios: int | None = None,
 ) -> float:
     """Train a policy from scratch, and score it against the optimum.

@@ -25,7 +25,7 @@ RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_car", "dyn
 HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]
-LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "exact_regret"]
+LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "regret"]
 DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
 
 

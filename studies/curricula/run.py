@@ -46,7 +46,7 @@ N_ROBOTS = 500
 NAMES = get_args(LevelsName)
 SCORES = ("positive_value_loss", "max_mc", "learnability", "failures")
 TARGETS = ("regret", "failure_rate", "success_regret")  # of the episodes with which the scores are compared
-LABELS = {"max_mc": "MaxMC", "failures": "failure rate", "exact_regret": "regret"}
+LABELS = {"max_mc": "MaxMC", "failures": "failure rate"}
 TABLES = dict.fromkeys(("curricula-scores", "curricula-stages", "curricula-runs"), "docs/curricula.md")
 
 

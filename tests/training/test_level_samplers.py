@@ -59,13 +59,13 @@ def test_a_level_selected_by_a_reset_is_not_sampled(bank):
 
 def test_high_scores_and_levels_not_drawn_for_long_are_preferred(bank):
     rng = np.random.default_rng(0)
-    sampler = PrioritizedSampler(bank, "exact_regret", replay=1.0, temperature=0.3, staleness=0.0)
+    sampler = PrioritizedSampler(bank, "regret", replay=1.0, temperature=0.3, staleness=0.0)
     for i in range(50):
         sampler.record(LevelOutcome(i, i % 2 == 0, False, -float(i), float(i)))
     drawn = np.array([sampler.draw(rng) for _ in range(2000)])
     assert (drawn == 49).mean() > 0.8  # the first rank: 1 / sum of k^(-1/0.3) = 0.86
     assert sampler.probabilities[:50].argmax() == 49 and sampler.probabilities.sum() == pytest.approx(1.0)
-    stale = PrioritizedSampler(bank, "exact_regret", replay=1.0, staleness=1.0)
+    stale = PrioritizedSampler(bank, "regret", replay=1.0, staleness=1.0)
     for i in range(50):
         stale.record(LevelOutcome(i, True, False, 0.0, float(i)))
     counts = np.bincount([stale.draw(rng) for _ in range(3000)], minlength=50)
@@ -109,7 +109,7 @@ def test_max_mc_compares_the_highest_return_with_the_expected_one(bank):
 
 
 def test_equal_scores_have_equal_probabilities(bank):
-    sampler = PrioritizedSampler(bank, "exact_regret", staleness=0.0)
+    sampler = PrioritizedSampler(bank, "regret", staleness=0.0)
     for i in range(20):
         sampler.record(LevelOutcome(i, True, False, -1.0, float(i >= 15)))
     probabilities = sampler.probabilities
@@ -117,7 +117,7 @@ def test_equal_scores_have_equal_probabilities(bank):
 
 
 def test_the_first_levels_with_a_score_are_not_played_all_the_time(bank):
-    rng, sampler = np.random.default_rng(0), PrioritizedSampler(bank, "exact_regret")
+    rng, sampler = np.random.default_rng(0), PrioritizedSampler(bank, "regret")
     drawn = []
     for _ in range(200):
         drawn.append(sampler.draw(rng))
@@ -198,7 +198,7 @@ def test_scores_that_are_never_set_are_reported(bank):
         sampler.draw(rng)
 
 
-@pytest.mark.parametrize("name", ["uniform", "plr", "learnability", "exact_regret"])
+@pytest.mark.parametrize("name", ["uniform", "plr", "learnability", "regret"])
 def test_ppo_of_stable_baselines_trains_with_every_sampler(bank, name):
     sampler = make_sampler(name, bank)
     venv = make_vec_env(n_envs=4, bank=bank, sampler=sampler, control_period=0.2, lidar_beams=8)
@@ -213,7 +213,7 @@ def test_ppo_of_stable_baselines_trains_with_every_sampler(bank, name):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda bank: PrioritizedSampler(bank, "regret"), "score: .*'regret'"),
+        (lambda bank: PrioritizedSampler(bank, "surprise"), "score: .*'surprise'"),
         (lambda bank: PrioritizedSampler(bank, replay=2.0), "replay: "),
         (lambda bank: PrioritizedSampler(bank, temperature=0.0), "temperature: "),
         (lambda bank: make_sampler("random", bank), "name: .*'random'"),

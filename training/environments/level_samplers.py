@@ -23,10 +23,10 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.sources import LevelOutcome
 from leapnav.envs.utils.validation import check_choice, check_fraction, check_positive
 
-ScoreName = Literal["positive_value_loss", "max_mc", "learnability", "exact_regret"]
+ScoreName = Literal["positive_value_loss", "max_mc", "learnability", "regret"]
 SCORES: tuple[str, ...] = get_args(ScoreName)
 VALUE_SCORES = ("positive_value_loss", "max_mc")  # those that need the values of a critic, see `score_rollout`
-SAMPLERS = ("uniform", "plr", "learnability", "exact_regret")
+SAMPLERS = ("uniform", "plr", "learnability", "regret")
 MAX_AGE = 64  # draws after which the probabilities are computed again ...
 MAX_GROWTH = 1.1  # ... or, earlier, growth of the number of levels with a score
 PLAYS_WITHOUT_SCORE = 5  # mean number of episodes of a level after which missing scores are reported
@@ -87,7 +87,7 @@ class PrioritizedSampler(UniformSampler):
 
     Args:
         bank: the levels.
-        score: "exact_regret": regret of the last episode; "learnability": p (1 - p) with the success rate p;
+        score: "regret": regret of the last episode; "learnability": p (1 - p) with the success rate p;
             "positive_value_loss" or "max_mc": from the critic's values, set by `score_rollout`.
         replay: probability of a level with a score; otherwise one that has none yet is drawn, as long as there are any.
         temperature: the smaller, the more the highest scores are preferred. With 0.3, as in the literature for levels
@@ -174,7 +174,7 @@ class PrioritizedSampler(UniformSampler):
         """Store the outcome of an episode, and the score that follows from it; the environment calls it."""
         super().record(outcome)
         i = outcome.index
-        if self.score == "exact_regret":
+        if self.score == "regret":
             self.scores[i] = self.regrets[i]
         elif self.score == "learnability":
             self.scores[i] = self.success[i] * (1 - self.success[i])
@@ -238,14 +238,14 @@ class RegretSampler(PrioritizedSampler):
     """Draw levels by the regret of the policy; arguments as for `PrioritizedSampler`, without `score`."""
 
     def __init__(self, bank: ScenarioBank, **options: Any) -> None:
-        super().__init__(bank, "exact_regret", **options)
+        super().__init__(bank, "regret", **options)
 
 
 def make_sampler(name: str, bank: ScenarioBank, **options: Any) -> UniformSampler:
     """Make a level sampler.
 
     Args:
-        name: "uniform", "plr" (with the option `score`), "learnability" or "exact_regret".
+        name: "uniform", "plr" (with the option `score`), "learnability" or "regret".
         bank: the levels.
         options: options of `PrioritizedSampler`; none for "uniform".
 

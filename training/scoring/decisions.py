@@ -1,4 +1,4 @@
-"""Exact regret: of a policy on each level, and of each of its decisions."""
+"""Regret of a policy on each level, and of each of its decisions."""
 
 from __future__ import annotations
 
