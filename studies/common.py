@@ -22,6 +22,8 @@ from leapnav.training import (
     evaluate,
     load_policy,
     policy_environment,
+    read_episodes,
+    score,
     train_bc,
     train_dagger,
     train_ppo,
@@ -29,6 +31,7 @@ from leapnav.training import (
     write_episodes,
 )
 from leapnav.training.config import read_config
+from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
 
 RUNS = Path("runs/studies")  # directory of the runs, the demonstrations and the fresh scenarios
 FRESH_SEED = 784  # of the fresh scenarios
@@ -164,3 +167,26 @@ def play(
         parts = [evaluate(policy, bank, **arguments).episodes for bank in banks]
         found.append(Evaluation(tuple(episode for part in parts for episode in part), float("nan")))
     write_episodes({name: found}, results / f"{name}.jsonl.gz")
+
+
+def score_tables(results: Path, heading: str, labels: Mapping[str, str]) -> tuple[str, str]:
+    """Return two Markdown tables of scores: over the scenarios, and with the values of each of several runs.
+
+    Args:
+        results: directory of the results.
+        heading: titles of the first columns, divided by " | ".
+        labels: cells of the first columns by the names of the results; results that do not exist are omitted.
+
+    """
+    head = f"| {heading} | success (%) | collision (%) | SOC | regret, pose reached (%) |\n"
+    head += "|---" * (head.count("|") - 1) + "|\n"
+    over_scenarios, over_runs = head, head
+    for name, label in labels.items():
+        path = results / f"{name}.jsonl.gz"
+        if path.exists():
+            ((_, found),) = read_episodes(path).items()
+            row = score(name, found)
+            over_scenarios += f"| {label} | {markdown_cells(row)} |\n"
+            if row.runs > 1:
+                over_runs += f"| {label} | {markdown_run_cells(row)} |\n"
+    return over_scenarios, over_runs

@@ -27,13 +27,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from leapnav.envs import ScenarioBank
 from leapnav.experts import build_bank
-from leapnav.training import PPOConfig, read_episodes, score
+from leapnav.training import PPOConfig
 from leapnav.training.config import LevelsName, read_config
 from leapnav.training.runs.reinforcement import make_training_env
-from leapnav.training.scoring.reports import markdown_run_cells
 
 sys.path.append(str(Path(__file__).parents[1]))
-from common import load, play, read_arguments, train, workers
+from common import load, play, read_arguments, score_tables, train, workers
 
 HERE = Path(__file__).parent
 SETTINGS, FIGURE = HERE / "configurations/ppo.json", HERE.parents[1] / "docs/images/curricula.svg"
@@ -209,12 +208,7 @@ def _mean_and_range(values: Sequence[float], digits: int = 2) -> str:
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
     scores, stages = correlations(results)
-    runs = "| levels | success (%) | collision (%) | SOC | regret, pose reached (%) |\n" + "|---" * 5 + "|\n"
-    for name in NAMES:
-        path = results / f"{name}.jsonl.gz"
-        if path.exists():
-            ((_, found),) = read_episodes(path).items()
-            runs += f"| {label(name)} | {markdown_run_cells(score(name, found))} |\n"
+    _, runs = score_tables(results, "levels", {name: label(name) for name in NAMES})
     return {"curricula-scores": scores, "curricula-stages": stages, "curricula-runs": runs}
 
 

@@ -13,11 +13,8 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
-from leapnav.training import read_episodes, score
-from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
-
 sys.path.append(str(Path(__file__).parents[1]))
-from common import demonstrate, fresh_bank, load, play, read_arguments, train
+from common import demonstrate, fresh_bank, load, play, read_arguments, score_tables, train
 
 HERE = Path(__file__).parent
 FAMILY, COUNTS, SCENARIOS = "clutter", (100, 300, 1000, 3000, 10_000), 1000
@@ -38,18 +35,8 @@ def demonstrations(count: int, runs: Path, *, tiny: bool) -> tuple[Path, ...]:
 
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
-    columns = (
-        "| demonstrations | success (%) | collision (%) | SOC | regret, pose reached (%) |\n|---|---|---|---|---|\n"
-    )
-    texts = {"demonstrations": columns, "demonstrations-runs": columns}
-    for name in NAMES:
-        path = results / f"{name}.jsonl.gz"
-        if path.exists():
-            ((_, found),) = read_episodes(path).items()
-            row, label = score(name, found), f"{int(name):,}"
-            texts["demonstrations"] += f"| {label} | {markdown_cells(row)} |\n"
-            texts["demonstrations-runs"] += f"| {label} | {markdown_run_cells(row)} |\n"
-    return texts
+    labels = {name: f"{int(name):,}" for name in NAMES}
+    return dict(zip(TABLES, score_tables(results, "demonstrations", labels), strict=True))
 
 
 def main() -> None:

@@ -14,11 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from leapnav.envs import ScenarioBank
-from leapnav.training import read_episodes, score
-from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
 
 sys.path.append(str(Path(__file__).parents[1]))
-from common import demonstrate, load, play, read_arguments, train
+from common import demonstrate, load, play, read_arguments, score_tables, train
 
 HERE = Path(__file__).parent
 TABLES = {"methods": "docs/results.md", "methods-runs": "docs/results.md"}
@@ -52,18 +50,9 @@ def train_method(name: str, seed: int, runs: Path, *, tiny: bool) -> Path:
 
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
-    columns = "| success (%) | collision (%) | SOC | regret, pose reached (%) |\n|---|---|---|---|---|---|---|\n"
-    rows = {"methods": "| family | method | runs " + columns, "methods-runs": "| family | method | runs " + columns}
-    for name in NAMES:
-        path = results / f"{name}.jsonl.gz"
-        if path.exists():
-            family, _, method = name.partition("-")
-            ((_, found),) = read_episodes(path).items()
-            row = score(name, found)
-            start = f"| {family} | {ROWS[method]} | {row.runs} | "
-            rows["methods"] += f"{start}{markdown_cells(row)} |\n"
-            rows["methods-runs"] += f"{start}{markdown_run_cells(row)} |\n"
-    return rows
+    parts = {name: name.partition("-") for name in NAMES}
+    labels = {name: f"{family} | {ROWS[method]}" for name, (family, _, method) in parts.items()}
+    return dict(zip(TABLES, score_tables(results, "family | method", labels), strict=True))
 
 
 def main() -> None:

@@ -15,12 +15,11 @@ from typing import Any
 from stable_baselines3.common.policies import BasePolicy
 
 from leapnav.envs import NavigateEnv
-from leapnav.training import make_policy, read_episodes, score
+from leapnav.training import make_policy
 from leapnav.training.policies.actors import copy_actor
-from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
 
 sys.path.append(str(Path(__file__).parents[1]))
-from common import fresh_bank, load, play, read_arguments, train
+from common import fresh_bank, load, play, read_arguments, score_tables, train
 
 HERE = Path(__file__).parent
 FAMILY, START, SCENARIOS, SEEDS = "clutter", "clutter", 1000, 3
@@ -43,18 +42,8 @@ def load_ideal() -> tuple[BasePolicy, dict[str, Any]]:
 
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
-    columns = "| disturbance | policy | success (%) | collision (%) | SOC | regret, pose reached (%) |\n"
-    texts = dict.fromkeys(TABLES, columns + "|---" * 6 + "|\n")
-    for disturbance in DISTURBANCES:
-        for name in NAMES:
-            path = results / f"{name}-{disturbance}.jsonl.gz"
-            if path.exists():
-                ((_, found),) = read_episodes(path).items()
-                row, start = score(name, found), f"| {disturbance:g} | {ROWS[name]} | "
-                texts["motors"] += f"{start}{markdown_cells(row)} |\n"
-                if row.runs > 1:
-                    texts["motors-runs"] += f"{start}{markdown_run_cells(row)} |\n"
-    return texts
+    labels = {f"{name}-{size}": f"{size:g} | {label}" for size in DISTURBANCES for name, label in ROWS.items()}
+    return dict(zip(TABLES, score_tables(results, "disturbance | policy", labels), strict=True))
 
 
 def main() -> None:

@@ -12,11 +12,9 @@ import sys
 from pathlib import Path
 
 from leapnav.envs import ScenarioBank
-from leapnav.training import read_episodes, score
-from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
 
 sys.path.append(str(Path(__file__).parents[1]))
-from common import demonstrate, load, play, read_arguments, train
+from common import demonstrate, load, play, read_arguments, score_tables, train
 
 HERE = Path(__file__).parent
 FAMILY, DEMONSTRATIONS, DEMONSTRATION_SEED, SEEDS = "rooms", 1500, 62_000, 3
@@ -31,16 +29,7 @@ TABLES = dict.fromkeys(("observations", "observations-runs"), "docs/training.md"
 
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
-    columns = "| observation | success (%) | collision (%) | SOC | regret, pose reached (%) |\n" + "|---" * 5 + "|\n"
-    texts = dict.fromkeys(TABLES, columns)
-    for name, label in ROWS.items():
-        path = results / f"{name}.jsonl.gz"
-        if path.exists():
-            ((_, found),) = read_episodes(path).items()
-            row = score(name, found)
-            texts["observations"] += f"| {label} | {markdown_cells(row)} |\n"
-            texts["observations-runs"] += f"| {label} | {markdown_run_cells(row)} |\n"
-    return texts
+    return dict(zip(TABLES, score_tables(results, "observation", ROWS), strict=True))
 
 
 def main() -> None:

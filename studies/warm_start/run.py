@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from leapnav.envs import ScenarioBank
-from leapnav.training import WarmStartConfig, read_episodes, score
-from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
+from leapnav.training import WarmStartConfig
 
 sys.path.append(str(Path(__file__).parents[1]))
-from common import demonstrate, load, play, read_arguments, train
+from common import demonstrate, load, play, read_arguments, score_tables, train
 
 HERE = Path(__file__).parent
 FAMILY, SEEDS = "clutter", 3
@@ -98,16 +97,8 @@ def train_row(name: str, seed: int, runs: Path, *, tiny: bool) -> Path:
 
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
-    columns = "| start | success (%) | collision (%) | SOC | regret, pose reached (%) |\n" + "|---" * 5 + "|\n"
-    texts = dict.fromkeys(TABLES, columns)
-    for name, row in ROWS.items():
-        path = results / f"{name}.jsonl.gz"
-        if path.exists():
-            ((_, found),) = read_episodes(path).items()
-            scores = score(name, found)
-            texts["warm-start"] += f"| {row.label} | {markdown_cells(scores)} |\n"
-            texts["warm-start-runs"] += f"| {row.label} | {markdown_run_cells(scores)} |\n"
-    return texts
+    labels = {name: row.label for name, row in ROWS.items()}
+    return dict(zip(TABLES, score_tables(results, "start", labels), strict=True))
 
 
 def main() -> None:
