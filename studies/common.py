@@ -66,7 +66,7 @@ def read_arguments(description: str, names: Sequence[str], folder: Path, **switc
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"parts ({', '.join(names)}); by default all")
-    parser.add_argument("--runs", type=Path, default=RUNS, help=f"directory of the runs; by default {RUNS}")
+    parser.add_argument("--runs", type=Path, help=f"directory of the runs; by default {RUNS}, with --tiny in --out")
     parser.add_argument("--out", type=Path, help="directory of the results; by default beside this file")
     parser.add_argument("--tiny", action="store_true", help="use a tiny budget, to try the script; needs --out")
     for name, text in switches.items():
@@ -79,6 +79,7 @@ def read_arguments(description: str, names: Sequence[str], folder: Path, **switc
         parser.error("--tiny: needs --out, so that the results in the repository are kept")
     arguments.names = arguments.names or list(names)
     arguments.results = arguments.out or folder / "results"
+    arguments.runs = arguments.runs or (arguments.out / "runs" if arguments.tiny else RUNS)
     arguments.results.mkdir(parents=True, exist_ok=True)
     return arguments
 
@@ -114,7 +115,8 @@ def train(
 def is_finished(run: Path) -> bool:
     """Return whether the final evaluation of a run exists."""
     evaluations = run / "evaluations.jsonl"
-    return evaluations.exists() and json.loads(evaluations.read_text(encoding="utf-8").splitlines()[-1])["final"]
+    lines = evaluations.read_text(encoding="utf-8").splitlines() if evaluations.exists() else []
+    return bool(lines) and json.loads(lines[-1])["final"]
 
 
 def demonstrate(family: str, count: int, folder: Path, *, seed: int, tiny: bool) -> Path:

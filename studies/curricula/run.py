@@ -1,8 +1,7 @@
 """Curricula: scores of levels beside their regret, and PPO from scratch with each level sampler, in several runs.
 
-python studies/curricula/run.py                  # trains and scores all, and draws the figure
-python studies/curricula/run.py fresh max_mc     # trains and scores with these samplers only
-python studies/curricula/run.py --figure         # only draws the figure from the results
+python studies/curricula/run.py               # trains and scores all, and draws the figure
+python studies/curricula/run.py fresh max_mc  # trains and scores with these samplers only
 
 `configurations/ppo.json` contains the complete settings, in the format of `config.json` of a training run; the levels
 differ. `results/` contains the episodes on the test split, the evaluations during the runs, and the scores of all
@@ -80,11 +79,11 @@ def label(name: str) -> str:
 
 
 @th.no_grad()
-def play_levels(model: PPO, venv: Any, indices: np.ndarray) -> dict[str, np.ndarray]:
+def play_levels(model: PPO, venv: Any, indices: np.ndarray, penalty: float) -> dict[str, np.ndarray]:
     """Play one episode of each of N levels with the noise of training.
 
     Returns:
-        `rewards`, `values` and `running` (T, N), the last bool; `returns`, without the graded reward, `costs` and
+        `rewards`, `values` and `running` (T, N), the last bool; `returns`, with the full penalty of a miss, `costs` and
         `success` (N,).
 
     """
@@ -100,7 +99,7 @@ def play_levels(model: PPO, venv: Any, indices: np.ndarray) -> dict[str, np.ndar
         for i in np.flatnonzero(dones & alive).tolist():
             last = infos[i]
             ends["costs"][i], ends["success"][i] = last["cost"], last["is_success"]
-            ends["returns"][i] = last["reward_collision"] + last["reward_miss"] - last["cost"]
+            ends["returns"][i] = -penalty * (not last["is_success"]) - last["cost"]
         alive &= ~dones
     return {**{name: np.array(column) for name, column in rows.items()}, **ends}
 
@@ -116,7 +115,7 @@ def score_levels(model: PPO, config: PPOConfig, bank: ScenarioBank) -> dict[str,
     th.manual_seed(config.seed)
     for first in range(0, len(bank), count):
         indices = np.arange(first, first + count)
-        episodes = [play_levels(model, venv, indices) for _ in range(2 * EPISODES)]
+        episodes = [play_levels(model, venv, indices, config.penalty) for _ in range(2 * EPISODES)]
         found = _scores(episodes[:EPISODES], config.gae_lambda) | _targets(episodes[EPISODES:], bank.costs[indices])
         for name, column in found.items():
             columns.setdefault(name, []).append(column)
@@ -246,11 +245,8 @@ def curve(run: Path) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Train, score the levels and the policies, and draw the figure."""
-    arguments = read_arguments(__doc__, NAMES, HERE, figure="only draw the figure")
+    arguments = read_arguments(__doc__, NAMES, HERE)
     tiny, results, runs = arguments.tiny, arguments.results, arguments.runs / "curricula"
-    if arguments.figure:
-        draw(results, FIGURE)
-        return
     runs.mkdir(parents=True, exist_ok=True)
     count, seeds = (10 if tiny else N_LEVELS), range(2 if tiny else SEEDS)
     path = runs / f"levels-{count}.bank"
@@ -272,7 +268,7 @@ def main() -> None:
         (results / f"{name}-curves.json").write_text(json.dumps([curve(run) for run in found]), encoding="utf-8")
         test = ScenarioBank.shipped(FAMILY, "test")
         play(map(load, found), [test], results, name, count=2 if tiny else None, progress=not tiny)
-    draw(results, results / "curricula.svg" if tiny else FIGURE)
+    draw(results, FIGURE if arguments.out is None else results / "curricula.svg")
     print("\n".join(tables(results).values()))
 
 

@@ -18,7 +18,7 @@ from common import demonstrate, fresh_bank, load, play, read_arguments, score_ta
 
 HERE = Path(__file__).parent
 FAMILY, COUNTS, SCENARIOS = "clutter", (100, 300, 1000, 3000, 10_000), 1000
-SEEDS, DEMONSTRATION_SEED = 3, 61_000
+SEEDS, DEMONSTRATION_SEED, SEED_DISTANCE = 3, 61_000, 100_000  # distance: of the seeds of two directories
 NAMES = tuple(map(str, COUNTS))
 TABLES = {"demonstrations": "docs/results.md", "demonstrations-runs": "docs/results.md"}
 
@@ -29,7 +29,9 @@ def demonstrations(count: int, runs: Path, *, tiny: bool) -> tuple[Path, ...]:
     for number, (before, following) in enumerate(pairwise((0, *COUNTS))):
         if following <= count:
             size, folder = 4 if tiny else following - before, runs / f"demonstrations-{following}"
-            folders.append(demonstrate(FAMILY, size, folder, seed=DEMONSTRATION_SEED + number, tiny=tiny))
+            folders.append(
+                demonstrate(FAMILY, size, folder, seed=DEMONSTRATION_SEED + number * SEED_DISTANCE, tiny=tiny)
+            )
     return tuple(folders)
 
 

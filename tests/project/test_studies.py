@@ -17,7 +17,6 @@ WORDS = {
     "observations": ["memory"],
     "planners": ["lattice"],
     "transfer": ["open", "clutter"],
-    "warm_start": ["ppo-value"],
 }
 ALL_WORDS = {"included_policies": ["open", "--train"]}  # of the slow test; training of all would take hours
 ROWS = {
@@ -30,7 +29,6 @@ ROWS = {
     "observations": "| lidar, also ",
     "planners": "| open | ",
     "transfer": "| `",
-    "warm_start": "| PPO, actor of the clone",
 }  # of the tables
 
 
