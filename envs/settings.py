@@ -36,6 +36,7 @@ SENSORS = (
     *("velocities", "history", "previous_action"),
 )
 FULL_CIRCLE = 2 * math.pi  # rad
+MIN_FOV, FOV_ROUNDING = 1e-3, 1e-6  # rad, smallest field of view, and rounding of a given full circle
 MIN_PERIOD = 1e-4  # s
 MAX_COUNT = 10_000  # beams, obstacles in the map, vertices of each, or control periods of the history
 
@@ -158,8 +159,10 @@ class EnvironmentSettings:
             check_not_negative(name, getattr(self, name))
         check_at_least("control_period", self.control_period, MIN_PERIOD, unit="s")
         check_fraction("discount", self.discount, zero=False)
-        if self.lidar_fov > FULL_CIRCLE:
-            raise ValueError(f"lidar_fov: expected an angle of at most 2 pi rad, got {self.lidar_fov:g}")
+        fov = float(self.lidar_fov)
+        if not MIN_FOV <= fov <= FULL_CIRCLE + FOV_ROUNDING:
+            raise ValueError(f"lidar_fov: expected an angle in [{MIN_FOV:g}, 2 pi] rad, got {fov!r}")
+        object.__setattr__(self, "lidar_fov", FULL_CIRCLE if fov > FULL_CIRCLE - FOV_ROUNDING else fov)
         for name, minimum in (("lidar_beams", 0), ("map_obstacles", 1), ("map_vertices", 3)):
             check_integer(name, getattr(self, name), minimum, MAX_COUNT)
         for name in ("terminate_on_collision", "graded_miss", "dict_observation", "previous_action", "velocities"):

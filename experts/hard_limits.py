@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -172,7 +173,7 @@ class _Continuation:
 
     def __init__(self, extremal: Extremal, weight: float, tolerance: float) -> None:
         self._weight, self._tolerance = 0.0 if extremal.problem.has_hard_limits else weight, tolerance
-        self._before: Extremal | None = None
+        self._first, self._before = extremal, cast(Extremal | None, None)
         self._set(extremal)
 
     def _set(self, extremal: Extremal) -> None:
@@ -221,11 +222,15 @@ class _Continuation:
         return True
 
     def _certified(self) -> Extremal | None:
-        """Return the last extremal with a certificate; None if Newton's method does not converge."""
-        problem = self._extremal.problem
+        """Return the last extremal with a certificate; None if Newton's method does not converge.
+
+        Its history begins with that of the first extremal.
+        """
+        problem, first = self._extremal.problem, self._first
         for steps in (STEPS_PER_SEGMENT, 1):
             times, nodes = self._nodes(steps)
             status, history, evaluations = polish(problem, times, nodes, OPTIONS.tol, OPTIONS.max_iterations)
+            history, evaluations = (*first.history, *history), first.n_evaluations + evaluations
             found = confirm(problem, times, nodes, status, history, evaluations, OPTIONS)
             if found.success:
                 return found

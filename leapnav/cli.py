@@ -16,7 +16,6 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import tyro
-from tyro import _strings as tyro_strings
 
 from leapnav.commands.bank import Bank
 from leapnav.commands.demo import Demo
@@ -112,8 +111,11 @@ def _as_paragraphs(text: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
 
 
-# tyro breaks help texts at indented lines, too, so that they are wrapped twice.
-tyro_strings.remove_single_line_breaks = _as_paragraphs
+# tyro breaks help texts at indented lines, too, so that they are wrapped twice. The module is private.
+with suppress(ImportError):
+    from tyro import _strings as tyro_strings
+
+    tyro_strings.remove_single_line_breaks = _as_paragraphs
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -281,8 +281,9 @@ def test_a_smaller_field_of_view_has_the_beams_of_the_full_circle(family):
             if family == "crossing":
                 pairs = everywhere["velocities"].reshape(2, 360)[:, indices].ravel()
                 assert found["velocities"] == pytest.approx(pairs, abs=1e-6)
-    with pytest.raises(ValueError, match="lidar_fov: expected an angle of at most 2 pi rad, got 270"):
+    with pytest.raises(ValueError, match=r"lidar_fov: expected an angle in \[0.001, 2 pi\] rad, got 270.0"):
         NavigateEnv(lidar_fov=270)
+    assert NavigateEnv(lidar_fov=np.float32(2 * np.pi)).settings == NavigateEnv().settings
 
 
 @pytest.mark.parametrize("heading", [0.0, -0.0, math.pi / 2, math.pi, -math.pi / 2, 1e-12])

@@ -70,7 +70,7 @@ def time_reverse(
     """
     settings = settings or EnvironmentSettings()
     symmetry = _require(settings, "reversal", settings.model.reversal)
-    if not settings.has_full_circle:
+    if settings.has_lidar and not settings.has_full_circle:
         raise ValueError(f"time reversal needs a lidar_fov of 2 pi rad, got {settings.lidar_fov:g}")
 
     def rotated(values: th.Tensor) -> th.Tensor:

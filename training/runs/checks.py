@@ -55,7 +55,7 @@ def check_config(config: RunConfig) -> None:
         raise ValueError(f"hidden: expected widths of at least 1, got {config.hidden!r}")
     check_integer("seed", config.seed, 0, 2**32 - 1)
     beams = config.environment["lidar_beams"]
-    if not (beams > 0 and beams % 2 == 0):
+    if not (beams > 0 and (beams % 2 == 0 or config.lidar_fov < math.tau)):  # for the time reversal
         raise ValueError(f"lidar_beams: expected an even number >= 2, got {beams!r}")
     EnvironmentSettings(**config.environment)
     if isinstance(config, SACConfig) and config.algorithm == "tqc" and config.effort_weights is not None:

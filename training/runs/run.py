@@ -23,7 +23,7 @@ from leapnav.envs.scenarios.families import BANK_ENDING, families_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
-from leapnav.training.config import RunConfig
+from leapnav.training.config import LATER_SENSORS, RunConfig
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.comparison import own_bank
@@ -111,6 +111,7 @@ class Run:
                 f"{self.folder}: a run of {str(stored.get('algorithm')).upper()}, not of {self.algorithm.upper()}; "
                 f"resume it by `leapnav train {stored.get('algorithm')}`"
             )
+        stored = {**LATER_SENSORS, **stored}
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
