@@ -53,7 +53,7 @@ class Evaluate(ParallelOptions):
     """Seed of the bootstrap intervals and of the random policy."""
     env: EnvironmentOption = ()
     """Arguments of the environment (KEY=VALUE) with which a model of Stable-Baselines3 was trained; by default derived
-    from its observation space, for a lidar."""
+    from its observation space, for a lidar with a field of view of the full circle."""
     trust: bool = False
     """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
     vecnormalize: Path | None = None

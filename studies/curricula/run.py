@@ -99,7 +99,8 @@ def play_levels(model: PPO, venv: Any, indices: np.ndarray, penalty: float) -> d
         for i in np.flatnonzero(dones & alive).tolist():
             last = infos[i]
             ends["costs"][i], ends["success"][i] = last["cost"], last["is_success"]
-            ends["returns"][i] = -penalty * (not last["is_success"]) - last["cost"]
+            missed = last["reward_miss"] < 0.0  # after a collision, too
+            ends["returns"][i] = last["reward_collision"] - penalty * missed - last["cost"]
         alive &= ~dones
     return {**{name: np.array(column) for name, column in rows.items()}, **ends}
 

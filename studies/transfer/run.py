@@ -19,7 +19,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from common import load, play, read_arguments
 
 HERE = Path(__file__).parent
-# The policies of each table, with the same sensors.
+# The policies of each table: those that know the map, and those with lidar alone.
 POLICIES = {
     "transfer-map": ("clutter", "polygons", "rooms", "slalom", "all"),
     "transfer-lidar": ("open", "clutter-lidar", "polygons-lidar", "rooms-lidar", "slalom-lidar"),

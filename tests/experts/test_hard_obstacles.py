@@ -149,6 +149,12 @@ def test_the_barrier_weight_of_a_stored_path_is_found():
         assert integral == pytest.approx(part, rel=1e-2)
 
 
+def test_the_history_begins_with_the_method_that_found_the_first_extremal():
+    found = solve(sample_scenario("clutter", 0, obstacles="hard"), method="leapfrog", polish=False)
+    assert found.success
+    assert found.history[0].phase == "sweep" and found.history[-1].phase == "newton"
+
+
 def test_banks_are_built_and_checked(tmp_path):
     path = tmp_path / "hard.bank"
     assert (

@@ -21,15 +21,18 @@ WORDS = {
 ALL_WORDS = {"included_policies": ["open", "--train"]}  # of the slow test; training of all would take hours
 ROWS = {
     "clients": "| gymnasium ",
-    "curricula": "0.0",
+    "curricula-scores": "| 0.5 M | MaxMC |",
+    "curricula-stages": "| 0.5 M |",
+    "curricula-runs": "| uniform |",
     "demonstrations": "| 100 |",
     "methods": "| open | clone |",
     "included_policies": "| `open` ",
     "motors": "PPO from it",
     "observations": "| lidar, also ",
     "planners": "| open | ",
-    "transfer": "| `",
-}  # of the tables
+    "transfer-map": "| `clutter` |",
+    "transfer-lidar": "| `open` |",
+}  # of the tables, by study or by table
 
 
 def load(path, name):
@@ -62,6 +65,19 @@ def test_a_table_that_differs_is_found(write_tables):
         write_tables.with_table(text, "y", "")
 
 
+def test_the_demonstrations_of_the_study_are_distinct(monkeypatch, tmp_path):
+    """Scenario k of a rollout has the seed of the rollout plus k; the next seeds replace rejected scenarios."""
+    study, seeds = load(ROOT / "studies" / "demonstrations" / "run.py", "study_demonstrations"), []
+
+    def demonstrate(family, count, folder, *, seed, tiny):
+        seeds.extend(range(seed, seed + 2 * count))
+        return folder
+
+    monkeypatch.setattr(study, "demonstrate", demonstrate)
+    assert len(study.demonstrations(10_000, tmp_path, tiny=False)) == 5
+    assert len(seeds) == len(set(seeds)) == 20_000
+
+
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """A function that runs a study with a tiny budget in an empty directory, and returns the files of its results."""
@@ -74,7 +90,8 @@ def run(tmp_path, monkeypatch):
         study = load(ROOT / "studies" / name / "run.py", f"study_{name}")
         monkeypatch.setattr(sys, "argv", ["run.py", *words, "--tiny", "--out", "results"])
         study.main()
-        assert all(ROWS[name] in table for table in study.tables(folder / "results").values())
+        for table, text in study.tables(folder / "results").items():
+            assert ROWS.get(table, ROWS.get(name)) in text
         return {path.name: path.read_bytes() for path in (folder / "results").iterdir() if path.is_file()}
 
     return run

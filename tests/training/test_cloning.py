@@ -9,7 +9,16 @@ from helpers import QUICK, SMALL, fresh
 from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from leapnav.envs import NavigateEnv, sample_scenario
-from leapnav.training import CloningConfig, Dataset, behaviour_clone, evaluate, network
+from leapnav.training import (
+    CloningConfig,
+    Dataset,
+    behaviour_clone,
+    evaluate,
+    load_policy,
+    network,
+    policy_environment,
+    save_policy,
+)
 from leapnav.training.learning.cloning import _Fit
 from leapnav.training.policies.actors import copy_actor, mean_action
 
@@ -25,6 +34,24 @@ def test_cloning_learns(clone, env):
 
 def test_the_noise_of_a_clone_is_the_error_that_remains(clone):
     assert th.all(clone[0].log_std.exp() < 0.2)
+
+
+@pytest.mark.parametrize("observation", ["lidar", "state"])
+def test_a_policy_with_a_smaller_field_of_view_is_cloned_saved_and_loaded(observation, dataset, tmp_path):
+    settings = {"observation": observation, "lidar_fov": 4.0, "lidar_beams": 15}
+    env = NavigateEnv("open", **settings)
+    model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [32]}, seed=0, device="cpu")
+    losses = behaviour_clone(model, dataset, CloningConfig(epochs=6, batch_size=256), progress=False)
+    assert losses[-1].training < losses[0].training
+    save_policy(model, tmp_path / "policy")
+    assert policy_environment(tmp_path / "policy")["lidar_fov"] == 4.0
+    load_policy(tmp_path / "policy", env)
+    if observation == "lidar":
+        seen = dataset.observed(env.settings)
+        first = NavigateEnv(scenario=seen.scenarios[int(seen.episodes[0])], **settings).reset()[0]
+        assert seen.observations[0] == pytest.approx(first, abs=1e-5)
+        with pytest.raises(ValueError, match=r"lidar_fov=4.0 \(here 6.28"):
+            load_policy(tmp_path / "policy", NavigateEnv("open", lidar_beams=15))
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3])

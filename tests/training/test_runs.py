@@ -143,6 +143,9 @@ def test_a_run_of_another_version_is_refused_by_what_it_lacks(tmp_path):
     config = ppo(tmp_path / "run", total_timesteps=256)
     train_ppo(config, progress=False)
     record = json.loads((config.out / "config.json").read_text())
+    del record["config"]["lidar_fov"]  # a run from before this setting has the full circle
+    (config.out / "config.json").write_text(json.dumps(record))
+    train_ppo(replace(config, resume=True), progress=False)
     del record["config"]["graded_miss"]
     (config.out / "config.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match="a run of another version of leapnav, without graded_miss"):
