@@ -302,8 +302,8 @@ class ObservationLayout:
             return np.empty(0)
         x, y, heading = pose[:3].tolist()
         buffers = self._buffers
-        reach, fov = self._settings.lidar_range, self._settings.lidar_fov
-        scan(x, y, heading, time, field, reach, fov, buffers.beams, buffers.scratch)
+        view = self._settings.lidar_range, self._settings.lidar_fov
+        scan(x, y, heading, time, field, view, buffers.beams, buffers.scratch)
         return buffers.scratch[2, : self._settings.lidar_beams].copy()
 
     def fill(self, robots: np.ndarray, packed: tuple[np.ndarray, ...], out: np.ndarray) -> None:
@@ -334,7 +334,8 @@ def observe_robots(robots, packed, packed_buffers, out):
         cos, sin = math.cos(heading), math.sin(heading)
         noise = sim.noise[i, episode.steps % sim.noise.shape[1]]
         if at.lidar >= 0:  # from the true pose, not from the sensed one
-            scan(x, y, heading, episode.time, field, settings.lidar_range, settings.lidar_fov, beams, scratch)
+            view = settings.lidar_range, settings.lidar_fov
+            scan(x, y, heading, episode.time, field, view, beams, scratch)
         # Achieved goals are observed without noise, because they determine the reward.
         if deviation != 0.0 and not settings.goal_conditioned:
             x += deviation * noise[sensing]

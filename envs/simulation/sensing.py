@@ -12,7 +12,7 @@ from leapnav.envs.field.layout import PART_TYPE, displacement_of, edges_of, head
 from leapnav.envs.field.packing import field_parts
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import part_of
-from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR
+from leapnav.envs.kernels.types import CONSTANT, MATRIX, NOTHING, VECTOR, tuple_of
 from leapnav.envs.settings import FULL_CIRCLE
 
 ROUNDING = 1e-9  # m, of two computations of the same range
@@ -113,8 +113,8 @@ def _shorten(cx, cy, r, reach, dxs, dys, nearest):
         nearest[k] = hit if hit < nearest[k] else nearest[k]
 
 
-@kernel(NOTHING(float64, float64, float64, float64, CONSTANT, float64, float64, MATRIX, MATRIX))
-def scan(x, y, heading, time, field, reach, fov, beams, scratch):
+@kernel(NOTHING(float64, float64, float64, float64, CONSTANT, tuple_of(float64, float64), MATRIX, MATRIX))
+def scan(x, y, heading, time, field, view, beams, scratch):
     """Compute lidar ranges (m).
 
     Polygons are intersected only with the beams that may meet a circle around them, and so are circles if there are
@@ -124,14 +124,14 @@ def scan(x, y, heading, time, field, reach, fov, beams, scratch):
         x, y, heading: position (m) and heading (rad) of the lidar.
         time: of the episode (s), for the positions of moving obstacles.
         field: the packed field of the scenario.
-        reach: maximum range (m).
-        fov: field of view (rad).
+        view: maximum range (m) and field of view (rad).
         beams (2, n): cosines and sines of the angles of the beams in the lidar's frame, see
             `EnvironmentSettings.beam_angles`.
         scratch (3, 2 n): working memory; the first n entries of row 2 are the ranges afterwards.
 
     """
     count, cos, sin = beams.shape[1], math.cos(heading), math.sin(heading)
+    reach, fov = view
     dxs, dys, nearest = scratch[0], scratch[1], scratch[2]
     parts, arena = parts_in(field), header_of(field).arena
     has_polygons = header_of(field).edges > 0

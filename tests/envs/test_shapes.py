@@ -149,7 +149,7 @@ def lidar(scenario, x, y, heading, count=64, reach=5.0):
     turn = 2 * math.pi * np.arange(count) / count
     scratch = np.zeros((3, 2 * count))
     beams = np.ascontiguousarray(np.stack([np.cos(turn), np.sin(turn)]))
-    scan(x, y, heading, 0.0, scenario.field, reach, 2 * np.pi, beams, scratch)
+    scan(x, y, heading, 0.0, scenario.field, (reach, 2 * np.pi), beams, scratch)
     return heading + turn, scratch[2, :count].copy()
 
 
