@@ -369,10 +369,11 @@ def _mean(values: np.ndarray) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    medians = np.full(values.shape[:-1], np.nan)
-    measured = ~np.isnan(values).all(axis=-1)  # NumPy warns of resamples that contain NaN only
-    medians[measured] = np.nanmedian(values[measured], axis=-1)
-    return medians
+    # As `np.nanmedian`, which calls a function for each row; NaN are sorted to the end.
+    ordered, known = np.sort(values, axis=-1), (~np.isnan(values)).sum(axis=-1, keepdims=True)
+    middle = (np.take_along_axis(ordered, np.maximum(at, 0), axis=-1) for at in ((known - 1) // 2, known // 2))
+    low, high = (np.where(known > 0, part, np.nan)[..., 0] for part in middle)
+    return 0.5 * (low + high)
 
 
 def _interquartile_mean(values: np.ndarray) -> np.ndarray:
