@@ -9,7 +9,6 @@ an environment of its own below runs/studies/clients, on top of the packages of 
 `--tiny` tries Gymnasium only; it needs `--out`.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -19,6 +18,9 @@ import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+sys.path.append(str(Path(__file__).parents[1]))
+from common import read_arguments
 
 HERE = Path(__file__).parent
 TABLES = {"clients": "docs/guides/learners.md"}
@@ -104,21 +106,10 @@ def tables(results: Path) -> dict[str, str]:
 
 def main() -> None:
     """Try the clients."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"clients ({', '.join(CLIENTS)}); by default all")
-    parser.add_argument("--runs", type=Path, default=Path("runs/studies"), help="directory of the environments")
-    parser.add_argument("--out", type=Path, help="directory of the results; by default beside this file")
-    parser.add_argument("--tiny", action="store_true", help="try Gymnasium only")
-    arguments = parser.parse_args()
-    unknown = [name for name in arguments.names if name not in CLIENTS]
-    if unknown:
-        parser.error(f"NAME: expected one of {', '.join(CLIENTS)}, got {unknown[0]!r}")
-    if arguments.tiny and arguments.out is None:
-        parser.error("--tiny: needs --out, so that the results in the repository are kept")
-    results = arguments.out or HERE / "results"
-    results.mkdir(parents=True, exist_ok=True)
+    arguments = read_arguments(__doc__, tuple(CLIENTS), HERE)
+    results = arguments.results
     differing = []
-    for name in arguments.names or (TINY if arguments.tiny else CLIENTS):
+    for name in TINY if arguments.tiny else arguments.names:
         found = try_client(name, arguments.runs.absolute() / "clients" / name)
         (results / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         wrong = [line["what"] for line in found["tried"] if not is_right(line)]
