@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 
@@ -173,7 +172,8 @@ class _Continuation:
 
     def __init__(self, extremal: Extremal, weight: float, tolerance: float) -> None:
         self._weight, self._tolerance = 0.0 if extremal.problem.has_hard_limits else weight, tolerance
-        self._first, self._before = extremal, cast(Extremal | None, None)
+        self._first = extremal
+        self._before: Extremal | None = None
         self._set(extremal)
 
     def _set(self, extremal: Extremal) -> None:
