@@ -10,7 +10,7 @@ from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import ExpertPolicy
 
-EPISODES, ROBOTS, ROUNDS = 100, 256, 25
+EPISODES, ROBOTS, ROUNDS = 20, 256, 25
 SETTINGS = [
     ("ideal", {}),
     ("10 % actuation noise", {"disturbance": {"actuation": 0.1}}),

@@ -90,8 +90,8 @@ def measure(name: str, cases: list[tuple[Scenario, Optimum]], gap: float, time_l
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=10, help="scenarios of each test bank")
-    parser.add_argument("--worlds", type=int, default=5, help="worlds with 250 discs")
+    parser.add_argument("--count", type=int, default=2, help="scenarios of each test bank")
+    parser.add_argument("--worlds", type=int, default=1, help="worlds with 250 discs")
     parser.add_argument("--gap", type=float, default=0.05, help="gap to prove; for the worlds twice as large")
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds; for the worlds twice as long")
     arguments = parser.parse_args()

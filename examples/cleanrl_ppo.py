@@ -19,8 +19,6 @@ from leapnav.envs import ScenarioBank
 from leapnav.envs.vector import AutoresetMode
 from leapnav.training import NavigationFeatures, PrioritizedSampler, evaluate, make_sampler
 
-REWARD_SCALE = 0.1  # brings returns to order 1
-
 
 def layers(inputs: int, outputs: int, gain: float) -> nn.Sequential:
     """Return a network with two hidden layers of 64 units and orthogonal initial weights."""
@@ -96,6 +94,8 @@ def main(
         "vector_entry_point",
         autoreset_mode=AutoresetMode.SAME_STEP,
         discount=gamma,
+        graded_miss=True,  # a constant penalty of a miss would not indicate where the goal is
+        reward_scale=0.1,  # brings returns to order 1
         **scenarios,
         **environment,
     )
@@ -118,14 +118,8 @@ def main(
             observation, reward, done, _, info = envs.step(action.clamp(-1, 1).numpy())
             following = torch.as_tensor(observation)
             if done.any():
-                final_info, final_obs = info["final_info"], np.stack(info["final_obs"][done].tolist())
-                successes += final_info["is_success"][done].tolist()
-                # The penalty of a miss is reduced near the goal; a constant one would not indicate where the goal is.
-                error = np.hypot(final_obs[:, 0], final_obs[:, 1]) + np.abs(
-                    np.arctan2(final_obs[:, 3], final_obs[:, 2])
-                )
-                reward[done] -= final_info["reward_miss"][done] * (1 - np.minimum(1, 0.2 + 0.1 * error))
-            step = (observed, action, distribution.log_prob(action).sum(1), value, REWARD_SCALE * reward, done)
+                successes += info["final_info"]["is_success"][done].tolist()
+            step = (observed, action, distribution.log_prob(action).sum(1), value, reward, done)
             for row, entry in zip(rows.values(), step, strict=True):
                 row.append(torch.as_tensor(entry, dtype=torch.float32))
         x, a, logp, value, reward, done = (torch.stack(row) for row in rows.values())

@@ -71,7 +71,7 @@ def main() -> None:
         times, nodes = rows[k].times, rows[k].nodes
         assert times is not None and nodes is not None
         _, states = dense_path(leapfrog.problem, times, nodes, 400)
-        plane.plot(states[:, 0], states[:, 1], color=color, linewidth=1.2, label=f"Leapfrog, sweep {k}")
+        plane.plot(states[:, 0], states[:, 1], color=color, linewidth=1.2, label=f"Leapfrog, iteration {k}")
         plane.plot(nodes[:, 0], nodes[:, 1], ".", color=color, markersize=3)
     path = optimum.interpolate(np.linspace(0.0, scenario.horizon, 400))
     plane.plot(path[:, 0], path[:, 1], color=OPTIMUM, linewidth=2.5, label=f"optimum, J* = {optimum.cost:.3f}")

@@ -35,9 +35,10 @@ if TYPE_CHECKING:
     from leapnav.training.runs.imitation import train_bc, train_dagger
     from leapnav.training.runs.recording import record
     from leapnav.training.runs.reinforcement import train_ppo, train_sac
+    from leapnav.training.scoring.adapters import Policy, PolicyFactory
     from leapnav.training.scoring.comparison import Comparison, compare
     from leapnav.training.scoring.decisions import Decisions, PolicyRegret, regret
-    from leapnav.training.scoring.evaluation import Policy, PolicyFactory, evaluate
+    from leapnav.training.scoring.evaluation import evaluate
     from leapnav.training.scoring.html_report import write_report
     from leapnav.training.scoring.reports import plot_episodes, plot_scores, print_scores
     from leapnav.training.scoring.results import Episode, Evaluation, read_episodes, write_episodes
@@ -131,7 +132,8 @@ _LAZY = {
     "runs.reinforcement": ("train_ppo", "train_sac"),
     "scoring.comparison": ("Comparison", "compare"),
     "scoring.decisions": ("Decisions", "PolicyRegret", "regret"),
-    "scoring.evaluation": ("Policy", "PolicyFactory", "evaluate"),
+    "scoring.adapters": ("Policy", "PolicyFactory"),
+    "scoring.evaluation": ("evaluate",),
     "scoring.results": ("Episode", "Evaluation", "read_episodes", "write_episodes"),
     "scoring.html_report": ("write_report",),
     "scoring.reports": ("plot_episodes", "plot_scores", "print_scores"),

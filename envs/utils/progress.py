@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from threading import RLock
 from time import monotonic
 from typing import Any
 
@@ -39,6 +40,9 @@ class _Lines(text_bar):
         self._printed = monotonic()
 
 
+_Lines.set_lock(RLock())  # tqdm's own lock contains a semaphore, of which a worker process that ends warns
+
+
 def progress_bar(*, total: int, label: str, unit: str, initial: int = 0, show: bool = True) -> text_bar[Any]:
     """Return a progress bar on standard error, a context manager.
 
@@ -51,7 +55,7 @@ def progress_bar(*, total: int, label: str, unit: str, initial: int = 0, show: b
 
     """
     is_notebook = tqdm is not tqdm_asyncio  # tqdm.auto selects a widget there
-    kind = tqdm if is_notebook or sys.stderr.isatty() else _Lines
+    kind = tqdm if show and (is_notebook or sys.stderr.isatty()) else _Lines
     return kind(
         total=total,
         desc=label,

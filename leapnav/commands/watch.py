@@ -21,8 +21,9 @@ class Watch:
     policy: PolicyName = "expert"
     """Policy: a baseline, an included policy, the directory of a policy or of a run, or a model of Stable-Baselines3
     (.zip)."""
-    family: Family = "clutter"
-    """Family of the scenarios."""
+    family: Family | None = None
+    """Family of the scenarios, or a file of them (.bank, .json); by default that of the training of the policy, or
+    clutter."""
     robot: Robot = "unicycle"
     """Model of the robot, for the expert and the baselines; a learned policy has its own."""
     horizon: Horizon = "fixed"
@@ -51,7 +52,7 @@ class Watch:
         from leapnav.envs.utils.validation import check_at_least
 
         check_at_least("episodes", self.episodes, 1)
-        if self.index is not None and self.split == "fresh":
+        if self.index is not None and self.split == "fresh" and "bank" not in self._scenarios():
             raise ValueError(f"index: fresh scenarios have no index, got {self.index}; use --split train or test")
         check_outputs(self.json, video=self.video)
         self._sensors()  # reports an unknown policy before a window opens
@@ -105,12 +106,27 @@ class Watch:
         own = {"robot": self.robot, "horizon": self.horizon}
         return own if self.policy in BASELINES else policy_environment(self.policy)
 
+    def _scenarios(self) -> dict[str, Any]:
+        """Return the arguments of the environment that select the scenarios."""
+        from leapnav.envs.scenarios.families import BANK_ENDING
+        from leapnav.training.policies.files import read_description
+        from leapnav.training.policies.zips import is_zip
+        from leapnav.training.scoring.policy_specs import BASELINES
+
+        family = self.family
+        if family is None and self.policy not in BASELINES and not is_zip(self.policy):
+            family = read_description(self.policy)["training"].get("family")
+        if family is not None and family.endswith(BANK_ENDING):
+            return {"bank": family}
+        return {"family": family or "clutter", "split": self.split, "obstacles": self.obstacles}
+
     def _make(self, render_mode: str) -> gym.Env[Any, Any]:
         import gymnasium as gym
 
         arguments = {**self._sensors(), "actuation": self.actuation, "disturbance": self.disturbance}
-        scenarios = {"family": self.family, "split": self.split, "obstacles": self.obstacles}
-        return gym.make("leapnav/Navigate-v0", **scenarios, render_mode=render_mode, show_optimum=True, **arguments)
+        return gym.make(
+            "leapnav/Navigate-v0", **self._scenarios(), render_mode=render_mode, show_optimum=True, **arguments
+        )
 
     def _play(self, env: gym.Env[Any, Any]) -> None:
         """Play and report the episodes, until the window is closed."""

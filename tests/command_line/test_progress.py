@@ -57,3 +57,9 @@ def test_a_terminal_shows_a_bar_in_place_and_a_hidden_bar_prints_nothing(monkeyp
         bar.update(2)
         stop_early(bar, "unnecessary")
     assert capsys.readouterr().err == ""
+
+
+def test_a_bar_that_prints_nothing_has_no_semaphore():
+    """A worker process is killed at the end, so that its semaphores would be reported as leaked."""
+    with progress_bar(total=1, label="Counting", unit="numbers", show=False) as bar:
+        assert not hasattr(bar.get_lock(), "mp_lock")

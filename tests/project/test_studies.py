@@ -74,8 +74,8 @@ def test_the_demonstrations_of_the_study_are_distinct(monkeypatch, tmp_path):
         return folder
 
     monkeypatch.setattr(study, "demonstrate", demonstrate)
-    assert len(study.demonstrations(3000, tmp_path, tiny=False)) == 4
-    assert len(seeds) == len(set(seeds)) == 6000
+    assert len(study.demonstrations(10_000, tmp_path, tiny=False)) == 5
+    assert len(seeds) == len(set(seeds)) == 20_000
 
 
 @pytest.fixture

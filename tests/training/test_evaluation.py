@@ -292,7 +292,7 @@ def test_the_picture_of_an_episode_shows_the_regret_for_the_pose_reached(reached
     stopped_short = replace(episode(cost=0.99), bank=bank_identity(BANK), reached_reference=reached)
     axes = Figure().subplots()
     draw_episode(axes, [BANK], stopped_short)
-    assert axes.get_title() == f"open-0: {title}"
+    assert axes.get_title() == f"open-0\n{title}"
 
 
 def test_extremes_are_the_best_the_median_and_the_worst():

@@ -12,7 +12,16 @@ from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.families import sample_scenario, task_of
 from leapnav.experts import build_bank, find_optimum, rollout
 from leapnav.experts.data.demonstrations import load_demonstrations
-from leapnav.training import BCConfig, CloningConfig, DAggerRunConfig, Dataset, train_bc, train_dagger
+from leapnav.training import (
+    BCConfig,
+    CloningConfig,
+    DAggerRunConfig,
+    Dataset,
+    compare,
+    evaluate,
+    train_bc,
+    train_dagger,
+)
 
 WIDE = Unicycle(radius=0.3)
 SMALL = ["--hidden", "16", "16", "--lidar-beams", "8", "--evaluation-scenarios", "2", "--observation", "lidar"]
@@ -64,6 +73,12 @@ def test_rollout_training_evaluation_and_report_need_no_robot(bank, tmp_path, mo
     printed = capsys.readouterr().out
     assert "2 scenarios" in printed and "open: clone trained in these scenarios" in printed
     assert "open: clone trained in these scenarios." in Path("page.html").read_text()
+    assert main(["evaluate", "clone", "--family", "open", "--count", "2", "--workers", "1"]) == 0
+    assert "open: clone trained with another robot: radius 0.3, here 0.25" in capsys.readouterr().out
+    assert main(["watch", "--policy", "clone", "--video", "clone.mp4", "--episodes", "1", "--index", "1"]) == 0
+    assert ScenarioBank(bank)[1].name in capsys.readouterr().out
+    (compared,) = compare({"clone": "clone"}, bank, progress=False).runs["clone"]
+    assert [e.cost for e in evaluate("clone", bank, progress=False)] == [e.cost for e in compared]
     assert main(["rollout", "--policy", "clone", "--family", bank, "--count", "1", "--out", "driven"]) == 0
 
 

@@ -60,6 +60,12 @@ def without_pickles(data):
     return json.dumps(content).encode()
 
 
+@pytest.mark.parametrize("sensors", [{"observation": "state"}, {"observation": "map", "horizon": "free"}])
+def test_an_observation_of_the_state_or_the_map_is_recognised(sensors, tmp_path):
+    make(PPO, NavigateEnv("open", split="fresh", **sensors)).save(tmp_path / "model.zip")
+    assert policy_environment(tmp_path / "model.zip") == sensors
+
+
 def test_the_sensors_of_the_environment_are_derived_from_the_file(tmp_path):
     env = NavigateEnv("open", lidar_beams=20, lidar_range=5.0)
     make(PPO, env).save(tmp_path / "model.zip")

@@ -168,7 +168,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
 def policy_environment(folder: str | Path) -> dict[str, Any]:
     """Return the arguments of `gym.make` for an environment with the observations that a policy was trained with.
 
-    Those of a model saved by Stable-Baselines3 are derived from its observation space, for a lidar.
+    Those of a model saved by Stable-Baselines3 are derived from its observations, of a lidar, the state or the map.
 
     Args:
         folder: see `load_policy`.

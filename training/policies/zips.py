@@ -137,7 +137,7 @@ class _Space:
         return "achieved_goal" in self.keys
 
     def guesses(self) -> Iterator[dict[str, Any]]:
-        """Yield arguments of an environment with a lidar that may have this space."""
+        """Yield arguments of an environment with a lidar, or with the state or the map, that may have this space."""
         sized = dict(zip(self.keys or ("observation",), zip(self.sizes, self.bounds, strict=True), strict=False))
         if not sized:
             return
@@ -147,7 +147,10 @@ class _Space:
         form = {"dict_observation": True} if self.keys and not self.is_goal else {}
         for kind, n_goal in (({}, GOAL_ENTRIES), ({"horizon": "free"}, FREE_GOAL_ENTRIES)):
             others = 0 if form else int(not kind) if self.is_goal else n_goal  # entries that are not of the lidar
-            yield {"lidar_beams": max(size - others, 0), "lidar_range": numbers[-1], **kind, **form}
+            if size > others:
+                yield {"lidar_beams": size - others, "lidar_range": numbers[-1], **kind, **form}
+            if not self.is_goal:
+                yield from ({"observation": name, **kind, **form} for name in ("state", "map"))
 
 
 def _environment(path: Path, stored: _Space, given: Mapping[str, Any] | None) -> tuple[dict[str, Any], Any]:
@@ -155,7 +158,7 @@ def _environment(path: Path, stored: _Space, given: Mapping[str, Any] | None) ->
     arguments = dict(given or {})
     make = NavigateGoalEnv if stored.is_goal else NavigateEnv
     for guess in stored.guesses() if given is None else ():
-        if guess["lidar_beams"] > 0 and _Space.of(make(split="fresh", **guess).observation_space) == stored:
+        if _Space.of(make(split="fresh", **guess).observation_space) == stored:
             arguments = guess
             break
     space: Any = make(split="fresh", **arguments).observation_space

@@ -19,15 +19,16 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import BANK_ENDING, families_of
+from leapnav.envs.scenarios.families import BANK_ENDING, families_of, task_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
 from leapnav.training.config import LATER_SENSORS, RunConfig
 from leapnav.training.policies.files import save_policy
 from leapnav.training.runs.checks import check_config
+from leapnav.training.scoring.adapters import PolicyOrFactory
 from leapnav.training.scoring.comparison import own_bank
-from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
+from leapnav.training.scoring.evaluation import evaluate
 from leapnav.training.scoring.results import Evaluation
 
 FINAL_SCENARIOS: int | None = None  # in the final evaluation; None: all of the bank
@@ -178,6 +179,9 @@ class Run:
         """Save the policy with the settings of the run, by which runs that differ only in their seed are grouped."""
         excluded = (*FREE_SETTINGS, "evaluation_scenarios")  # no influence on the policy
         training = {name: value for name, value in self._settings.items() if name not in excluded}
+        config = self.config
+        robot, *_ = task_of(config.family, config.robot, config.horizon, config.obstacles)
+        training["robot"] = robot.model_dump(mode="json")
         save_policy(model, self.folder, self.config.environment, training=training)
 
     def save_checkpoint(self, write: Callable[[Path], None], progress: Mapping[str, Any]) -> None:

@@ -1,20 +1,102 @@
-"""Adapters of policies with other actions, observations or signatures to the interface of an evaluation."""
+"""Policies, and adapters of those with other actions, observations or signatures to the interface of an evaluation."""
 
 from __future__ import annotations
 
 import inspect
 import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
+from leapnav.envs.utils.validation import in_words
 from leapnav.training.policies.actors import action_range
 
 GOAL_KEYS = {"observation", "achieved_goal", "desired_goal"}
 ARGUMENTS = "state", "episode_start", "deterministic"  # of `predict` in Stable-Baselines3
+
+
+class Policy(Protocol):
+    """Any object with the `predict` method of Stable-Baselines3, for one observation or a batch of observations."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions for observations, and the state of a recurrent policy."""
+        ...
+
+
+@dataclass(frozen=True)
+class PolicyFactory:
+    """A function that makes a policy for an environment, as in `PolicyFactory(lambda env: ExpertPolicy(env))`.
+
+    A class such as `ExpertPolicy` needs no factory. Any other function is a policy itself: it maps an observation to an
+    action.
+
+    Attributes:
+        make: the function.
+
+    """
+
+    make: Callable[[Any], Policy]
+
+    def __call__(self, env: Any) -> Policy:
+        """Return the policy for an environment."""
+        return self.make(env)
+
+
+PolicyOrFactory = Policy | Callable[[Any], Any]
+
+
+class FunctionPolicy:
+    """A policy from a function of one observation, called for each robot.
+
+    Args:
+        function: maps an observation (d,), or a dictionary, to an action (m,).
+        observation_space: the space of one observation, to recognise batches.
+        n_actions: number m of controls.
+
+    """
+
+    def __init__(self, function: Callable[[Any], Any], observation_space: gym.spaces.Space, n_actions: int = 2) -> None:
+        self._function, self._space, self._n_actions = function, observation_space, n_actions
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the actions (m,) or (N, m) for an observation or a batch of them."""
+        if isinstance(observation, Mapping):
+            assert isinstance(self._space, gym.spaces.Dict)
+            name, values = next(iter(observation.items()))
+            is_batch, count = np.ndim(values) > len(self._space[name].shape or ()), len(values)
+            rows = [{key: value[i] for key, value in observation.items()} for i in range(count)] if is_batch else []
+        else:
+            is_batch = np.ndim(observation) > len(self._space.shape or ())
+            rows = list(observation) if is_batch else []
+        return np.array([self._action(row) for row in rows]) if is_batch else self._action(observation), state
+
+    def _action(self, observation: Any) -> np.ndarray:
+        given = self._function(observation)
+        if hasattr(given, "predict"):
+            raise TypeError("policy: expected an action from the function, got a policy; pass a PolicyFactory of it")
+        action = np.asarray(given, dtype=np.float32)
+        if action.shape != (self._n_actions,) or not np.isfinite(action).all():
+            raise ValueError(
+                f"policy: expected {in_words(self._n_actions)} finite numbers from the function, got {action.tolist()}"
+            )
+        return action
 
 
 class AdaptedPolicy:

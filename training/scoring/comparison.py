@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of
 from leapnav.training.config import PPOConfig, RunConfig, read_config
-from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
+from leapnav.training.scoring.adapters import PolicyOrFactory
+from leapnav.training.scoring.evaluation import evaluate
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.results import Evaluation, bank_identity
 from leapnav.training.scoring.scores import Score, score
@@ -30,6 +32,7 @@ class Comparison:
         runs: for each row of the table, the evaluations of its runs on all banks.
         seed: random seed of the bootstrap.
         folders: directories of the training runs of the rows that have any.
+        robots: robots of the training of the rows of which they are known.
 
     """
 
@@ -37,6 +40,7 @@ class Comparison:
     runs: Mapping[str, Sequence[Evaluation]]
     seed: int
     folders: Mapping[str, Sequence[Path]] = field(default_factory=dict)
+    robots: Mapping[str, Sequence[RobotModel]] = field(default_factory=dict)
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -91,12 +95,26 @@ class Comparison:
             name: [replace(run, episodes=tuple(e for e in run if e.bank in identities)) for run in evaluations]
             for name, evaluations in self.runs.items()
         }
-        return Comparison(banks, runs, self.seed, self.folders)
+        return Comparison(banks, runs, self.seed, self.folders, self.robots)
 
     def trained_on(self, bank: ScenarioBank) -> list[str]:
         """Return the rows with a run that was trained in the scenarios of a bank."""
         rows = self.folders.items()
         return [row for row, folders in rows if any(_trains_on(read_config(folder)[1], bank) for folder in folders)]
+
+    def other_robots(self, bank: ScenarioBank) -> dict[str, str]:
+        """Return the parameters in which the robot of the training differs from that of a bank, by row."""
+        here, found = bank.robot.model_dump(), {}
+        for row, robots in self.robots.items():
+            differences = [
+                f"{name} {value}, here {here.get(name)}"
+                for robot in robots
+                for name, value in robot.model_dump().items()
+                if value != here.get(name)
+            ]
+            if differences:
+                found[row] = "; ".join(dict.fromkeys(differences))
+        return found
 
 
 def _trains_on(config: RunConfig, bank: ScenarioBank) -> bool:
@@ -135,7 +153,8 @@ def compare(
               Stable-Baselines3 (`.zip`), see `leapnav evaluate --help`;
             - an object, a function or a class, see `evaluate`;
             - a tuple of one of these and the arguments of its environment.
-        bank: a bank, several banks, the name of a family for its test split, or "all" for those of all families.
+        bank: a bank, its file (`.bank`), several banks, the name of a family for its test split, or "all" for those of
+            all families.
         count: number of scenarios of each bank, from the first; None: all.
         environment: arguments of the environment, such as `observation`, for the policies without their own.
         seed: random seed of the bootstrap intervals, the disturbances and the random policy.
@@ -154,7 +173,9 @@ def compare(
     for label, given in policies.items():
         for number, member in enumerate(given if isinstance(given, list) else [given]):
             specs.append(_spec(label, f"{label}[{number}]", member, environment, seed))
-    if isinstance(bank, str):
+    if isinstance(bank, str) and bank.endswith(BANK_ENDING):
+        banks = [ScenarioBank(bank)]
+    elif isinstance(bank, str):
         check_family(bank)
         banks = included_banks(specs, families_of(bank))
     else:
@@ -329,4 +350,13 @@ def compare_policies(
             milliseconds = float(np.mean([evaluation.milliseconds for evaluation in evaluations]))
             runs[row].append(Evaluation(episodes, milliseconds, evaluations[0].settings))
     folders = {row: [member.run for member in members if member.run] for row, members in rows.items()}
-    return Comparison(tuple(banks), runs, seed, {row: found for row, found in folders.items() if found})
+    robots = {
+        row: [member.trained_robot for member in members if member.trained_robot] for row, members in rows.items()
+    }
+    return Comparison(
+        tuple(banks),
+        runs,
+        seed,
+        {row: found for row, found in folders.items() if found},
+        {row: found for row, found in robots.items() if found},
+    )

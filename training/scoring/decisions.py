@@ -17,7 +17,8 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_positive
 from leapnav.experts.optimum import find_optimum
-from leapnav.training.scoring.evaluation import PolicyOrFactory, evaluate
+from leapnav.training.scoring.adapters import PolicyOrFactory
+from leapnav.training.scoring.evaluation import evaluate
 from leapnav.training.scoring.results import Episode, Evaluation
 
 RESOLUTION = 0.25  # s between the states from which the optimum is searched

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
-from typing import Any, Protocol, cast
+from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -18,19 +19,27 @@ from leapnav.envs.goal_navigation import NavigateGoalEnv
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.banks.checks import Reference
-from leapnav.envs.scenarios.families import check_family
+from leapnav.envs.scenarios.families import BANK_ENDING, check_family
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import progress_bar
-from leapnav.envs.utils.validation import check_at_least, in_words
+from leapnav.envs.utils.validation import check_at_least
 from leapnav.envs.vector import AutoresetMode, NavigateGoalVectorEnv, NavigateVectorEnv
 from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.training.environments.playing import PlayedEpisode, play_episodes
 from leapnav.training.policies.files import environment_of
-from leapnav.training.scoring.adapters import adapted, is_goal_conditioned
+from leapnav.training.scoring.adapters import (
+    FunctionPolicy,
+    Policy,
+    PolicyFactory,
+    PolicyOrFactory,
+    adapted,
+    is_goal_conditioned,
+)
+from leapnav.training.scoring.policy_specs import load_policy_spec
 from leapnav.training.scoring.results import Episode, Evaluation, bank_identity
 from leapnav.training.threads import limit_threads
 
@@ -41,88 +50,9 @@ GOAL_ARGUMENTS = {"reward": "cost"}  # of the environment for goal-conditioned p
 MIN_REVERSE_SPEED = 0.05  # m/s; an optimum that reaches this speed backwards counts as reversing
 
 
-class Policy(Protocol):
-    """Any object with the `predict` method of Stable-Baselines3, for one observation or a batch of observations."""
-
-    def predict(
-        self,
-        observation: Any,
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return the actions for observations, and the state of a recurrent policy."""
-        ...
-
-
-@dataclass(frozen=True)
-class PolicyFactory:
-    """A function that makes a policy for an environment, as in `PolicyFactory(lambda env: ExpertPolicy(env))`.
-
-    A class such as `ExpertPolicy` needs no factory. Any other function is a policy itself: it maps an observation to an
-    action.
-
-    Attributes:
-        make: the function.
-
-    """
-
-    make: Callable[[Any], Policy]
-
-    def __call__(self, env: Any) -> Policy:
-        """Return the policy for an environment."""
-        return self.make(env)
-
-
-PolicyOrFactory = Policy | Callable[[Any], Any]
-
-
-class FunctionPolicy:
-    """A policy from a function of one observation, called for each robot.
-
-    Args:
-        function: maps an observation (d,), or a dictionary, to an action (m,).
-        observation_space: the space of one observation, to recognise batches.
-        n_actions: number m of controls.
-
-    """
-
-    def __init__(self, function: Callable[[Any], Any], observation_space: gym.spaces.Space, n_actions: int = 2) -> None:
-        self._function, self._space, self._n_actions = function, observation_space, n_actions
-
-    def predict(
-        self,
-        observation: Any,
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return the actions (m,) or (N, m) for an observation or a batch of them."""
-        if isinstance(observation, Mapping):
-            assert isinstance(self._space, gym.spaces.Dict)
-            name, values = next(iter(observation.items()))
-            is_batch, count = np.ndim(values) > len(self._space[name].shape or ()), len(values)
-            rows = [{key: value[i] for key, value in observation.items()} for i in range(count)] if is_batch else []
-        else:
-            is_batch = np.ndim(observation) > len(self._space.shape or ())
-            rows = list(observation) if is_batch else []
-        return np.array([self._action(row) for row in rows]) if is_batch else self._action(observation), state
-
-    def _action(self, observation: Any) -> np.ndarray:
-        given = self._function(observation)
-        if hasattr(given, "predict"):
-            raise TypeError("policy: expected an action from the function, got a policy; pass a PolicyFactory of it")
-        action = np.asarray(given, dtype=np.float32)
-        if action.shape != (self._n_actions,) or not np.isfinite(action).all():
-            raise ValueError(
-                f"policy: expected {in_words(self._n_actions)} finite numbers from the function, got {action.tolist()}"
-            )
-        return action
-
-
 @limit_threads
 def evaluate(
-    policy: PolicyOrFactory,
+    policy: PolicyOrFactory | str | Path,
     bank: ScenarioBank | str = "clutter",
     *,
     count: int | None = None,
@@ -144,12 +74,12 @@ def evaluate(
             which maps one observation to an action. The arguments of `predict` after the observation are optional. A
             model with `VecNormalize` gets normalised observations. The actions of a policy with another bounded
             action space, such as that of `RescaleAction`, are scaled to [-1, 1]. A policy of
-            `leapnav/NavigateGoal-v0` is evaluated there.
-        bank: a bank, or the name of a family for its test split, with the robot, horizon and obstacles of
-            `environment`.
+            `leapnav/NavigateGoal-v0` is evaluated there. Also a name or a directory, see `compare`.
+        bank: a bank, its file (`.bank`), or the name of a family for its test split, with the robot, horizon and
+            obstacles of `environment`.
         count: number of scenarios, from the first of the bank; None: all.
-        environment: arguments of the environment, such as `observation`; None: those of the model's environment that
-            determine the observations, if it has one.
+        environment: arguments of the environment, such as `observation`; None: those that determine the observations of
+            the model's environment, or of the training of a policy that is given by its name, if they are known.
         seed: random seed of the disturbances.
         timed: measure the computation time of an action; otherwise `milliseconds` is NaN.
         workers: number of processes that search the optima for the poses reached, which takes most of the time; the
@@ -166,17 +96,18 @@ def evaluate(
 
     """
     check_at_least("workers", workers, 1)
+    if isinstance(policy, (str, Path)):
+        spec = load_policy_spec(str(policy), seed=seed)
+        policy, environment = spec.policy, spec.environment if environment is None else environment
     environment = _environment_of(policy) if environment is None else environment
     if not (hasattr(policy, "predict") or callable(policy)):
-        names = "; `compare` takes names of policies" if isinstance(policy, str) else ""
         raise TypeError(
-            "policy: expected an object with `predict`, a function of an observation, or a PolicyFactory, got "
-            f"{type(policy).__name__}{names}"
+            "policy: expected a name, an object with `predict`, a function of an observation, or a PolicyFactory, got "
+            f"{type(policy).__name__}"
         )
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str):
             raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
-        check_family(bank)
         bank = _named_bank(bank, environment)
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
@@ -207,10 +138,13 @@ def _environment_of(policy: Any) -> dict[str, Any]:
     return found
 
 
-def _named_bank(family: str, environment: Mapping[str, Any]) -> ScenarioBank:
-    """Return the included test bank of a family for an environment."""
+def _named_bank(name: str, environment: Mapping[str, Any]) -> ScenarioBank:
+    """Return the bank of a file, or the included test bank of a family for an environment."""
+    if name.endswith(BANK_ENDING):
+        return ScenarioBank(name)
+    check_family(name)
     kinds = environment.get("horizon") or "fixed", environment.get("obstacles") or "cost"
-    return ScenarioBank.shipped(family, "test", check_robot(environment.get("robot") or "unicycle").model, *kinds)
+    return ScenarioBank.shipped(name, "test", check_robot(environment.get("robot") or "unicycle").model, *kinds)
 
 
 def _play_batch(

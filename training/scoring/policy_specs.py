@@ -12,6 +12,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from leapnav.envs.robots import RobotModel
+from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
@@ -19,8 +21,14 @@ from leapnav.training.policies.files import BASELINES as BASELINES
 from leapnav.training.policies.files import load_policy, policy_environment, read_description
 from leapnav.training.policies.planners import PLANNERS, PlannerPolicy
 from leapnav.training.policies.zips import is_zip, load_zip
-from leapnav.training.scoring.adapters import NormalizedPolicy, read_statistics, statistics_beside
-from leapnav.training.scoring.evaluation import Policy, PolicyFactory, PolicyOrFactory
+from leapnav.training.scoring.adapters import (
+    NormalizedPolicy,
+    Policy,
+    PolicyFactory,
+    PolicyOrFactory,
+    read_statistics,
+    statistics_beside,
+)
 
 
 @dataclass(frozen=True)
@@ -36,6 +44,7 @@ class PolicySpec:
         is_baseline: whether the policy drives any robot.
         run: directory of the training run; None for other policies.
         family: family of the scenarios of the training; None if it is unknown.
+        trained_robot: robot of the training; None if its parameters are unknown.
 
     """
 
@@ -47,6 +56,7 @@ class PolicySpec:
     is_baseline: bool = False
     run: Path | None = None
     family: str | None = None
+    trained_robot: RobotModel | None = None
 
     @property
     def robot(self) -> str | None:
@@ -115,8 +125,12 @@ def load_policy_spec(
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
     method = json.dumps(training, sort_keys=True) if training else None
     run = Path(place) if (Path(place) / "config.json").is_file() else None
-    family = description["training"].get("family")
-    return PolicySpec(place, label, method, policy, policy_environment(place), run=run, family=family)
+    family, environment, given = training.get("family"), policy_environment(place), training.get("robot")
+    robot: Any = given if isinstance(given, Mapping) else None
+    if robot is None and family in (*FAMILIES, ALL):
+        robot = environment.get("robot") or "unicycle"
+    trained = None if robot is None else check_robot(robot)
+    return PolicySpec(place, label, method, policy, environment, run=run, family=family, trained_robot=trained)
 
 
 def group_by_row(specs: Sequence[PolicySpec]) -> dict[str, list[PolicySpec]]:

@@ -84,11 +84,14 @@ def print_scores(comparison: Comparison) -> None:
 
 
 def training_notes(comparison: Comparison) -> list[str]:
-    """Return a sentence for each bank whose scenarios some of the policies were trained in."""
-    trained = {
-        name: comparison.trained_on(bank) for name, bank in zip(comparison.bank_names, comparison.banks, strict=True)
-    }
-    return [f"{name}: {', '.join(rows)} trained in these scenarios" for name, rows in trained.items() if rows]
+    """Return the banks whose scenarios, or other robots than whose, some of the policies were trained with."""
+    notes = []
+    for name, bank in zip(comparison.bank_names, comparison.banks, strict=True):
+        if rows := comparison.trained_on(bank):
+            notes.append(f"{name}: {', '.join(rows)} trained in these scenarios")
+        for row, differences in comparison.other_robots(bank).items():
+            notes.append(f"{name}: {row} trained with another robot: {differences}")
+    return notes
 
 
 def sensors_of(comparison: Comparison) -> dict[str, list[str]]:
@@ -307,10 +310,10 @@ def draw_episode(axes: Axes, banks: Sequence[ScenarioBank], episode: Episode) ->
     draw_scenario(axes, bank[episode.index])
     axes.plot(*bank.states(episode.index)[:, :2].T, color=OPTIMUM, linewidth=1.2, linestyle="--")
     axes.plot(*episode.states[:, :2].T, color=POLICY if episode.success else FAILURE, linewidth=1.8)
-    missed = f"missed by {episode.goal_distance:.2f} m, {episode.heading_error:.2f} rad"
-    outcome = "collision" if episode.collision else missed
+    missed = f"missed by {episode.goal_distance:.2f} m, {episode.heading_error:.2f} rad after {episode.duration:.1f} s"
+    outcome = f"collision after {episode.duration:.1f} s" if episode.collision else missed
     if episode.success:
         outcome = (
             "regret unknown" if math.isnan(episode.reached_regret) else f"regret {100 * episode.reached_regret:z.1f} %"
         )
-    axes.set_title(f"{episode.scenario}: {outcome}", fontsize=9)
+    axes.set_title(f"{episode.scenario}\n{outcome}", fontsize=9)
