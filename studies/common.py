@@ -27,6 +27,7 @@ from leapnav.training import (
     train_bc,
     train_dagger,
     train_ppo,
+    train_sac,
     write_episodes,
 )
 from leapnav.training.config import read_config
@@ -34,7 +35,7 @@ from leapnav.training.scoring.reports import markdown_cells, markdown_run_cells
 
 RUNS = Path("runs/studies")  # directory of the runs, the demonstrations and the fresh scenarios
 FRESH_SEED = 784  # of the fresh scenarios
-TRAIN: dict[str, Callable[..., Any]] = {"bc": train_bc, "dagger": train_dagger, "ppo": train_ppo}
+TRAIN: dict[str, Callable[..., Any]] = {"bc": train_bc, "dagger": train_dagger, "ppo": train_ppo, "sac": train_sac}
 # Changes of the settings with a tiny budget, of those that have them.
 TINY: dict[str, Any] = {
     "hidden": (16, 16),

@@ -16,6 +16,7 @@ WORDS = {
     "motors": ["ppo"],
     "observations": ["memory"],
     "planners": ["lattice"],
+    "sac": ["clone"],
     "transfer": ["open", "clutter"],
 }
 ALL_WORDS = {"included_policies": ["open", "--train"]}  # of the slow test; training of all would take hours
@@ -30,6 +31,8 @@ ROWS = {
     "motors": "PPO from it",
     "observations": "| lidar, also ",
     "planners": "| open | ",
+    "sac": "| from scratch |",
+    "sac-runs": "| actor cloned, before",
     "transfer-map": "| `clutter` |",
     "transfer-lidar": "| `open` |",
 }  # of the tables, by study or by table
