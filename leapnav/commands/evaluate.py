@@ -53,7 +53,7 @@ class Evaluate(ParallelOptions):
     """Seed of the bootstrap intervals and of the random policy."""
     env: EnvironmentOption = ()
     """Arguments of the environment (KEY=VALUE) with which a model of Stable-Baselines3 was trained; by default derived
-    from its observation space, for a lidar with a field of view of the full circle."""
+    from its observations: a lidar with a field of view of the full circle, the state or the map."""
     trust: bool = False
     """Load a model of Stable-Baselines3 with its own loader, which executes code from the file."""
     vecnormalize: Path | None = None
@@ -75,6 +75,7 @@ class Evaluate(ParallelOptions):
         """Play the episodes and report the scores."""
         from leapnav.envs.scenarios.bank import ScenarioBank
         from leapnav.envs.utils.validation import check_at_least
+        from leapnav.training.policies.zips import is_zip
         from leapnav.training.scoring.comparison import compare_policies, default_banks
         from leapnav.training.scoring.html_report import write_report
         from leapnav.training.scoring.policy_specs import load_policy_spec
@@ -90,6 +91,8 @@ class Evaluate(ParallelOptions):
         environment = parse_environment(self.env)
         options = {"environment": environment, "trust": self.trust, "vecnormalize": self.vecnormalize}
         specs = [load_policy_spec(name, seed=self.seed, **options) for name in self.policies]
+        if self.vecnormalize is not None and not any(is_zip(spec.name) for spec in specs):
+            raise ValueError("vecnormalize: expected a model of Stable-Baselines3 (.zip) among the policies, got none")
         if self.bank is not None:
             banks = [ScenarioBank(self.bank)]
         else:

@@ -208,6 +208,9 @@ def test_statistics_of_vecnormalize_are_read_from_their_file(tmp_path, capsys):
     assert main(words) == 2
     assert "is a pickle file, which can execute code" in capsys.readouterr().err
     assert main([*words, "--trust"]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", "open", "--count", "2", "--trust", *words[-2:]]) == 2
+    assert "vecnormalize: expected a model of Stable-Baselines3 (.zip)" in capsys.readouterr().err
     (tmp_path / "vecnormalize.pkl").write_bytes(b"text")
     assert main([*words, "--trust"]) == 2
     assert "not a file of VecNormalize" in capsys.readouterr().err

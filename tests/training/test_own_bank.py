@@ -77,6 +77,8 @@ def test_rollout_training_evaluation_and_report_need_no_robot(bank, tmp_path, mo
     assert "open: clone trained with another robot: radius 0.3, here 0.25" in capsys.readouterr().out
     assert main(["watch", "--policy", "clone", "--video", "clone.mp4", "--episodes", "1", "--index", "1"]) == 0
     assert ScenarioBank(bank)[1].name in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"horizon: clone was trained with 'free', .* has 'fixed'"):
+        compare({"clone": "clone"}, ScenarioBank.shipped("open", "test"), progress=False)
     (compared,) = compare({"clone": "clone"}, bank, progress=False).runs["clone"]
     assert [e.cost for e in evaluate("clone", bank, progress=False)] == [e.cost for e in compared]
     assert main(["rollout", "--policy", "clone", "--family", bank, "--count", "1", "--out", "driven"]) == 0

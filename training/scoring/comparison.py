@@ -296,6 +296,16 @@ def _common(name: str, values: Sequence[str | None], given: str | None) -> str |
     return common
 
 
+def _check_task(spec: PolicySpec, banks: Sequence[ScenarioBank]) -> None:
+    """Check that a policy was trained for the kind of horizon and the model of the robot of banks, if it names them."""
+    trained = spec.environment.get("horizon"), spec.robot if "robot" in spec.environment else None
+    for bank in banks:
+        here = bank.horizon, bank.robot.model
+        for name, own, value in zip(("horizon", "robot"), trained, here, strict=True):
+            if own is not None and own != value:
+                raise ValueError(f"{name}: {spec.label or spec.name} was trained with {own!r}, {bank.path.name} has {value!r}")
+
+
 def compare_policies(
     specs: Sequence[PolicySpec],
     banks: Sequence[ScenarioBank],
@@ -317,7 +327,8 @@ def compare_policies(
         progress: show progress bars.
 
     Raises:
-        ValueError: a bank is given twice, or see `group_by_row` and `evaluate`.
+        ValueError: a bank is given twice, has another robot or horizon than a policy, or see `group_by_row` and
+            `evaluate`.
 
     """
     given: dict[str, ScenarioBank] = {}
@@ -329,6 +340,8 @@ def compare_policies(
         raise ValueError("banks: expected different ones, got the same bank more than once")
     runs: dict[str, list[Evaluation]] = {}
     rows = group_by_row(specs)
+    for spec in specs:
+        _check_task(spec, banks)
     for row, members in rows.items():
         runs[row] = []
         for member in members:
