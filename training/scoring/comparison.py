@@ -299,11 +299,12 @@ def _common(name: str, values: Sequence[str | None], given: str | None) -> str |
 def _check_task(spec: PolicySpec, banks: Sequence[ScenarioBank]) -> None:
     """Check that a policy was trained for the kind of horizon and the model of the robot of banks, if it names them."""
     trained = spec.environment.get("horizon"), spec.robot if "robot" in spec.environment else None
+    policy = spec.label or spec.name
     for bank in banks:
         here = bank.horizon, bank.robot.model
         for name, own, value in zip(("horizon", "robot"), trained, here, strict=True):
             if own is not None and own != value:
-                raise ValueError(f"{name}: {spec.label or spec.name} was trained with {own!r}, {bank.path.name} has {value!r}")
+                raise ValueError(f"{name}: {policy} was trained with {own!r}, {bank.path.name} has {value!r}")
 
 
 def compare_policies(
