@@ -38,7 +38,7 @@ PRINTED = {
     "lower_bounds.md": r"True\n",
     "recipes.md": r"\(1024, 41\) \(1024,\)\nTrue\n" + BANK + r"True 0\.99\d*\nTrue True\nTrue True 3 3\n"
     r"\['reward_collision', 'reward_effort', 'reward_miss', 'reward_proximity'\]\n\(8,\)\n"
-    r"\(58,\)\n2\.0\n\(172,\)\n1\.0\n",
+    r"\(58,\)\n2\.0\n\[-1\.1, -1\.1, 11\.1, 11\.1\]\n\(172,\)\n1\.0\n",
     "training.md": r"20 True\n\(548,\)\n1\n2 True\nTrue \(400,\)\nleapnav/open/mixed-v0 True\n\(3,\) True\n",
     "tutorial.md": rf"True {NUMBER} 0\.3007\d+\n\[5\.1999\d+, .*\]\nTrue 1\.0000\d*\n"
     rf"RolloutSummary\(demonstrations=50, .*\)\n{NUMBER} {RATE} {RATE} 0\.00\d*\n{RATE}\n",
