@@ -16,7 +16,7 @@ WORDS = {
     "motors": ["ppo"],
     "observations": ["memory"],
     "planners": ["lattice"],
-    "sac": ["clone"],
+    "sac": ["scratch", "clone"],
     "transfer": ["open", "clutter"],
 }
 ALL_WORDS = {"included_policies": ["open", "--train"]}  # of the slow test; training of all would take hours
@@ -32,7 +32,7 @@ ROWS = {
     "observations": "| lidar, also ",
     "planners": "| open | ",
     "sac": "| from scratch |",
-    "sac-runs": "| actor cloned, before",
+    "sac-runs": "| actor cloned, critic",
     "transfer-map": "| `clutter` |",
     "transfer-lidar": "| `open` |",
 }  # of the tables, by study or by table

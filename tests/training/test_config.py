@@ -11,7 +11,7 @@ def test_a_run_that_starts_from_a_policy_has_its_observation():
         config = PPOConfig.tuned("clutter", warm_start=start)
         assert (config.observation, config.lidar_beams) == ("geodesic", 64)
     given = DAggerRunConfig.tuned("clutter", observation="lidar")
-    inherited = DAggerRunConfig.tuned("clutter", policy=Path("free-clutter"))
+    inherited = DAggerRunConfig.tuned("clutter", policy=Path("clutter-lidar"))
     assert inherited.observation == "lidar" and inherited.dagger == given.dagger
 
 
