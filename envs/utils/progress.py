@@ -40,7 +40,9 @@ class _Lines(text_bar):
         self._printed = monotonic()
 
 
-_Lines.set_lock(RLock())  # tqdm's own lock contains a semaphore, of which a worker process that ends warns
+# The lock that tqdm would create contains a semaphore. A worker process that is stopped does not release it, and Python
+# warns about it at the end.
+_Lines.set_lock(RLock())
 
 
 def progress_bar(*, total: int, label: str, unit: str, initial: int = 0, show: bool = True) -> text_bar[Any]:

@@ -22,8 +22,7 @@ class Watch:
     """Policy: a baseline, an included policy, the directory of a policy or of a run, or a model of Stable-Baselines3
     (.zip)."""
     family: Family | None = None
-    """Family of the scenarios, or a file of them (.bank, .json); by default that of the training of the policy, or
-    clutter."""
+    """Family of the scenarios, or a bank (.bank); by default that of the training of the policy, or clutter."""
     robot: Robot = "unicycle"
     """Model of the robot, for the expert and the baselines; a learned policy has its own."""
     horizon: Horizon = "fixed"

@@ -49,7 +49,7 @@ ROWS = {
         {"total_timesteps": 16, "learning_starts": 16, "start": WarmStartConfig(critic=False)},
     ),
     "clone": Row("actor cloned, critic fitted", "warm", {"demonstrations": 0.0, "imitation": 0.0}),
-    "imitation": Row("the same, half of each batch are demonstrations, imitation 50", "warm"),
+    "imitation": Row("the same, half of each batch is demonstrations, imitation 50", "warm"),
 }
 NAMES = tuple(ROWS)
 

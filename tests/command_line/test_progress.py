@@ -60,6 +60,6 @@ def test_a_terminal_shows_a_bar_in_place_and_a_hidden_bar_prints_nothing(monkeyp
 
 
 def test_a_bar_that_prints_nothing_has_no_semaphore():
-    """A worker process is killed at the end, so that its semaphores would be reported as leaked."""
+    """A worker process is stopped without releasing its semaphores, and Python warns about them at the end."""
     with progress_bar(total=1, label="Counting", unit="numbers", show=False) as bar:
         assert not hasattr(bar.get_lock(), "mp_lock")

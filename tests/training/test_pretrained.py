@@ -17,7 +17,7 @@ SOC = {
     "crossing": 0.869,
     "crowd": 0.868,
     "dynamic_unicycle-clutter": 0.938,
-    "free-clutter": 0.99,
+    "free-clutter": 0.998,
     "open": 0.997,
     "polygons": 0.969,
     "polygons-lidar": 0.957,

@@ -32,7 +32,7 @@ class Comparison:
         runs: for each row of the table, the evaluations of its runs on all banks.
         seed: random seed of the bootstrap.
         folders: directories of the training runs of the rows that have any.
-        robots: robots of the training of the rows of which they are known.
+        robots: for each row, the robots with which its policies were trained, as far as they are known.
 
     """
 
@@ -297,7 +297,7 @@ def _common(name: str, values: Sequence[str | None], given: str | None) -> str |
 
 
 def _check_task(spec: PolicySpec, banks: Sequence[ScenarioBank]) -> None:
-    """Check that a policy was trained for the kind of horizon and the model of the robot of banks, if it names them."""
+    """Check that banks have the kind of horizon and the model of the robot that a policy was trained with, if known."""
     trained = spec.environment.get("horizon"), spec.robot if "robot" in spec.environment else None
     policy = spec.label or spec.name
     for bank in banks:

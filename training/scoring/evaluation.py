@@ -74,7 +74,7 @@ def evaluate(
             which maps one observation to an action. The arguments of `predict` after the observation are optional. A
             model with `VecNormalize` gets normalised observations. The actions of a policy with another bounded
             action space, such as that of `RescaleAction`, are scaled to [-1, 1]. A policy of
-            `leapnav/NavigateGoal-v0` is evaluated there. Also a name or a directory, see `compare`.
+            `leapnav/NavigateGoal-v0` is evaluated there. The names, directories and files of `compare` are accepted.
         bank: a bank, its file (`.bank`), or the name of a family for its test split, with the robot, horizon and
             obstacles of `environment`.
         count: number of scenarios, from the first of the bank; None: all.
@@ -90,6 +90,7 @@ def evaluate(
         progress: show a progress bar.
 
     Raises:
+        FileNotFoundError: there is no policy or bank of this name.
         TypeError: `policy` is neither a policy nor a function that returns one.
         ValueError: an argument is invalid, or the policy expects other observations.
         ModuleNotFoundError, OSError: the Dask scheduler cannot be used.

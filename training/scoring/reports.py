@@ -84,7 +84,7 @@ def print_scores(comparison: Comparison) -> None:
 
 
 def training_notes(comparison: Comparison) -> list[str]:
-    """Return the banks whose scenarios, or other robots than whose, some of the policies were trained with."""
+    """Return sentences on policies that were trained in the scenarios of a bank, or with another robot than its own."""
     notes = []
     for name, bank in zip(comparison.bank_names, comparison.banks, strict=True):
         if rows := comparison.trained_on(bank):
