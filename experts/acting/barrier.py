@@ -38,11 +38,12 @@ def barrier_integral(problem: OptimalControlProblem, times: np.ndarray, nodes: n
     """Return the integral of the barrier along the extremal through nodes (K + 1, 2n) at times (K + 1,) (s)."""
     if not problem.has_hard_limits:
         return 0.0
-    total = 0.0
-    for start, end in itertools.pairwise(times):
-        ends = np.linspace(start, end, math.ceil((end - start) / PANEL - 1e-9) + 1)
-        half = 0.5 * np.diff(ends)[:, None]
-        moments = ends[:-1, None] + half * (1.0 + GAUSS_NODES)
-        states = follow_all(problem.arrays.flow, times, nodes, moments.ravel())
-        total += float((half * problem.barrier_cost(states).reshape(moments.shape) @ GAUSS_WEIGHTS).sum())
-    return total
+    segments = [
+        np.linspace(start, end, math.ceil((end - start) / PANEL - 1e-9), endpoint=False)
+        for start, end in itertools.pairwise(times)
+    ]
+    ends = np.append(np.concatenate(segments), times[-1])
+    half = 0.5 * np.diff(ends)[:, None]
+    moments = ends[:-1, None] + half * (1.0 + GAUSS_NODES)
+    states = follow_all(problem.arrays.flow, times, nodes, moments.ravel())
+    return float((half * problem.barrier_cost(states).reshape(moments.shape) @ GAUSS_WEIGHTS).sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float64, int64
+from numba import float64, int64, void
 
 from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.types import MATRIX, VECTOR, tuple_of
@@ -18,27 +18,45 @@ MIN_SEGMENT = 0.02  # s; a shorter first segment is merged with the next one
 MAX_ITERATIONS = 8  # Newton steps; a state that needs more is usually closer to another solution
 
 
-@kernel(VECTOR(FLOW, VECTOR, MATRIX, float64))
-def follow(flow, times, nodes, time):
-    """Integrate (q, lambda) to a time from the preceding node; NaN if the flow diverges."""
-    k = min(max(np.searchsorted(times, time, side="right") - 1, 0), len(times) - 2)
-    z = nodes[k].copy()
-    duration = min(time, times[-1]) - times[k]
+@kernel(int64(VECTOR, float64))
+def segment_of(times, time):
+    """The segment that contains a time."""
+    return min(max(np.searchsorted(times, time, side="right") - 1, 0), len(times) - 2)
+
+
+@kernel(void(FLOW, VECTOR, float64))
+def continue_flow(flow, z, duration):
+    """Integrate (q, lambda) in place for a duration (s) if it is positive; NaN if the flow diverges."""
     if duration > 0.0:
         success, _, _, _, _ = propagate(flow, z, np.empty((len(z), 0)), duration, FLOW_ACCURACY, 0.0, False)
         if not success:
             z[:] = np.nan
+
+
+@kernel(VECTOR(FLOW, VECTOR, MATRIX, float64))
+def follow(flow, times, nodes, time):
+    """Integrate (q, lambda) to a time from the preceding node; NaN if the flow diverges."""
+    k = segment_of(times, time)
+    z = nodes[k].copy()
+    continue_flow(flow, z, min(time, times[-1]) - times[k])
     return z
 
 
 @kernel(MATRIX(FLOW, VECTOR, MATRIX, VECTOR))
 def follow_all(flow, times, nodes, moments):
-    """Integrate the states (K, n) to times (K,); NaN where the flow diverges."""
+    """Integrate the states (K, n) to increasing times (K,); NaN where the flow diverges."""
     states = np.empty((len(moments), nodes.shape[1] // 2))
-    for k in range(len(moments)):
-        z = follow(flow, times, nodes, moments[k])
+    last, now, z = -1, 0.0, nodes[0].copy()
+    for row in range(len(moments)):
+        k = segment_of(times, moments[row])
+        if k != last:
+            last, now = k, times[k]
+            z[:] = nodes[k]
+        end = min(moments[row], times[-1])
+        continue_flow(flow, z, end - now)
+        now = max(now, end)
         for i in range(states.shape[1]):
-            states[k, i] = z[i]
+            states[row, i] = z[i]
     return states
 
 
