@@ -355,6 +355,11 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
         return self._source.family
 
     @property
+    def source(self) -> ScenarioSource:
+        """The source of the scenarios, with their robot."""
+        return self._source
+
+    @property
     def bank(self) -> ScenarioBank | None:
         """The bank of the scenarios, or None."""
         return self._source.bank

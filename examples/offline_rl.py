@@ -1,6 +1,7 @@
 """Offline reinforcement learning with d3rlpy, scored against the optimum: BC, TD3+BC or IQL on recorded episodes.
 
-pip install leapnav d3rlpy
+pip install leapnav
+pip install --no-deps -r examples/requirements.txt
 python examples/offline_rl.py --policies random open --episodes 500 --algorithm iql --steps 20000
 """
 

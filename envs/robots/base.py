@@ -166,6 +166,15 @@ class RobotModel(Frozen):
                 del fields[f"max_{name}"]
         return fields
 
+    def differences(self, here: RobotModel) -> list[str]:
+        """Return the parameters in which this robot differs from another one, as "radius 0.3, here 0.25"."""
+        other = here.model_dump()
+        return [
+            f"{name} {value}, here {other.get(name)}"
+            for name, value in self.model_dump().items()
+            if value != other.get(name)
+        ]
+
     @property
     def _intervals(self) -> list[str]:
         """Names of the limits that are given as intervals."""

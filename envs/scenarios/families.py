@@ -243,8 +243,9 @@ def sample_scenario(
 
     Raises:
         TypeError: the function of the family returns something else.
-        ValueError: an argument is invalid, a scenario of the family has another robot, kind of horizon or kind of
-            obstacles, or none of its layouts connects start and goal.
+        ValueError: an argument is invalid, a scenario of the family has another robot (of another model, if the
+            parameters are not given), kind of horizon or kind of obstacles, or none of its layouts connects start and
+            goal.
 
     """
     chosen = family if isinstance(family, CustomFamily) else find_family(family)
@@ -257,7 +258,7 @@ def sample_scenario(
     for _ in range(MAX_DRAWS):  # rejection sampling: the draws are independent
         layout = custom.sample(rng)
         if isinstance(layout, Scenario):
-            scenario = _checked(layout, custom.name, body, horizon, obstacles)
+            scenario = _checked(layout, custom, body, horizon, obstacles)
             return scenario if custom.names_scenarios else scenario.model_copy(update={"name": name})
         if not isinstance(layout, ScenarioLayout):
             raise TypeError(
@@ -277,9 +278,9 @@ def task_of(
 ) -> tuple[RobotModel, str, str]:
     """Return robot, kind of horizon and kind of obstacles of new scenarios of a family.
 
-    Those that are not given are those of the first scenario if the family is a file, otherwise the unicycle, "fixed"
-    and "cost". The name of the model of the stored robot selects that robot, whose parameters may differ from the
-    defaults.
+    Those that are not given are those of the first scenario if the family consists of whole scenarios (a file, or a
+    function that returns them), otherwise the unicycle, "fixed" and "cost". The name of the model of that scenario's
+    robot selects this robot, whose parameters may differ from the defaults.
 
     Args:
         family, robot, horizon, obstacles: see `sample_scenario`.
@@ -293,11 +294,20 @@ def task_of(
         check_choice("horizon", horizon, HORIZONS)
     if obstacles is not None:
         check_choice("obstacles", obstacles, OBSTACLE_KINDS)
-    if not isinstance(chosen, CustomFamily) or not isinstance(chosen.sample, StoredScenarios):
+    first = _first_scenario(chosen) if isinstance(chosen, CustomFamily) else None
+    if first is None:
         return check_robot("unicycle" if robot is None else robot), horizon or "fixed", obstacles or "cost"
-    first = _stored(chosen.sample.file)[0]
     body = first.robot if robot in (None, first.robot.model) else check_robot(robot)
     return body, horizon or first.horizon_kind, obstacles or first.cost.obstacles
+
+
+@lru_cache(maxsize=8)
+def _first_scenario(family: CustomFamily) -> Scenario | None:
+    """Return the first scenario of a family that consists of whole scenarios, otherwise None."""
+    if isinstance(family.sample, StoredScenarios):
+        return _stored(family.sample.file)[0]
+    layout = family.sample(np.random.default_rng(0))
+    return layout if isinstance(layout, Scenario) else None
 
 
 def random_cost(horizon: str, obstacles: str) -> Cost:
@@ -307,16 +317,21 @@ def random_cost(horizon: str, obstacles: str) -> Cost:
     )
 
 
-def _checked(scenario: Scenario, family: str, robot: RobotModel, horizon: str, obstacles: str) -> Scenario:
-    """Return a scenario of a family if it has the robot and the kinds of horizon and obstacles."""
-    if scenario.robot != robot:
-        raise ValueError(f"robot: expected that of the scenarios of {family!r}, {scenario.robot!r}, got {robot!r}")
+def _checked(scenario: Scenario, family: CustomFamily, robot: RobotModel, horizon: str, obstacles: str) -> Scenario:
+    """Return a scenario of a family if it has the robot and the kinds of horizon and obstacles.
+
+    The robots of a family may have different parameters if none but that of its first scenario is asked for.
+    """
+    first = _first_scenario(family)
+    is_default = first is not None and first.robot == robot
+    if scenario.robot != robot and not (is_default and scenario.robot.model == robot.model):
+        raise ValueError(f"robot: expected that of the scenarios of {family.name!r}, {scenario.robot!r}, got {robot!r}")
     for name, kind, wanted in (
         ("horizon", scenario.horizon_kind, horizon),
         ("obstacles", scenario.cost.obstacles, obstacles),
     ):
         if kind != wanted:
-            raise ValueError(f"{name}: expected that of the scenarios of {family!r}, {kind!r}, got {wanted!r}")
+            raise ValueError(f"{name}: expected that of the scenarios of {family.name!r}, {kind!r}, got {wanted!r}")
     return scenario
 
 

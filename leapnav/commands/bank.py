@@ -250,12 +250,15 @@ class Bank:
     """Build and inspect scenario banks, files of scenarios with their certified optima, and add bounds to them."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Build, tyro.conf.subcommand("build")]
-        | Annotated[Show, tyro.conf.subcommand("show")]
-        | Annotated[Verify, tyro.conf.subcommand("verify")]
-        | Annotated[Card, tyro.conf.subcommand("card")]
-        | Annotated[Prove, tyro.conf.subcommand("prove")]
-        | Annotated[Shortest, tyro.conf.subcommand("shortest")]
+        Annotated[
+            Annotated[Build, tyro.conf.subcommand("build")]
+            | Annotated[Show, tyro.conf.subcommand("show")]
+            | Annotated[Verify, tyro.conf.subcommand("verify")]
+            | Annotated[Card, tyro.conf.subcommand("card")]
+            | Annotated[Prove, tyro.conf.subcommand("prove")]
+            | Annotated[Shortest, tyro.conf.subcommand("shortest")],
+            tyro.conf.arg(name=""),
+        ]
     ]
 
 

@@ -91,8 +91,9 @@ class Evaluate(ParallelOptions):
         environment = parse_environment(self.env)
         options = {"environment": environment, "trust": self.trust, "vecnormalize": self.vecnormalize}
         specs = [load_policy_spec(name, seed=self.seed, **options) for name in self.policies]
-        if self.vecnormalize is not None and not any(is_zip(spec.name) for spec in specs):
-            raise ValueError("vecnormalize: expected a model of Stable-Baselines3 (.zip) among the policies, got none")
+        for name, value in (("env", self.env), ("vecnormalize", self.vecnormalize)):
+            if value and not any(is_zip(spec.name) for spec in specs):
+                raise ValueError(f"{name}: expected a model of Stable-Baselines3 (.zip) among the policies, got none")
         if self.bank is not None:
             banks = [ScenarioBank(self.bank)]
         else:
@@ -108,8 +109,8 @@ class Evaluate(ParallelOptions):
             plot_scores(comparison, self.plot)
             print(f"wrote {self.plot}")
         if self.episodes_plot is not None:
-            first = next(iter(comparison.runs.values()))
-            plot_episodes(comparison.banks, first[0].episodes, self.episodes_plot)
+            name, (first, *_) = next(iter(comparison.runs.items()))
+            plot_episodes(comparison.banks, first.episodes, self.episodes_plot, title=name)
             print(f"wrote {self.episodes_plot}")
         if self.decisions is not None:
             self._write_decisions(comparison)
@@ -120,8 +121,8 @@ class Evaluate(ParallelOptions):
         from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions, print_decisions
 
         assert self.decisions is not None  # checked by `run`
-        first = next(iter(comparison.runs.values()))[0]
+        name, (first, *_) = next(iter(comparison.runs.items()))
         found = costliest_decisions(first, comparison.banks, workers=self.workers)
         print_decisions(found)
-        plot_decisions(found, comparison.banks, self.decisions)
+        plot_decisions(found, comparison.banks, self.decisions, title=name)
         print(f"wrote {self.decisions}")

@@ -31,9 +31,13 @@ class TrainCommand:
 
     def run(self) -> int:
         """Train a policy and print its scores."""
+        from leapnav.envs.scenarios.families import BANK_ENDING
+
         evaluations = self._train()
         for evaluation in evaluations:
             print(_describe(evaluation))
+        if self.config.family.endswith(BANK_ENDING):
+            print(f"{self.config.family}: scenarios of the training; those of another bank are a test")
         print(f"observed: {evaluations[0].settings.sensors}")
         print(f"wrote {self.config.out} (next: leapnav evaluate {self.config.out} expert --html report.html)")
         return 0

@@ -29,8 +29,9 @@ class Watch:
     """Fixed or free horizon, for the expert and the baselines; a learned policy has its own."""
     obstacles: Obstacles = "cost"
     """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
-    split: Literal["train", "test", "fresh"] = "test"
-    """Split of the included banks, or "fresh" for newly sampled scenarios."""
+    split: Literal["train", "test", "fresh"] | None = None
+    """Split of the included banks, or "fresh" for newly sampled scenarios; by default "test", and "fresh" for a family
+    without included banks."""
     index: int | None = None
     """Index in the bank of the first episode's scenario; later episodes play the following ones. By default random."""
     episodes: int = 3
@@ -51,7 +52,7 @@ class Watch:
         from leapnav.envs.utils.validation import check_at_least
 
         check_at_least("episodes", self.episodes, 1)
-        if self.index is not None and self.split == "fresh" and "bank" not in self._scenarios():
+        if self.index is not None and self._scenarios().get("split") == "fresh":
             raise ValueError(f"index: fresh scenarios have no index, got {self.index}; use --split train or test")
         check_outputs(self.json, video=self.video)
         self._sensors()  # reports an unknown policy before a window opens
@@ -107,6 +108,7 @@ class Watch:
 
     def _scenarios(self) -> dict[str, Any]:
         """Return the arguments of the environment that select the scenarios."""
+        from leapnav.envs.scenarios.bank import ScenarioBank
         from leapnav.envs.scenarios.families import BANK_ENDING
         from leapnav.training.policies.files import read_description
         from leapnav.training.policies.zips import is_zip
@@ -117,7 +119,11 @@ class Watch:
             family = read_description(self.policy)["training"].get("family")
         if family is not None and family.endswith(BANK_ENDING):
             return {"bank": family}
-        return {"family": family or "clutter", "split": self.split, "obstacles": self.obstacles}
+        family = family or "clutter"
+        kinds = {name: value for name, value in self._sensors().items() if name in ("robot", "horizon")}
+        included = ScenarioBank.shipped_families(**kinds, obstacles=self.obstacles)
+        split = self.split or ("test" if family in included else "fresh")
+        return {"family": family, "split": split, "obstacles": self.obstacles}
 
     def _make(self, render_mode: str) -> gym.Env[Any, Any]:
         import gymnasium as gym

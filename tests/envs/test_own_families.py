@@ -89,6 +89,24 @@ def test_a_family_may_return_whole_scenarios():
         sample_scenario("lane", 7, horizon="free")
 
 
+def test_the_scenarios_of_a_family_may_have_robots_with_different_parameters(tmp_path):
+    def sample(rng):
+        robot = {"model": "differential_drive", "radius": round(float(rng.uniform(0.2, 0.3)), 3)}
+        return Scenario(name="x", arena=(0, 0, 8, 4), start=(1, 2, 0), goal=(5, 2, 0), horizon=6.0, robot=robot)
+
+    register_family("sizes", sample)
+    env, radii = gym.make("leapnav/Navigate-v0", family="sizes"), set()  # the model is that of the scenarios
+    for seed in range(3):
+        env.reset(seed=seed)
+        radii.add(env.unwrapped.scenario.robot.radius)
+    assert len(radii) == 3 and env.unwrapped.settings.robot == "differential_drive"
+    bank = build_bank("sizes", 3, tmp_path / "sizes.bank", progress=False)
+    assert len({scenario.robot.radius for scenario in bank}) == 3
+    assert rollout("sizes", 2, tmp_path / "demos", robot="differential_drive", progress=False).demonstrations == 2
+    with pytest.raises(ValueError, match="robot: expected that of the scenarios of 'sizes'"):
+        sample_scenario("sizes", 7, robot={"model": "differential_drive", "radius": 0.25})
+
+
 def test_banks_and_demonstrations_are_the_same_with_any_number_of_processes(pillar, tmp_path):
     """The function is local, so that other processes cannot import it."""
     banks = [build_bank("pillar", 4, tmp_path / f"{n}.bank", seed=5, workers=n, progress=False) for n in (1, 2)]

@@ -1,10 +1,12 @@
 """A bank of scenarios with a robot of their own, from the rollout to the report, without the robot being named."""
 
 import json
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from stable_baselines3 import PPO
 
 from leapnav.cli import main
 from leapnav.envs import NavigateEnv, ScenarioBank
@@ -17,10 +19,16 @@ from leapnav.training import (
     CloningConfig,
     DAggerRunConfig,
     Dataset,
+    behaviour_clone,
     compare,
     evaluate,
+    load_policy,
+    make_vec_env,
+    network,
+    save_policy,
     train_bc,
     train_dagger,
+    warm_start,
 )
 
 WIDE = Unicycle(radius=0.3)
@@ -108,7 +116,7 @@ def test_banks_and_files_are_accepted_where_a_scenario_or_a_family_is(bank, tmp_
     rollout(stored, 2, tmp_path / "others", progress=False)
 
 
-def test_demonstrations_of_another_robot_or_horizon_are_refused(bank, tmp_path, capsys):
+def test_demonstrations_of_another_robot_or_horizon_are_refused(bank, tmp_path):
     rollout(ScenarioBank(bank), 2, tmp_path / "wide", progress=False)
     rollout("open", 2, tmp_path / "open", progress=False)
     small = {"hidden": (4,), "lidar_beams": 4, "evaluation_scenarios": 1}
@@ -125,7 +133,30 @@ def test_demonstrations_of_another_robot_or_horizon_are_refused(bank, tmp_path, 
     with pytest.raises(ValueError, match=r"robot: expected the name of a model, got .* build a bank"):
         clone("open", "open", robot={"model": "unicycle", "radius": 0.3})
     assert not (tmp_path / "run").exists()
-    clone("clutter", "open", cloning=CloningConfig(epochs=1))
-    assert "demonstrations of open for a policy of clutter" in capsys.readouterr().out
+    with pytest.warns(UserWarning, match="dataset: demonstrations of open, here clutter"):
+        clone("clutter", "open", cloning=CloningConfig(epochs=1))
     with pytest.raises(ValueError, match="a run of BC, not of DAGGER; resume it by `leapnav train bc`"):
         train_dagger(DAggerRunConfig(out=tmp_path / "run", resume=True))
+
+
+def test_samples_and_policies_of_another_robot_or_family_are_named_in_python(tmp_path):
+    rollout("open", 2, tmp_path / "wide", robot=WIDE, progress=False)
+    model = PPO("MlpPolicy", make_vec_env(n_envs=1, family="clutter"), policy_kwargs=network((4,)))
+    quick = CloningConfig(epochs=1)
+    with pytest.warns(UserWarning, match="dataset: demonstrations of another robot: radius 0.3, here 0.25"):
+        behaviour_clone(model, tmp_path / "wide", quick, progress=False)
+    with pytest.warns(UserWarning, match=r"dataset|validation_share") as caught:
+        warm_start(model, tmp_path / "wide", cloning=quick, progress=False)
+    texts = [str(one.message) for one in caught]
+    assert [text.partition(":")[0] for text in texts] == ["dataset", "dataset", "validation_share"]
+    assert texts[1] == "dataset: demonstrations of open, here clutter"
+    assert "0.05 of 2 obstacle courses is less than one" in texts[2]
+    assert {one.filename for one in caught[:2]} == {__file__}
+    wide = make_vec_env(n_envs=1, family="open", split="fresh", robot=WIDE)
+    description = {"robot": WIDE.model_dump(mode="json")}
+    save_policy(PPO("MlpPolicy", wide, policy_kwargs=network((4,))), tmp_path / "policy", training=description)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_policy(tmp_path / "policy", wide)
+    with pytest.warns(UserWarning, match="trained with another robot: radius 0.3, here 0.25"):
+        load_policy(tmp_path / "policy", make_vec_env(n_envs=1, family="open"))

@@ -128,7 +128,23 @@ def test_a_finished_run_is_extended_with_more_steps_and_another_learning_rate(tm
     assert main(["train", "ppo", "--out", str(config.out), "--resume", "--total-timesteps", "300"]) == 2
     assert "total_timesteps: expected at least 1024" in capsys.readouterr().err
     assert main(["train", "ppo", "--out", str(config.out), "--resume", "--seed", "7"]) == 2
-    assert "apart from total_timesteps and learning_rate" in capsys.readouterr().err
+    assert "apart from total_timesteps, learning_rate and dagger.rounds" in capsys.readouterr().err
+
+
+def test_a_finished_run_of_dagger_is_extended_with_more_rounds(demos, tmp_path, capsys):
+    dagger = DAggerConfig(rounds=1, max_episodes=4, lead=0.5, last_epochs=1)
+    config = DAggerRunConfig(out=tmp_path / "run", demos=(demos,), n_envs=2, cloning=QUICK, dagger=dagger, **COMMON)
+    train_dagger(config, progress=False)
+    assert main(["train", "dagger", "--out", str(config.out), "--resume", "--dagger.rounds", "2"]) == 0
+    record = json.loads((config.out / "config.json").read_text())
+    assert record["config"]["dagger"]["rounds"] == 2
+    assert record["changes"][0]["before"] == {"dagger.rounds": 1}
+    assert len(list((config.out / "rounds").glob("round-*.npz"))) == 2
+    capsys.readouterr()
+    assert main(["train", "dagger", "--out", str(config.out), "--resume", "--dagger.rounds", "1"]) == 2
+    assert "dagger.rounds: expected at least 2" in capsys.readouterr().err
+    assert main(["train", "dagger", "--out", str(config.out), "--resume", "--dagger.lead", "1"]) == 2
+    assert "dagger.lead: the run in" in capsys.readouterr().err
 
 
 def test_without_a_family_policies_are_evaluated_in_their_own():

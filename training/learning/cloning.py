@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -101,7 +102,7 @@ def behaviour_clone(
     with progress_bar(total=fit.epochs * fit.batches, label=label, unit="batches", show=progress) as bar:
         while not fit.finished:
             loss = fit.run_epoch(bar.update)
-            bar.set_postfix(training=f"{loss.training:.4f}", validation=f"{loss.validation:.4f}")
+            bar.set_postfix(fit.shown(loss))
             if on_epoch is not None:
                 on_epoch(loss)
         if len(fit.losses) < fit.epochs:
@@ -143,6 +144,12 @@ class _Fit:
             Samples(dataset, chosen, policy.device)
             for chosen in split_courses(dataset, config.validation_share, config.seed)
         )
+        if config.validation_share > 0 and not len(self._held_out):
+            warnings.warn(
+                f"validation_share: {config.validation_share} of {len(set(dataset.course_texts))} obstacle courses is "
+                "less than one; the fit has no validation loss and runs all its epochs",
+                stacklevel=4,
+            )
         self._scale = _scale(self._train, config.loss)
         self._batch_size = config.batch_size or _default_batch_size(len(self._train))
         self.batches = self._train.n_batches(self._batch_size)
@@ -160,6 +167,11 @@ class _Fit:
             return True
         validation = [loss.validation for loss in self.losses]
         return bool(patience and done > patience and min(validation[:-patience]) <= min(validation[-patience:]))
+
+    def shown(self, loss: EpochLoss) -> dict[str, str]:
+        """Return the losses of an epoch as text, that of the validation only if there are held-out samples."""
+        values = {"training": loss.training, **({"validation": loss.validation} if len(self._held_out) else {})}
+        return {name: f"{value:.4f}" for name, value in values.items()}
 
     def run_epoch(self, on_batch: Callable[[], Any] = lambda: None) -> EpochLoss:
         """Run one pass over the training samples.
@@ -289,9 +301,11 @@ def samples_for(
     samples = Dataset.of(dataset)
     venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
     try:
-        settings = unwrap(venv)[0].settings
+        env = unwrap(venv)[0]
     except TypeError:  # another environment, or none
         return samples
+    samples.warn_of_other(env.source, stacklevel=5)  # where the public function is called, around its `limit_threads`
+    settings = env.settings
     if settings.goal_conditioned:  # refused by `check_observations`
         return samples
     return samples.observed(replace(settings, dict_observation=False))

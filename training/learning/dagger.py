@@ -135,6 +135,7 @@ class DAgger:
         self._parts: list[Dataset] = [] if dataset is None else [Dataset.of(dataset)]
         if self._parts:
             check_observations(self._policy, self._parts[0])
+            self._parts[0].warn_of_other(self._source)
             for name, value in vars(self._parts[0].settings).items():
                 if value != (own := getattr(self._settings, name)):
                     raise ValueError(f"dataset: {name}: expected that of the environment, {own!r}, got {value!r}")

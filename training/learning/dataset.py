@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -15,7 +17,9 @@ import numpy as np
 
 from leapnav.envs.robots import RobotModel, Symmetry
 from leapnav.envs.scenarios.cost import Cost
+from leapnav.envs.scenarios.families import is_built_in
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
+from leapnav.envs.scenarios.sources import ScenarioSource
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
@@ -117,6 +121,28 @@ class Dataset:
     def _scenario_fields(self) -> list[dict[str, Any]]:
         # Without the validation of `Scenario`, which would dominate the time.
         return [json.loads(text) for text in self.scenarios]
+
+    @property
+    def families(self) -> list[str]:
+        """The families of the scenarios, according to their names."""
+        return sorted({re.sub(r"(-\d+)+$", "", fields["name"]) for fields in self._scenario_fields})
+
+    def warn_of_other(self, source: ScenarioSource, stacklevel: int = 3) -> None:
+        """Warn if the samples are of another robot, or of other families, than the scenarios of an environment.
+
+        Args:
+            source: the scenarios of the environment.
+            stacklevel: see `warnings.warn`.
+
+        """
+        robots = list({json.dumps(fields["robot"]): fields["robot"] for fields in self._scenario_fields}.values())
+        differences = check_robot(robots[0]).differences(source.robot) if len(robots) == 1 else []
+        if differences:
+            text = "; ".join(differences)
+            warnings.warn(f"dataset: demonstrations of another robot: {text}", stacklevel=stacklevel)
+        if is_built_in(source.family) and source.family not in self.families:
+            families = ", ".join(self.families)
+            warnings.warn(f"dataset: demonstrations of {families}, here {source.family}", stacklevel=stacklevel)
 
     @property
     def halves(self) -> np.ndarray:

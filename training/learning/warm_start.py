@@ -108,7 +108,7 @@ def warm_start(
     if policy is not None:
         copy_actor(policy, target)
     elif config.actor:
-        losses = behaviour_clone(model, samples, cloning, progress=progress)
+        losses = behaviour_clone(target, samples, cloning, progress=progress)
     value_error = slope_error = math.nan
     if valued is not None:
         gamma = float(getattr(model, "gamma", 1.0))

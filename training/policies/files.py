@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -18,8 +19,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.navigation import NavigateEnv
-from leapnav.envs.robots.base import robot_class
+from leapnav.envs.robots.base import RobotModel, robot_class
 from leapnav.envs.scenarios.families import ALL, FAMILIES
+from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.envs.settings import SENSORS, EnvironmentSettings
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.files import atomic_path, write_text
@@ -289,9 +291,22 @@ def _check_environment(folder: Path, description: dict[str, Any], space: spaces.
             for name in OBSERVED
             if trained.get(name) != settings.get(name)
         ]
+        robot = trained_robot(description)
+        others = robot.differences(inner.source.robot) if robot is not None and not differing else []
+        if others:
+            warnings.warn(f"{folder}: trained with another robot: {'; '.join(others)}", stacklevel=3)
         if differing or getattr(inner, "single_observation_space", inner.observation_space) != space:
             difference = ", ".join(differing) or "other bounds"
             raise ValueError(f"{folder}: the policy was trained with other observations: {difference}")
+
+
+def trained_robot(description: Mapping[str, Any]) -> RobotModel | None:
+    """Return the robot of the training in the description of a policy; None if its parameters are unknown."""
+    training = description["training"]
+    robot: Any = training.get("robot")
+    if not isinstance(robot, Mapping):
+        robot = description["environment"].get("robot") if training.get("family") in (*FAMILIES, ALL) else None
+    return None if robot is None else check_robot(robot)
 
 
 def shipped_policies() -> list[str]:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import partial
 from typing import Any, cast, get_args
 
-from tqdm.auto import tqdm
-
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import check_family, is_built_in, task_of
+from leapnav.envs.scenarios.families import check_family, task_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.validation import (
@@ -74,17 +71,16 @@ def check_config(config: RunConfig) -> None:
             _CHECKS[field.name](field.name, value)
 
 
-def check_demonstrations(config: RunConfig, dataset: Dataset, progress: bool) -> None:
-    """Check that demonstrations are for the robot and the horizon of a run, and say if they are of other families.
+def check_demonstrations(config: RunConfig, dataset: Dataset) -> None:
+    """Check that demonstrations are for the robot and the horizon of a run.
 
     Raises:
         ValueError: they are not.
 
     """
     body, horizon, _ = task_of(config.family, config.robot, config.horizon, config.obstacles)
-    # One scenario of each robot, kind of horizon and family; validating all takes long.
-    chosen = {_kind(text): text for text in dataset.scenarios}
-    scenarios = [Scenario.from_json(text) for text in chosen.values()]
+    # One scenario of each robot and kind of horizon; validating all takes long.
+    scenarios = [Scenario.from_json(text) for text in {_kind(text): text for text in dataset.scenarios}.values()]
     for scenario in scenarios:
         expected, found = (one.model_dump(mode="json") for one in (body, scenario.robot))
         different = [name for name in found if found[name] != expected.get(name)]
@@ -93,15 +89,12 @@ def check_demonstrations(config: RunConfig, dataset: Dataset, progress: bool) ->
             raise ValueError(f"demos: expected a robot with {name} {expected.get(name)!r}, got {found[name]!r}")
         if scenario.horizon_kind != horizon:
             raise ValueError(f"demos: expected a {horizon} horizon, got a {scenario.horizon_kind} one")
-    families = sorted({family for *_, family in chosen})
-    if progress and is_built_in(config.family) and config.family not in families:
-        tqdm.write(f"demonstrations of {', '.join(families)} for a policy of {config.family}")
 
 
-def _kind(text: str) -> tuple[str, bool, str]:
-    """Return robot, whether the horizon is free, and family of a scenario in JSON, without a validation."""
+def _kind(text: str) -> tuple[str, bool]:
+    """Return the robot of a scenario in JSON, and whether its horizon is free, without a validation."""
     fields = json.loads(text)
-    return str(fields.get("robot")), fields.get("horizon") is None, re.sub(r"(-\d+)+$", "", fields["name"])
+    return str(fields.get("robot")), fields.get("horizon") is None
 
 
 def _check_levels(config: PPOConfig) -> None:

@@ -53,7 +53,8 @@ def train_bc(config: BCConfig, *, workers: int = 1, progress: bool = True) -> li
     check_config(config)
     given = Dataset.of(config.demos) if config.demos else None
     if given is not None:
-        check_demonstrations(config, given, progress)
+        check_demonstrations(config, given)
+        given.warn_of_other(make_env(config).source)
     run = Run("bc", config)
     policy = _new_policy(config)
     checkpoint = run.load_checkpoint() if config.resume else None
@@ -108,7 +109,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
     check_config(config)
     dataset = Dataset.of(config.demos) if config.demos else None
     if dataset is not None:
-        check_demonstrations(config, dataset, progress)
+        check_demonstrations(config, dataset)
     policy = _new_policy(config)
     if config.policy is not None:
         copy_actor(load_policy(config.policy, make_env(config)), policy)

@@ -164,7 +164,7 @@ def _train(
         raise ValueError(f"reward: expected 'cost', the reward of demonstrations, got {config.reward!r}")
     dataset = Dataset.of(demos) if demos else None
     if dataset is not None:
-        check_demonstrations(config, dataset, progress)
+        check_demonstrations(config, dataset)
         dataset = dataset.observed(observed_settings(config))
     venv = make_training_env(config)
     if wrapper is not None:

@@ -38,7 +38,8 @@ LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # wit
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
 # Settings by which a resumed run is extended; `config.json` records the changes.
-EXTENSIONS = ("total_timesteps", "learning_rate")
+EXTENSIONS = ("total_timesteps", "learning_rate", "dagger.rounds")
+LENGTHS = ("total_timesteps", "dagger.rounds")  # those that may only increase
 MEASURES = ("success", "collision", "soc", "regret", "reached_regret")  # of an evaluation, for each family
 
 
@@ -116,20 +117,21 @@ class Run:
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
-        names = sorted({*stored, *self._settings} - set(FREE_SETTINGS))
-        changed = [name for name in names if stored.get(name) != self._settings.get(name)]
+        before, after = _flat(stored), _flat(self._settings)
+        names = sorted({*before, *after} - set(FREE_SETTINGS))
+        changed = [name for name in names if before.get(name) != after.get(name)]
         for name in changed:
-            old, new = stored.get(name), self._settings.get(name)
+            old, new = before.get(name), after.get(name)
             if name not in EXTENSIONS:
                 raise ValueError(
                     f"{name}: the run in {self.folder} has {old!r}, got {new!r}; resume a run with its own "
-                    f"configuration, apart from {' and '.join(EXTENSIONS)}"
+                    f"configuration, apart from {', '.join(EXTENSIONS[:-1])} and {EXTENSIONS[-1]}"
                 )
-            if name == "total_timesteps" and (old is None or new is None or new < old):
+            if name in LENGTHS and (old is None or new is None or new < old):
                 raise ValueError(f"{name}: expected at least {old!r}, those of the run in {self.folder}, got {new!r}")
         if changed:
-            before = {name: stored.get(name) for name in changed}
-            record["changes"] = [*record.get("changes", []), {"before": before, "date": _now()}]
+            earlier = {name: before.get(name) for name in changed}
+            record["changes"] = [*record.get("changes", []), {"before": earlier, "date": _now()}]
             record["config"] = self._settings
             write_text(path, encode(record, indent=1) + "\n")
 
@@ -242,6 +244,14 @@ class Run:
         if count:
             self._write_evaluations()
         return folder, progress
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the settings of a run with those of its parts under names such as "dagger.rounds"."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
 
 
 def _versions() -> dict[str, str]:

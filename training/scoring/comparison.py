@@ -104,14 +104,9 @@ class Comparison:
 
     def other_robots(self, bank: ScenarioBank) -> dict[str, str]:
         """Return the parameters in which the robot of the training differs from that of a bank, by row."""
-        here, found = bank.robot.model_dump(), {}
+        found = {}
         for row, robots in self.robots.items():
-            differences = [
-                f"{name} {value}, here {here.get(name)}"
-                for robot in robots
-                for name, value in robot.model_dump().items()
-                if value != here.get(name)
-            ]
+            differences = [text for robot in robots for text in robot.differences(bank.robot)]
             if differences:
                 found[row] = "; ".join(dict.fromkeys(differences))
         return found

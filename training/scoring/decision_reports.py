@@ -79,6 +79,8 @@ def plot_decisions(
     banks: Sequence[ScenarioBank],
     path: str | os.PathLike[str] | IO[bytes],
     columns: int = 4,
+    *,
+    title: str | None = None,
 ) -> None:
     """Plot where along the paths of episodes the regret was incurred, with the optima, into a file.
 
@@ -87,6 +89,7 @@ def plot_decisions(
         banks: the banks of the episodes.
         path: the file.
         columns: number of episodes in each row.
+        title: title of the figure, such as the name of the policy.
 
     Raises:
         ValueError: there are no episodes.
@@ -105,6 +108,8 @@ def plot_decisions(
     for axes, one in zip(grid.ravel()[: len(decisions)], decisions, strict=True):
         _draw_decisions(axes, banks, one, scale)
     figure.colorbar(ScalarMappable(scale, COLOR_MAP), ax=grid, label="regret per second", extend="max", shrink=0.8)
+    if title is not None:
+        figure.suptitle(title)
     figure.savefig(path, dpi=130)
 
 

@@ -13,12 +13,11 @@ from typing import Any
 import gymnasium as gym
 
 from leapnav.envs.robots import RobotModel
-from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
 from leapnav.training.policies.files import BASELINES as BASELINES
-from leapnav.training.policies.files import load_policy, policy_environment, read_description
+from leapnav.training.policies.files import load_policy, policy_environment, read_description, trained_robot
 from leapnav.training.policies.planners import PLANNERS, PlannerPolicy
 from leapnav.training.policies.zips import is_zip, load_zip
 from leapnav.training.scoring.adapters import (
@@ -125,12 +124,8 @@ def load_policy_spec(
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
     method = json.dumps(training, sort_keys=True) if training else None
     run = Path(place) if (Path(place) / "config.json").is_file() else None
-    family, environment, given = training.get("family"), policy_environment(place), training.get("robot")
-    robot: Any = given if isinstance(given, Mapping) else None
-    if robot is None and family in (*FAMILIES, ALL):
-        robot = environment.get("robot") or "unicycle"
-    trained = None if robot is None else check_robot(robot)
-    return PolicySpec(place, label, method, policy, environment, run=run, family=family, trained_robot=trained)
+    family, environment, robot = training.get("family"), policy_environment(place), trained_robot(description)
+    return PolicySpec(place, label, method, policy, environment, run=run, family=family, trained_robot=robot)
 
 
 def group_by_row(specs: Sequence[PolicySpec]) -> dict[str, list[PolicySpec]]:

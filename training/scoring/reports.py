@@ -257,6 +257,8 @@ def plot_episodes(
     episodes: Sequence[Episode],
     path: str | os.PathLike[str] | IO[bytes],
     columns: int = 4,
+    *,
+    title: str | None = None,
 ) -> None:
     """Plot the best, median and worst episodes of a policy with their optima into a file.
 
@@ -265,6 +267,7 @@ def plot_episodes(
         episodes: the episodes of a policy.
         path: the file.
         columns: number of episodes in each row, see `extremes`.
+        title: title of the figure, such as the name of the policy.
 
     """
     rows = extremes(episodes, columns)
@@ -277,6 +280,8 @@ def plot_episodes(
             else:
                 axes.set_visible(False)
         row_axes[0].set_ylabel(title, fontsize=11)
+    if title is not None:
+        figure.suptitle(title)
     figure.savefig(path, dpi=130)
 
 

@@ -14,5 +14,8 @@ class Worlds:
     """Read the worlds of other benchmarks, and score policies and the expert in them."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Import, tyro.conf.subcommand("import")] | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
+        Annotated[
+            Annotated[Import, tyro.conf.subcommand("import")] | Annotated[Benchmark, tyro.conf.subcommand("benchmark")],
+            tyro.conf.arg(name=""),
+        ]
     ]

@@ -162,9 +162,12 @@ class Benchmark:
     """Run a benchmark of the field on your own download."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[BenchmarkBarn, tyro.conf.subcommand("barn")]
-        | Annotated[BenchmarkDynobench, tyro.conf.subcommand("dynobench")]
-        | Annotated[BenchmarkTpcap, tyro.conf.subcommand("tpcap")]
+        Annotated[
+            Annotated[BenchmarkBarn, tyro.conf.subcommand("barn")]
+            | Annotated[BenchmarkDynobench, tyro.conf.subcommand("dynobench")]
+            | Annotated[BenchmarkTpcap, tyro.conf.subcommand("tpcap")],
+            tyro.conf.arg(name=""),
+        ]
     ]
 
 

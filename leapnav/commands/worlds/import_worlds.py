@@ -157,12 +157,15 @@ class Import:
     """Read the worlds of another benchmark from your own download, and write them as scenario files."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[ImportBarn, tyro.conf.subcommand("barn")]
-        | Annotated[ImportDynobench, tyro.conf.subcommand("dynobench")]
-        | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
-        | Annotated[ImportPedestrians, tyro.conf.subcommand("pedestrians")]
-        | Annotated[ImportRosMap, tyro.conf.subcommand("ros-map")]
-        | Annotated[ImportTpcap, tyro.conf.subcommand("tpcap")]
+        Annotated[
+            Annotated[ImportBarn, tyro.conf.subcommand("barn")]
+            | Annotated[ImportDynobench, tyro.conf.subcommand("dynobench")]
+            | Annotated[ImportMovingAI, tyro.conf.subcommand("movingai")]
+            | Annotated[ImportPedestrians, tyro.conf.subcommand("pedestrians")]
+            | Annotated[ImportRosMap, tyro.conf.subcommand("ros-map")]
+            | Annotated[ImportTpcap, tyro.conf.subcommand("tpcap")],
+            tyro.conf.arg(name=""),
+        ]
     ]
 
 
