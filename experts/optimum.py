@@ -220,8 +220,6 @@ def _of_scenario(scenario: Scenario, effort: Effort, barrier_tolerance: float) -
     optima, failed = search(scenario, problem, effort)
     if optima is None or (failed is not None and not optima.certified):
         return as_optimum(failure(problem, failed or Status.NO_PATH))
-    if effort != "low":
-        optima.settle_doubts()
     found = _result(optima, barrier_tolerance, effort)
     if found.problem.barrier_weight > 0.0 and not found.success:
         # The continuation stalled at a barrier weight, or the barrier makes the flow in a narrow gap too sensitive.

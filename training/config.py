@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, cast, get_args
 
 _FOLDER = files("leapnav.training")
+INHERITED = ("robot", "horizon", "observation", "lidar_beams", "previous_action")  # from the policy at the start
 LATER_SENSORS = {"velocities": False, "lidar_fov": math.tau}  # those that older descriptions of policies do not contain
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
 PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
@@ -191,8 +192,8 @@ class RunConfig:
         """Return the settings for a family, tuned for the start of the run: the profile of the algorithm, with changes.
 
         The defaults of the class are the profile of a run from scratch; DAgger has another one for lidar alone, and PPO
-        and SAC for a warm start (file `profiles.toml`). A run that starts from a policy has the observation of that
-        policy.
+        and SAC for a warm start (file `profiles.toml`). A run that starts from a policy has the robot model, the
+        horizon and the observation of that policy.
 
         Args:
             family: one of the families, or "all".
@@ -396,16 +397,15 @@ def _as_paths(value: Any) -> list[Path]:
 
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
-    """Return the settings of the observation of the policy among some paths; empty without one."""
+    """Return the task and the sensors of the policy among some paths; empty without one."""
     included = _FOLDER.joinpath("policies", "pretrained")
     for path in paths:
         for folder in (Path(path), included.joinpath(str(path))):
             try:
-                description = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))
-                environment = description["environment"]
-                sensors = {name: environment[name] for name in ("observation", "lidar_beams", "previous_action")}
-                sensors |= {name: environment.get(name, value) for name, value in LATER_SENSORS.items()}
-                return {**sensors, "history": tuple(environment["history"])}
+                environment = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))["environment"]
+                known = {name: environment[name] for name in INHERITED}
+                known |= {name: environment.get(name, value) for name, value in LATER_SENSORS.items()}
+                return {**known, "history": tuple(environment["history"])}
             except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
                 continue
     return {}

@@ -11,6 +11,7 @@ Each candidate path goes through the same steps, and ends in one `Verdict`:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
@@ -29,22 +30,19 @@ from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.solvers.multiple_shooting import confirm, polish_in_stages
 from leapnav.experts.solvers.nodes import SolverOptions
-from leapnav.experts.transcription.adaptive import settle
+from leapnav.experts.transcription.adaptive import INTERVALS_PER_SEGMENT, settled_attempts
 from leapnav.experts.transcription.direct import MAX_VIOLATION, RELAXED_DISTANCE, DirectPath, discretise, optimise
 
 TOLERANCE = 1e-9
 # Newton steps of a candidate, and of a manoeuvre, whose Hamiltonian changes abruptly at contacts.
 # With 14 for candidates, 1.4 times as many evaluations in 93 difficult scenarios; with 25 about the same.
 NEWTON_ITERATIONS, MANOEUVRE_ITERATIONS = 20, 60
-# Intervals of the refined direct path per segment of multiple shooting, smallest number of segments, and attempts.
-INTERVALS_PER_SEGMENT, MIN_SEGMENTS, MAX_ATTEMPTS = 8, 8, 3
-# Numbers of segments of the last attempts on an adaptive mesh. In a door of 0.45 m, 8, 32 and 64 segments converge, but
-# 16, 28, 57 and 114 do not: with many nodes near an edge, the closest feature changes from one Newton step to the next.
-FEW_SEGMENTS = 32, 8
+MIN_SEGMENTS = 8  # of multiple shooting from a refined direct path
+FINER_ATTEMPTS = 2  # on halved and quartered intervals, where the first attempt fails
 UNCONFIRMED = Status.NOT_CERTIFIED, Status.STALLED, Status.MAX_ITERATIONS  # of a solution that is not accurate enough
-MAX_SETTLED = 3  # paths at which Newton's method stalled
-# A long refined path: number of intervals above which it is one, attempts that it omits, and intervals per segment.
-LONG_PATH, SKIPPED_ATTEMPTS, INTERVALS_PER_SEGMENT_OF_LONG_PATH = 2048, 2, 3
+# A long path, some place of which is too coarse: number of intervals above which it is one, further refinements, and
+# then intervals per segment.
+LONG_PATH, REFINEMENTS_OF_LONG_PATH, INTERVALS_PER_SEGMENT_OF_LONG_PATH = 2048, 2, 3
 # Two paths are duplicates if they stay within this distance of each other (m, and rad for the heading) ...
 DUPLICATE_DISTANCE = 0.15
 # ... and two extremals are duplicates if, in addition, their costs agree to this relative tolerance.
@@ -152,6 +150,7 @@ class LocalOptima:
         self._wound: dict[tuple[float | None, ...], OptimalControlProblem] = {}  # by the goal
         self._found: list[tuple[Extremal, np.ndarray]] = []  # the distinct extremals, with their shapes
         self._seen = np.empty((0, len(COMPARED_FRACTIONS), 3))
+        self._lowest_settled = math.inf  # lowest cost of a path that was retried on adaptive meshes
 
     @property
     def certified(self) -> list[Extremal]:
@@ -235,6 +234,7 @@ class LocalOptima:
         """Compute the extremals of direct paths, in order of their costs."""
         for problem, direct in sorted(transcribed, key=lambda entry: entry[1].cost):
             self.verdicts.append(self._judge(problem, direct))
+        self._retry_cheapest()
 
     def lowest_cost(self, transcribed: Sequence[tuple[OptimalControlProblem, DirectPath]]) -> float:
         """Return the lowest cost of the certified extremals and of direct paths that are likely to lead to one."""
@@ -245,33 +245,41 @@ class LocalOptima:
         return min(costs, default=math.inf)
 
     def add_manoeuvres(self, guesses: Iterable[DirectPath]) -> bool:
-        """Compute the local optima of paths that are free of contact, on adaptive meshes; return whether any is found.
-
-        A local optimum that was known is also found.
-        """
+        """Compute the local optima of paths free of contact, on adaptive meshes; return whether there are any."""
         found = False
         for guess in guesses:
             problem = self._with_winding(guess.states)
-            extremal, _ = self._extremal(problem, self._settled(problem, guess), max_iterations=MANOEUVRE_ITERATIONS)
-            if extremal is not None:
-                self.verdicts.append(self._verdict(problem, guess, extremal))
-                found = found or extremal.success
+            found = self._add_extremal(problem, guess, settled_attempts(problem, guess, self._energy)) or found
         return found
 
-    def settle_doubts(self) -> None:
-        """Compute the local optima of paths that cost less than the best extremal, on adaptive meshes."""
-        stalled = [verdict for verdict in self.verdicts if verdict.outcome is Outcome.STALLED and self.certified]
-        for verdict in sorted(stalled, key=lambda verdict: verdict.cost)[:MAX_SETTLED]:
-            if verdict.cost < self.best.cost * (1 - DIRECT_ERROR) and self._clearance(verdict.path) > 0.0:
-                self.add_manoeuvres([verdict.path])
+    def _add_extremal(
+        self, problem: OptimalControlProblem, path: DirectPath, attempts: Iterable[tuple[int, DirectPath]]
+    ) -> bool:
+        """Compute the extremal of a path in several attempts, and return whether it is certified."""
+        extremal, _ = self._extremal(problem, attempts, max_iterations=MANOEUVRE_ITERATIONS)
+        if extremal is not None:
+            self.verdicts.append(self._verdict(problem, path, extremal))
+        return extremal is not None and extremal.success
 
-    def _settled(self, problem: OptimalControlProblem, guess: DirectPath) -> Iterator[tuple[int, DirectPath]]:
-        """Yield numbers of segments of multiple shooting, each with a path on an adaptive mesh."""
-        path = None
-        for path in settle(problem, guess, self._energy):
-            yield len(path.controls) // INTERVALS_PER_SEGMENT, path
-        if path is not None:
-            yield from ((segments, path) for segments in FEW_SEGMENTS)
+    def _retry_cheapest(self) -> None:
+        """Retry the cheapest path at which Newton's method stalled, if it may cost less than the best extremal."""
+        stalled = [v for v in self.verdicts if v.outcome is Outcome.STALLED and v.cost < self._lowest_settled]
+        free = [verdict for verdict in stalled if self._clearance(verdict.path) > 0.0]
+        if not free:
+            return
+        _, problem, path, *_ = min(free, key=lambda verdict: verdict.cost)
+        if not self._is_expensive(path, -DIRECT_ERROR):
+            attempts = self._finer(problem, path)
+            if self.certified:  # otherwise there may be no extremal at all, and attempts on adaptive meshes take long
+                self._lowest_settled = path.cost
+                attempts = itertools.chain(attempts, settled_attempts(problem, path, self._energy))
+            self._add_extremal(problem, path, attempts)
+
+    def _finer(self, problem: OptimalControlProblem, path: DirectPath) -> Iterator[tuple[int, DirectPath]]:
+        """Yield numbers of segments of multiple shooting, each with the path on shorter intervals."""
+        for _ in range(FINER_ATTEMPTS):
+            path = self._optimise(problem, path.refined())
+            yield _segments(path), path
 
     def refine(self, problem: OptimalControlProblem, direct: DirectPath) -> DirectPath:
         """Return the optimum on shorter intervals, of a free horizon with a better duration."""
@@ -333,7 +341,9 @@ class LocalOptima:
         is_expensive = self._is_expensive(refined, REFINED_ERROR)
         extremal, evaluations = None, 0
         if is_feasible or not self.certified:
-            extremal, evaluations = self._extremal(problem, self._attempts(problem, refined), self._found)
+            for _ in range(REFINEMENTS_OF_LONG_PATH if len(refined.controls) > LONG_PATH else 0):
+                refined = self._optimise(problem, refined.refined())
+            extremal, evaluations = self._extremal(problem, [(_segments(refined), refined)], self._found)
         if is_expensive:
             self._budget -= evaluations
         return self._verdict(problem, refined, extremal)
@@ -350,19 +360,6 @@ class LocalOptima:
         if not extremal.success:
             return Verdict(Outcome.REFUSED, problem, path, extremal)
         return Verdict(Outcome.CERTIFIED, problem, path, extremal, expected_limit(without_barrier(extremal)))
-
-    def _attempts(self, problem: OptimalControlProblem, direct: DirectPath) -> Iterator[tuple[int, DirectPath]]:
-        """Yield numbers of segments of multiple shooting, each with the path to apply it to."""
-        is_expensive = self._is_expensive(direct, REFINED_ERROR)  # not the optimum
-        # On a long path, some place is too coarse for the first attempts.
-        first = SKIPPED_ATTEMPTS if len(direct.controls) > LONG_PATH else 0
-        for attempt in range(first + (1 if is_expensive else MAX_ATTEMPTS)):
-            if attempt > 0:
-                direct = self._optimise(problem, direct.refined())
-            if attempt >= first:
-                intervals, is_long = len(direct.controls), len(direct.controls) > LONG_PATH * 2**attempt
-                length = INTERVALS_PER_SEGMENT_OF_LONG_PATH if is_long else INTERVALS_PER_SEGMENT
-                yield max(round(intervals / (length * 2**attempt)), MIN_SEGMENTS) * 2**attempt, direct
 
     def _extremal(
         self,
@@ -439,6 +436,13 @@ class LocalOptima:
 
     def _is_close(self, shape: np.ndarray, other: np.ndarray) -> bool:
         return bool(np.abs(shape - other).max() < self._duplicate_distance)
+
+
+def _segments(path: DirectPath) -> int:
+    """Return the number of segments of multiple shooting from a path."""
+    intervals, is_long = len(path.controls), len(path.controls) > LONG_PATH * 2**REFINEMENTS_OF_LONG_PATH
+    length = INTERVALS_PER_SEGMENT_OF_LONG_PATH if is_long else INTERVALS_PER_SEGMENT
+    return max(round(intervals / length), MIN_SEGMENTS)
 
 
 def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:

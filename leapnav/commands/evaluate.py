@@ -42,7 +42,7 @@ class Evaluate(ParallelOptions):
     """Fixed or free horizon of the included banks; by default that of the policies."""
     obstacles: Obstacles | None = None
     """Obstacles of the included banks: with a proximity cost, or hard obstacles, which cost nothing; by default those
-    of the training runs, or with a proximity cost."""
+    for which the policies were trained."""
     split: Literal["test", "train"] = "test"
     """Split of the included banks."""
     bank: Path | None = None

@@ -27,8 +27,9 @@ class Watch:
     """Model of the robot, for the expert and the baselines; a learned policy has its own."""
     horizon: Horizon = "fixed"
     """Fixed or free horizon, for the expert and the baselines; a learned policy has its own."""
-    obstacles: Obstacles = "cost"
-    """Obstacles with a proximity cost, or hard obstacles, which cost nothing."""
+    obstacles: Obstacles | None = None
+    """Obstacles with a proximity cost, or hard obstacles, which cost nothing; by default those of the training of the
+    policy, or with a proximity cost."""
     split: Literal["train", "test", "fresh"] | None = None
     """Split of the included banks, or "fresh" for newly sampled scenarios; by default "test", and "fresh" for a family
     without included banks."""
@@ -114,16 +115,16 @@ class Watch:
         from leapnav.training.policies.zips import is_zip
         from leapnav.training.scoring.policy_specs import BASELINES
 
-        family = self.family
-        if family is None and self.policy not in BASELINES and not is_zip(self.policy):
-            family = read_description(self.policy)["training"].get("family")
-        if family is not None and family.endswith(BANK_ENDING):
+        is_learned = self.policy not in BASELINES and not is_zip(self.policy)
+        training = read_description(self.policy)["training"] if is_learned else {}
+        family = self.family or training.get("family") or "clutter"
+        if family.endswith(BANK_ENDING):
             return {"bank": family}
-        family = family or "clutter"
+        obstacles = self.obstacles or training.get("obstacles") or "cost"
         kinds = {name: value for name, value in self._sensors().items() if name in ("robot", "horizon")}
-        included = ScenarioBank.shipped_families(**kinds, obstacles=self.obstacles)
+        included = ScenarioBank.shipped_families(**kinds, obstacles=obstacles)
         split = self.split or ("test" if family in included else "fresh")
-        return {"family": family, "split": split, "obstacles": self.obstacles}
+        return {"family": family, "split": split, "obstacles": obstacles}
 
     def _make(self, render_mode: str) -> gym.Env[Any, Any]:
         import gymnasium as gym

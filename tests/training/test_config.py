@@ -13,6 +13,9 @@ def test_a_run_that_starts_from_a_policy_has_its_observation():
     given = DAggerRunConfig.tuned("clutter", observation="lidar")
     inherited = DAggerRunConfig.tuned("clutter", policy=Path("clutter-lidar"))
     assert inherited.observation == "lidar" and inherited.dagger == given.dagger
+    warm = PPOConfig.tuned("clutter", warm_start=(Path("free-clutter"),))
+    assert warm.task["horizon"] == "free" and warm.environment["previous_action"]
+    assert PPOConfig.tuned("clutter", warm_start=(Path("car-clutter"),)).task["robot"] == "car"
 
 
 def test_a_profile_contains_all_settings_of_its_algorithm():

@@ -149,7 +149,7 @@ def compare(
             - an object, a function or a class, see `evaluate`;
             - a tuple of one of these and the arguments of its environment.
         bank: a bank, its file (`.bank`), several banks, the name of a family for its test split, or "all" for those of
-            all families.
+            all families, with the kinds of obstacles for which the policies were trained.
         count: number of scenarios of each bank, from the first; None: all.
         environment: arguments of the environment, such as `observation`, for the policies without their own.
         seed: random seed of the bootstrap intervals, the disturbances and the random policy.
@@ -172,7 +172,8 @@ def compare(
         banks = [ScenarioBank(bank)]
     elif isinstance(bank, str):
         check_family(bank)
-        banks = included_banks(specs, families_of(bank))
+        kinds = sorted({spec.obstacles for spec in specs if spec.obstacles is not None} or {"cost"})
+        banks = [one for kind in kinds for one in included_banks(specs, families_of(bank), obstacles=kind)]
     else:
         banks = [bank] if isinstance(bank, ScenarioBank) else list(bank)
     return compare_policies(specs, banks, count=count, seed=seed, workers=workers, dask=dask, progress=progress)
@@ -235,7 +236,7 @@ def default_banks(
         family: a family, or "all"; None: those for which the policies were trained, or "clutter" without any.
         split: "train" or "test"; training runs have a test bank only.
         robot, horizon: see `included_banks`.
-        obstacles: "cost" or "hard"; None: those of the training runs, or "cost" without any.
+        obstacles: "cost" or "hard"; None: those for which the policies were trained, or "cost" without any.
 
     Raises:
         FileNotFoundError, ValueError: the configuration of a run is damaged, or see `included_banks`.
@@ -248,8 +249,9 @@ def default_banks(
     trained += [spec.family for spec in specs if spec.run is None and spec.family in (*FAMILIES, ALL)]
     chosen = [family] if family is not None else trained or ["clutter"]
     families = {name for one in chosen for name in families_of(one)}
-    of_runs = {config.task["obstacles"] for config in configs.values()}
-    kinds = of_runs or {"cost"} if obstacles is None else {obstacles}
+    trained_kinds = {config.task["obstacles"] for config in configs.values()}
+    trained_kinds |= {spec.obstacles for spec in specs if spec.run is None and spec.obstacles is not None}
+    kinds = trained_kinds or {"cost"} if obstacles is None else {obstacles}
     included, own = [], {}  # those of the runs by their identity: runs can have the same bank, or several of a family
     for name in sorted(families, key=lambda name: (*FAMILIES, name).index(name)):
         if name.endswith(BANK_ENDING):

@@ -76,7 +76,8 @@ def evaluate(
             action space, such as that of `RescaleAction`, are scaled to [-1, 1]. A policy of
             `leapnav/NavigateGoal-v0` is evaluated there. The names, directories and files of `compare` are accepted.
         bank: a bank, its file (`.bank`), or the name of a family for its test split, with the robot, horizon and
-            obstacles of `environment`.
+            obstacles of `environment`; by default the obstacles are those of the training of a policy that is given by
+            its name.
         count: number of scenarios, from the first of the bank; None: all.
         environment: arguments of the environment, such as `observation`; None: those that determine the observations of
             the model's environment, or of the training of a policy that is given by its name, if they are known.
@@ -97,9 +98,11 @@ def evaluate(
 
     """
     check_at_least("workers", workers, 1)
+    obstacles: str | None = None
     if isinstance(policy, (str, Path)):
         spec = load_policy_spec(str(policy), seed=seed)
         policy, environment = spec.policy, spec.environment if environment is None else environment
+        obstacles = spec.obstacles
     environment = _environment_of(policy) if environment is None else environment
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
@@ -109,7 +112,7 @@ def evaluate(
     if not isinstance(bank, ScenarioBank):
         if not isinstance(bank, str):
             raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
-        bank = _named_bank(bank, environment)
+        bank = _named_bank(bank, {"obstacles": obstacles, **environment})
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
     arguments = {name: value for name, value in environment.items() if name != "obstacles"}

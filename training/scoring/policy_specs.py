@@ -43,6 +43,7 @@ class PolicySpec:
         is_baseline: whether the policy drives any robot.
         run: directory of the training run; None for other policies.
         family: family of the scenarios of the training; None if it is unknown.
+        obstacles: kind of the obstacles of the training; None if it is unknown.
         trained_robot: robot of the training; None if its parameters are unknown.
 
     """
@@ -55,6 +56,7 @@ class PolicySpec:
     is_baseline: bool = False
     run: Path | None = None
     family: str | None = None
+    obstacles: str | None = None
     trained_robot: RobotModel | None = None
 
     @property
@@ -124,8 +126,10 @@ def load_policy_spec(
     training = {key: value for key, value in description["training"].items() if key not in ("seed", "out")}
     method = json.dumps(training, sort_keys=True) if training else None
     run = Path(place) if (Path(place) / "config.json").is_file() else None
-    family, environment, robot = training.get("family"), policy_environment(place), trained_robot(description)
-    return PolicySpec(place, label, method, policy, environment, run=run, family=family, trained_robot=robot)
+    family, environment = training.get("family"), policy_environment(place)
+    robot, obstacles = trained_robot(description), training.get("obstacles") or ("cost" if training else None)
+    known = {"family": family, "obstacles": obstacles, "trained_robot": robot}
+    return PolicySpec(place, label, method, policy, environment, run=run, **known)
 
 
 def group_by_row(specs: Sequence[PolicySpec]) -> dict[str, list[PolicySpec]]:
