@@ -9,6 +9,7 @@ import errno
 import os
 import re
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
@@ -132,7 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         words = sys.argv[1:] if arguments is None else arguments
         command = parse(words)
-        with json_on_stdout(getattr(command, "json", None)), _warnings_in_one_line():
+        with json_on_stdout(getattr(command, "json", None)), _warnings_in_one_line(), _stopped_workers():
             return command.run()
     except BrokenPipeError:  # the process that read the output has ended, as in `leapnav bank show ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -162,6 +163,23 @@ def _warnings_in_one_line() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning = usual
+
+
+@contextmanager
+def _stopped_workers() -> Iterator[None]:
+    """Print no traceback of the thread of joblib that manages worker processes, which fails when they are stopped."""
+    usual = threading.excepthook
+
+    def hook(failure: threading.ExceptHookArgs) -> None:
+        is_manager = failure.thread is not None and failure.thread.name == "ExecutorManagerThread"
+        if not (is_manager and failure.exc_type is KeyError):
+            usual(failure)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = usual
 
 
 def _message(error: Exception) -> str:
