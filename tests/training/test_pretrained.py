@@ -16,7 +16,7 @@ SOC = {
     "clutter-lidar": 0.924,
     "crossing": 0.869,
     "crowd": 0.868,
-    "dynamic_unicycle-clutter": 0.938,
+    "dynamic_unicycle-clutter": 0.972,
     "free-clutter": 0.998,
     "open": 0.997,
     "polygons": 0.969,

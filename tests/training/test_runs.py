@@ -131,22 +131,6 @@ def test_a_finished_run_is_extended_with_more_steps_and_another_learning_rate(tm
     assert "apart from total_timesteps, learning_rate and dagger.rounds" in capsys.readouterr().err
 
 
-def test_a_finished_run_of_dagger_is_extended_with_more_rounds(demos, tmp_path, capsys):
-    dagger = DAggerConfig(rounds=1, max_episodes=4, lead=0.5, last_epochs=1)
-    config = DAggerRunConfig(out=tmp_path / "run", demos=(demos,), n_envs=2, cloning=QUICK, dagger=dagger, **COMMON)
-    train_dagger(config, progress=False)
-    assert main(["train", "dagger", "--out", str(config.out), "--resume", "--dagger.rounds", "2"]) == 0
-    record = json.loads((config.out / "config.json").read_text())
-    assert record["config"]["dagger"]["rounds"] == 2
-    assert record["changes"][0]["before"] == {"dagger.rounds": 1}
-    assert len(list((config.out / "rounds").glob("round-*.npz"))) == 2
-    capsys.readouterr()
-    assert main(["train", "dagger", "--out", str(config.out), "--resume", "--dagger.rounds", "1"]) == 2
-    assert "dagger.rounds: expected at least 2" in capsys.readouterr().err
-    assert main(["train", "dagger", "--out", str(config.out), "--resume", "--dagger.lead", "1"]) == 2
-    assert "dagger.lead: the run in" in capsys.readouterr().err
-
-
 def test_without_a_family_policies_are_evaluated_in_their_own():
     def families(*names):
         return [bank.family for bank in default_banks([load_policy_spec(name) for name in names])]
@@ -308,7 +292,7 @@ def test_an_interrupted_clone_keeps_its_demonstrations(tmp_path, monkeypatch):
     assert [line["step"] for line in lines(config.out)] == [samples, 2 * samples, 3 * samples, 3 * samples]
 
 
-def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
+def test_dagger_is_resumed_round_by_round_and_extended(demos, tmp_path, monkeypatch, capsys):
     def config(out, **changes):
         settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, max_episodes=6, lead=0.5)}
         return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
@@ -330,6 +314,14 @@ def test_dagger_is_resumed_round_by_round(demos, tmp_path, monkeypatch):
     monkeypatch.undo()
     train_dagger(config(tmp_path / "stopped", resume=True), progress=False)
     assert weights(tmp_path / "stopped") == weights(tmp_path / "straight")
+    resume = ["train", "dagger", "--out", str(tmp_path / "stopped"), "--resume"]
+    assert main([*resume, "--dagger.rounds", "3"]) == 0
+    record = json.loads((tmp_path / "stopped" / "config.json").read_text())
+    assert record["config"]["dagger"]["rounds"] == 3 and record["changes"][0]["before"] == {"dagger.rounds": 2}
+    assert len(list((tmp_path / "stopped" / "rounds").glob("round-*.npz"))) == 3
+    for option, message in (("rounds", "expected at least 3"), ("lead", "the run in")):
+        assert main([*resume, f"--dagger.{option}", "1"]) == 2
+        assert f"dagger.{option}: {message}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("algorithm", [pytest.param("sac", marks=pytest.mark.slow), "tqc"])
