@@ -221,12 +221,15 @@ def _of_scenario(scenario: Scenario, effort: Effort, barrier_tolerance: float) -
     if optima is None or (failed is not None and not optima.certified):
         return as_optimum(failure(problem, failed or Status.NO_PATH))
     found = _result(optima, barrier_tolerance, effort)
-    if found.problem.barrier_weight > 0.0 and not found.success:
+    stalled = [one for one in (*found.doubts, found) if one.problem.barrier_weight > 0.0 and not one.success]
+    if stalled:
         # The continuation stalled at a barrier weight, or the barrier makes the flow in a narrow gap too sensitive.
-        weight = max(FACTOR**2 * found.problem.barrier_weight, scenario.cost.proximity_weight)
+        weight = max(FACTOR**2 * stalled[0].problem.barrier_weight, scenario.cost.proximity_weight)
         optima, _ = search(scenario, problem.with_barrier(weight), effort, SHARPNESS)
         if optima is not None and optima.certified:
-            found = _result(optima, barrier_tolerance, effort)
+            again = _result(optima, barrier_tolerance, effort)
+            if not found.success or (again.success and again.cost < found.cost):
+                found = again
     return found
 
 
@@ -428,7 +431,9 @@ def _result(optima: LocalOptima, tolerance: float, effort: Effort) -> Optimum:
     doubts = optima.doubts(optima.best.cost)
     weight = optima.scenario.cost.proximity_weight
     best, *others = follow_best(optima.certified, weight, tolerance, alternatives=effort == "high")
-    found = tuple(map(as_optimum, others)) if best.success else ()
+    # The path of a continuation that stalled is feasible, so that its cost is an upper bound.
+    doubts += tuple(one for one in others if not one.success and one.cost < best.cost)
+    found = tuple(as_optimum(one) for one in others if one.success and best.success)
     return replace(as_optimum(best), alternatives=found, doubts=doubts)
 
 

@@ -1,7 +1,7 @@
 """The included policies: training, and scores in fresh scenarios of their families.
 
 python studies/included_policies/run.py                   # scores all included policies
-python studies/included_policies/run.py clutter crossing  # scores only these
+python studies/included_policies/run.py clutter crossing  # scores only these; clutter-hard: among hard obstacles
 python studies/included_policies/run.py clutter --train   # trains and includes them first; resumes unfinished runs
 
 `configurations/` contains the complete settings of each policy, in the format of `config.json` of a training run, and
@@ -24,7 +24,8 @@ sys.path.append(str(Path(__file__).parents[1]))
 from common import fresh_bank, load, play, read_arguments, train
 
 HERE = Path(__file__).parent
-NAMES = tuple(sorted(path.stem for path in (HERE / "configurations").glob("*.json")))
+HARD = {"clutter-hard": "clutter"}  # results of policies among hard obstacles, for which they were not trained
+NAMES = (*sorted(path.stem for path in (HERE / "configurations").glob("*.json")), *HARD)
 SCENARIOS = 4000  # of each bank of fresh scenarios
 TABLES = {"included-policies": "docs/results.md"}  # with the files that contain them
 
@@ -49,6 +50,7 @@ def tables(results: Path) -> dict[str, str]:
                 episodes = tuple(episode for episode in evaluation if episode.family == family)
                 row = score(name, replace(evaluation, episodes=episodes))
                 label = f"`{name}`" if len(families) == 1 else f"`{name}` on {family}"
+                label = f"`{HARD[name]}`, hard obstacles" if name in HARD else label
                 lines.append(f"| {label} | {row.episodes:,} | {markdown_cells(row)} | {row.unknown} |")
     return {"included-policies": "\n".join(lines) + "\n"}
 
@@ -57,16 +59,19 @@ def main() -> None:
     """Train and score the named policies."""
     arguments = read_arguments(__doc__, NAMES, HERE, train="train the policies first, and include them")
     tiny, count = arguments.tiny, 4 if arguments.tiny else SCENARIOS
-    folder = arguments.results / "policies" if tiny and arguments.train else SHIPPED
     for name in arguments.names:
-        settings = HERE / "configurations" / f"{name}.json"
+        policy = HARD.get(name, name)
+        is_trained = arguments.train and name not in HARD
+        folder = arguments.results / "policies" if tiny and is_trained else SHIPPED
+        settings = HERE / "configurations" / f"{policy}.json"
         _, config = read_config(settings)
         assert isinstance(config, DAggerRunConfig)
-        if arguments.train:
+        if is_trained:
             include(train(settings, arguments.runs / "included_policies" / name, tiny=tiny), folder / name)
-        task = {"robot": config.robot, "horizon": config.horizon, "obstacles": config.obstacles}
+        obstacles = "hard" if name in HARD else config.obstacles
+        task = {"robot": config.robot, "horizon": config.horizon, "obstacles": obstacles}
         banks = [fresh_bank(arguments.runs, one, count, tiny=tiny, **task) for one in families_of(config.family)]
-        play([load(folder / name)], banks, arguments.results, name, progress=not tiny)
+        play([load(folder / policy)], banks, arguments.results, name, progress=not tiny)
     print(tables(arguments.results)["included-policies"])
 
 

@@ -289,3 +289,12 @@ def test_the_minimum_time_with_hard_obstacles_is_shorter():
     free = minimum_time(hard, 0.1)
     assert free.horizon < minimum_time(soft, 0.1).horizon
     assert free.extremal.certificate.clearance > 0 and free.extremal.barrier < 5e-3
+
+
+@pytest.mark.parametrize("effort", ["medium", "high"])
+def test_a_cheaper_extremal_whose_continuation_stalled_is_searched_again(effort):
+    """At the first barrier weight that is tried, the continuation of the optimum stalls; the next one costs 45 % more."""
+    scenario = sample_scenario("clutter", np.random.default_rng([784, 3408]), obstacles="hard")
+    found = find_optimum(scenario, effort)
+    assert found.success and found.cost < 2.22 and not found.doubts
+    assert all(one.success and one.cost > found.cost for one in found.alternatives)
