@@ -293,7 +293,7 @@ def test_the_minimum_time_with_hard_obstacles_is_shorter():
 
 @pytest.mark.parametrize("effort", ["medium", "high"])
 def test_a_cheaper_extremal_whose_continuation_stalled_is_searched_again(effort):
-    """At the first barrier weight that is tried, the continuation of the optimum stalls; the next one costs 45 % more."""
+    """The continuation of the optimum stalls at the first barrier weight; the next extremal costs 45 % more."""
     scenario = sample_scenario("clutter", np.random.default_rng([784, 3408]), obstacles="hard")
     found = find_optimum(scenario, effort)
     assert found.success and found.cost < 2.22 and not found.doubts
