@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers import SMALL
+from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 
 from leapnav.cli import main
@@ -62,6 +63,14 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert "Comparison of policies" in page and "Learning curves" not in page and "<h2>Runs</h2>" not in page
     assert page.count("data:image/png") == 2 * len(rows)  # episodes and decisions
+
+
+@pytest.mark.parametrize("title", [None, "own"])
+def test_pictures_of_episodes_have_the_title_that_is_given(title, tmp_path, monkeypatch):
+    found, titles = compare({"random": "random"}, "open", count=3, progress=False), []
+    monkeypatch.setattr(Figure, "suptitle", lambda _, text: titles.append(text))
+    plot_episodes(found.banks, found.runs["random"][0].episodes, tmp_path / "episodes.png", title=title)
+    assert titles == ([] if title is None else [title])
 
 
 def test_a_function_gets_one_observation_at_a_time_and_dictionaries_too():

@@ -273,13 +273,13 @@ def plot_episodes(
     rows = extremes(episodes, columns)
     figure = Figure(figsize=(3.1 * columns, 3.3 * len(rows)), layout="constrained")
     grid = figure.subplots(len(rows), columns, squeeze=False)
-    for row_axes, (title, chosen) in zip(grid, rows.items(), strict=True):
+    for row_axes, (group, chosen) in zip(grid, rows.items(), strict=True):
         for column, axes in enumerate(row_axes):
             if column < len(chosen):
                 draw_episode(axes, banks, chosen[column])
             else:
                 axes.set_visible(False)
-        row_axes[0].set_ylabel(title, fontsize=11)
+        row_axes[0].set_ylabel(group, fontsize=11)
     if title is not None:
         figure.suptitle(title)
     figure.savefig(path, dpi=130)
