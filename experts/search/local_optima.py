@@ -234,7 +234,7 @@ class LocalOptima:
         """Compute the extremals of direct paths, in order of their costs."""
         for problem, direct in sorted(transcribed, key=lambda entry: entry[1].cost):
             self.verdicts.append(self._judge(problem, direct))
-        self._retry_cheapest()
+        self._retry(self.verdicts[len(self.verdicts) - len(transcribed) :])
 
     def lowest_cost(self, transcribed: Sequence[tuple[OptimalControlProblem, DirectPath]]) -> float:
         """Return the lowest cost of the certified extremals and of direct paths that are likely to lead to one."""
@@ -246,11 +246,9 @@ class LocalOptima:
 
     def add_manoeuvres(self, guesses: Iterable[DirectPath]) -> bool:
         """Compute the local optima of paths free of contact, on adaptive meshes; return whether there are any."""
-        found = False
-        for guess in guesses:
-            problem = self._with_winding(guess.states)
-            found = self._add_extremal(problem, guess, settled_attempts(problem, guess, self._energy)) or found
-        return found
+        pairs = [(self._with_winding(guess.states), guess) for guess in guesses]
+        found = [self._add_extremal(*pair, settled_attempts(*pair, self._energy)) for pair in pairs]
+        return any(found)
 
     def _add_extremal(
         self, problem: OptimalControlProblem, path: DirectPath, attempts: Iterable[tuple[int, DirectPath]]
@@ -261,19 +259,20 @@ class LocalOptima:
             self.verdicts.append(self._verdict(problem, path, extremal))
         return extremal is not None and extremal.success
 
-    def _retry_cheapest(self) -> None:
-        """Retry the cheapest path at which Newton's method stalled, if it may cost less than the best extremal."""
-        stalled = [v for v in self.verdicts if v.outcome is Outcome.STALLED and v.cost < self._lowest_settled]
-        free = [verdict for verdict in stalled if self._clearance(verdict.path) > 0.0]
-        if not free:
-            return
-        _, problem, path, *_ = min(free, key=lambda verdict: verdict.cost)
-        if not self._is_expensive(path, -DIRECT_ERROR):
-            attempts = self._finer(problem, path)
-            if self.certified:  # otherwise there may be no extremal at all, and attempts on adaptive meshes take long
-                self._lowest_settled = path.cost
-                attempts = itertools.chain(attempts, settled_attempts(problem, path, self._energy))
-            self._add_extremal(problem, path, attempts)
+    def _retry(self, last: Sequence[Verdict]) -> None:
+        """Retry paths at which Newton's method stalled: all until one is certified, then the cheapest one."""
+        for verdict in sorted(filter(self._is_retried, last), key=lambda verdict: verdict.cost):
+            if not self.certified:
+                self._add_extremal(verdict.problem, verdict.path, self._finer(verdict.problem, verdict.path))
+        best = min(filter(self._is_retried, self.verdicts), key=lambda verdict: verdict.cost, default=None)
+        if self.certified and best is not None and not self._is_expensive(best.path, -DIRECT_ERROR):
+            self._lowest_settled = best.cost
+            settled = settled_attempts(best.problem, best.path, self._energy)
+            self._add_extremal(best.problem, best.path, itertools.chain(self._finer(best.problem, best.path), settled))
+
+    def _is_retried(self, verdict: Verdict) -> bool:
+        is_new = verdict.outcome is Outcome.STALLED and verdict.cost < self._lowest_settled
+        return is_new and self._clearance(verdict.path) > 0.0
 
     def _finer(self, problem: OptimalControlProblem, path: DirectPath) -> Iterator[tuple[int, DirectPath]]:
         """Yield numbers of segments of multiple shooting, each with the path on shorter intervals."""
