@@ -51,6 +51,20 @@ def load(folder: Path) -> tuple[d3rlpy.dataset.MDPDataset, dict[str, Any], list[
     return transitions, dataset.storage.metadata, [float(np.sum(episode.rewards)) for episode in episodes]
 
 
+def fit(transitions: d3rlpy.dataset.MDPDataset, algorithm: str, steps: int) -> Any:
+    """Return a d3rlpy algorithm that has learned from transitions in a number of gradient steps."""
+    learner = ALGORITHMS[algorithm].create(device="cpu:0")
+    learner.fit(
+        transitions,
+        n_steps=steps,
+        n_steps_per_epoch=min(steps, 5000),
+        show_progress=False,
+        save_interval=10**9,  # epochs: save nothing
+        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+    )
+    return learner
+
+
 def main(
     family: str = "open",
     policies: tuple[str, ...] = ("expert",),
@@ -65,8 +79,8 @@ def main(
 
     Args:
         family: Family of the scenarios: open, clutter, polygons, rooms or slalom.
-        policies: Policies that are recorded in turn: expert, random, go-to-goal, dwa, mppi, lattice, an included policy
-            or a training run. They must observe the default, 32 lidar beams.
+        policies: Policies that are recorded in turn: expert, random, go-to-goal, dwa, mppi, lattice, freespace, an
+            included policy or a training run. They must observe the default, 32 lidar beams.
         episodes: Number of recorded episodes.
         noise: Standard deviation of the noise on the recorded actions, which are in [-1, 1].
         algorithm: Algorithm that learns.
@@ -78,16 +92,7 @@ def main(
     if not data.exists():
         record(policies, family, episodes, data, noise=noise)
     transitions, metadata, returns = load(data)
-    learner = ALGORITHMS[algorithm].create(device="cpu:0")
-    learner.fit(
-        transitions,
-        n_steps=steps,
-        n_steps_per_epoch=min(steps, 5000),
-        show_progress=False,
-        save_interval=10**9,  # epochs: save nothing
-        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-    )
-    score = evaluate(OfflinePolicy(learner), family, count=test_scenarios)
+    score = evaluate(OfflinePolicy(fit(transitions, algorithm, steps)), family, count=test_scenarios)
     low, high = metadata["ref_min_score"], metadata["ref_max_score"]
     achieved = np.mean([episode.episode_return for episode in score])
     print(f"normalised return: data {(np.mean(returns) - low) / (high - low):.3f}, ", end="")

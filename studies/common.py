@@ -119,9 +119,9 @@ def is_finished(run: Path) -> bool:
     return bool(lines) and json.loads(lines[-1])["final"]
 
 
-def demonstrate(family: str, count: int, folder: Path, *, seed: int, tiny: bool) -> Path:
+def demonstrate(family: str, count: int, folder: Path, *, seed: int, tiny: bool, horizon: str = "fixed") -> Path:
     """Record demonstrations of the expert, unless they are complete, and return their directory."""
-    rollout(family, count, folder, seed=seed, workers=workers(), progress=not tiny)
+    rollout(family, count, folder, horizon=horizon, seed=seed, workers=workers(), progress=not tiny)
     return folder
 
 

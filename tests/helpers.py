@@ -4,6 +4,8 @@ import json
 import math
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,6 +15,7 @@ from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
+import pytest
 import sympy as sp
 from scipy.integrate import solve_ivp
 
@@ -27,6 +30,7 @@ from leapnav.training import CloningConfig, make_policy
 
 DATA = Path(__file__).parent / "data"
 ROOT = Path(__file__).parents[1]
+D3RLPY = ROOT / ".venv" / "examples"  # `make test-all` installs it there
 # All built-in robots and solvers.
 ROBOTS = tuple(name for name, kind in MODELS.items() if kind.__module__.startswith("leapnav."))
 SOLVERS = tuple(METHODS)
@@ -43,6 +47,22 @@ DISC_AND_TRIANGLE = Scenario(
         {"polygon": {"vertices": ((1.0, 3.0), (2.0, 3.4), (1.2, 4.2))}},
     ),
 )
+
+
+def run_with_d3rlpy(script: str, words: list[str], folder: Path) -> str:
+    """Run a script of the repository in a directory, and return what it prints; skip the test without d3rlpy.
+
+    It is a process of its own, because d3rlpy brings other versions of packages that the tests use.
+    """
+    if not D3RLPY.exists():
+        pytest.skip("d3rlpy is not installed; `make test-all` installs it")
+    path = os.pathsep.join(filter(None, [str(D3RLPY), os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, str(ROOT / script), *words]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=folder, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def best_known() -> list[tuple[Scenario, float]]:

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from leapnav.training.scoring.comparison import Comparison
 
 POLICIES = (
-    'Policies: "expert", a baseline ("random", "go-to-goal", "dwa", "mppi", "lattice"), an included policy (the name '
-    "of its family), the directory of a policy or of a run, or a model saved by Stable-Baselines3 (.zip). Runs that "
-    "differ only in their seed share a row, and so do policies with the same LABEL=."
+    'Policies: "expert", a baseline ("random", "go-to-goal", "dwa", "mppi", "lattice", "freespace"), an included '
+    "policy (the name of its family), the directory of a policy or of a run, or a model saved by Stable-Baselines3 "
+    "(.zip). Runs that differ only in their seed share a row, and so do policies with the same LABEL=."
 )
 
 

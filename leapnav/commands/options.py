@@ -26,6 +26,7 @@ PolicyName = (
         "dwa",
         "mppi",
         "lattice",
+        "freespace",
         "open",
         "clutter",
         "polygons",

@@ -26,22 +26,24 @@ ROWS = {
     "ppo": "PPO from scratch",
     "ppo-clone": "PPO from the clone",
 }
-FAMILIES = ("open", "clutter")
-NAMES = tuple(f"{family}-{method}" for family in FAMILIES for method in ROWS)
+TASKS = {"open": ("open", "fixed"), "clutter": ("clutter", "fixed"), "free-clutter": ("clutter", "free")}
+PARTS = {f"{task}-{method}": (task, method) for task in TASKS for method in ROWS}
+NAMES = tuple(PARTS)
 SEEDS, DEMONSTRATIONS, DEMONSTRATION_SEED = 3, 2000, 60_000
 
 
 def train_method(name: str, seed: int, runs: Path, *, tiny: bool) -> Path:
     """Train a method, or resume its run, and return the directory of the run."""
-    family, _, method = name.partition("-")
+    task, method = PARTS[name]
+    family, horizon = TASKS[task]
     given: dict[str, Any] = {}
     if method != "ppo":
-        count, folder = 4 if tiny else DEMONSTRATIONS, runs / f"{family}-demonstrations"
-        demonstrations = demonstrate(family, count, folder, seed=DEMONSTRATION_SEED, tiny=tiny)
+        count, folder = 4 if tiny else DEMONSTRATIONS, runs / f"{task}-demonstrations"
+        demonstrations = demonstrate(family, count, folder, seed=DEMONSTRATION_SEED, tiny=tiny, horizon=horizon)
         if method == "bc":
             given = {"demos": (demonstrations,)}
         else:
-            clone = train_method(f"{family}-bc", seed, runs, tiny=tiny)
+            clone = train_method(f"{task}-bc", seed, runs, tiny=tiny)
             given = {"policy": clone, "demos": (demonstrations,)}
             if method == "ppo-clone":
                 given = {"warm_start": (clone, demonstrations)}
@@ -50,8 +52,10 @@ def train_method(name: str, seed: int, runs: Path, *, tiny: bool) -> Path:
 
 def tables(results: Path) -> dict[str, str]:
     """Return the tables of the results, in Markdown."""
-    parts = {name: name.partition("-") for name in NAMES}
-    labels = {name: f"{family} | {ROWS[method]}" for name, (family, _, method) in parts.items()}
+    titles = {
+        task: family if horizon == "fixed" else f"{family}, free horizon" for task, (family, horizon) in TASKS.items()
+    }
+    labels = {name: f"{titles[task]} | {ROWS[method]}" for name, (task, method) in PARTS.items()}
     return dict(zip(TABLES, score_tables(results, "family | method", labels), strict=True))
 
 
@@ -61,7 +65,8 @@ def main() -> None:
     tiny, seeds = arguments.tiny, range(2 if arguments.tiny else SEEDS)
     for name in arguments.names:
         runs = [train_method(name, seed, arguments.runs / "methods", tiny=tiny) for seed in seeds]
-        bank = ScenarioBank.shipped(name.partition("-")[0], "test")
+        family, horizon = TASKS[PARTS[name][0]]
+        bank = ScenarioBank.shipped(family, "test", horizon=horizon)
         play(map(load, runs), [bank], arguments.results, name, count=2 if tiny else None, progress=not tiny)
     print("\n".join(tables(arguments.results).values()))
 

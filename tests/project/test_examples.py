@@ -1,15 +1,12 @@
 """The examples run as their users run them, with arguments that make them short; whether they learn is not tested."""
 
-import os
 import re
 import runpy
-import subprocess
 import sys
 
 import pytest
-from helpers import ROOT
+from helpers import ROOT, run_with_d3rlpy
 
-D3RLPY = ROOT / ".venv" / "examples"  # `make test` installs it there
 SCORE = r"success \d+\.\d %, collision \d+\.\d %, SOC \d\.\d+"
 # Arguments, and the last lines of the output.
 EXAMPLES = {
@@ -47,17 +44,5 @@ def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_example_with_d3rlpy_runs(tmp_path):
-    """In a process of its own: d3rlpy brings other versions of packages that the tests use."""
-    if not D3RLPY.exists():
-        pytest.skip("d3rlpy is not installed; `make test-all` installs it")
-    path = os.pathsep.join(filter(None, [str(D3RLPY), os.environ.get("PYTHONPATH")]))
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "offline_rl.py"), *words("offline_rl", tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    assert done.returncode == 0, done.stderr
-    assert re.search(rf"(^|\n){EXAMPLES['offline_rl'][1]}$", done.stdout), done.stdout
+    printed = run_with_d3rlpy("examples/offline_rl.py", words("offline_rl", tmp_path), tmp_path)
+    assert re.search(rf"(^|\n){EXAMPLES['offline_rl'][1]}$", printed), printed

@@ -4,9 +4,9 @@ import importlib.util
 import sys
 
 import pytest
-from helpers import ROOT
+from helpers import ROOT, run_with_d3rlpy
 
-STUDIES = sorted(path.parent.name for path in (ROOT / "studies").glob("*/run.py"))
+STUDIES = sorted({path.parent.name for path in (ROOT / "studies").glob("*/run.py")} - {"offline"})  # which needs d3rlpy
 # Words of a run with a tiny budget, of which a part may stand for all.
 WORDS = {
     "curricula": ["uniform"],
@@ -111,3 +111,14 @@ def test_a_study_gives_the_same_bytes_again(name, run):
     words = ALL_WORDS.get(name, [])
     found = run(name, words)
     assert found and run(name, words, 1) == found
+
+
+@pytest.mark.slow
+def test_the_study_with_d3rlpy_gives_the_same_bytes_again(tmp_path):
+    found = []
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        assert "| expert | BC |" in run_with_d3rlpy("studies/offline/run.py", ["--tiny", "--out", "results"], folder)
+        found.append({path.name: path.read_bytes() for path in folder.glob("results/*.gz")})
+    assert len(found[0]) == 9 and found[0] == found[1]

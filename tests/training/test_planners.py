@@ -1,4 +1,4 @@
-"""The planners among the baselines: dynamic window, path integral, lattice."""
+"""The planners among the baselines: dynamic window, path integral, lattice, freespace assumption."""
 
 import gymnasium as gym
 import numpy as np
@@ -7,8 +7,9 @@ from gymnasium.wrappers import RescaleAction
 
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, Obstacle, Scenario, ScenarioBank
 from leapnav.envs.shapes import Circle
+from leapnav.experts import find_optimum
 from leapnav.training import PlannerPolicy, PolicyFactory, evaluate
-from leapnav.training.policies.planners import PLANNERS, Geodesics, arcs
+from leapnav.training.policies.planners import PLANNERS, FreespaceAssumption, Geodesics, arcs
 
 POLICIES = {name: PolicyFactory(lambda env, name=name: PlannerPolicy(env, name)) for name in PLANNERS}
 
@@ -42,7 +43,7 @@ def test_a_planner_drives_single_vector_and_wrapped_environments_alike(name):
         scaled.step(twice)
 
 
-@pytest.mark.parametrize("name", ["dwa", "mppi"])
+@pytest.mark.parametrize("name", ["dwa", "mppi", "freespace"])
 def test_a_disc_that_drives_towards_the_robot_is_avoided(name):
     path = {"times": [0, 5], "points": [[7.0, 2.2], [2.0, 2.2]]}
     disc = Obstacle(circle=Circle(center=(7.0, 2.2), radius=0.5), path=path)
@@ -53,6 +54,18 @@ def test_a_disc_that_drives_towards_the_robot_is_avoided(name):
     while not done:
         _, _, done, _, info = env.step(policy.predict(None)[0])
     assert info["is_success"] and not info["collision"] and info["clearance"] > 0.0
+
+
+def test_an_obstacle_changes_the_plan_when_lidar_meets_it():
+    first, behind = (Obstacle(circle=Circle(center=(x, 2.6), radius=r)) for x, r in ((3.0, 0.6), (5.0, 0.5)))
+    scenario = Scenario(arena=(0, 0, 8, 5), start=(1, 2.5, 0), goal=(7, 2.5, 0), horizon=8, obstacles=(first, behind))
+    driver = FreespaceAssumption(scenario, 0.05, np.random.default_rng(0))
+    only_first = find_optimum(scenario.model_copy(update={"obstacles": (first,)}))
+    control = driver.control(np.array(scenario.start), 0.0)
+    assert control == pytest.approx(only_first.evaluate(0.025)[1], abs=1e-3)
+    pose = np.array([2.6, 1.5, 0.3])  # beside the first obstacle, which no longer hides the other one
+    both = find_optimum(scenario.from_state(pose, 2.0))
+    assert driver.control(pose, 2.0) == pytest.approx(both.evaluate(0.025)[1], abs=1e-3)
 
 
 def test_a_goal_that_cannot_be_reached_is_no_error():

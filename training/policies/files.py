@@ -33,7 +33,7 @@ from leapnav.training.policies.actors import policy_of
 from leapnav.training.policies.architecture import KINDS, Architecture, is_actor_weight
 from leapnav.training.policies.zips import is_zip, load_zip
 
-BASELINES = ("expert", "random", "go-to-goal", "dwa", "mppi", "lattice")  # policies without a file
+BASELINES = ("expert", "random", "go-to-goal", "dwa", "mppi", "lattice", "freespace")  # policies without a file
 FORMAT = 6  # version of policy.json
 SHIPPED = Path(__file__).parent / "pretrained"
 # Settings of the environment that determine the observation and the meaning of an action.

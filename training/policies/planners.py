@@ -1,13 +1,14 @@
-"""Planners as baselines: dynamic window approach, model predictive path integral control, and a lattice planner.
+"""Planners as baselines: dynamic window, model predictive path integral, lattice, and the freespace assumption.
 
-They drive the unicycle and know the map: scenario and pose are read from the environment, as by `ExpertPolicy`. The
-first two also know the motions of obstacles. Their constants were chosen on the training banks, see
+They drive the unicycle; scenario and state are read from the environment, as by `ExpertPolicy`. All but the last know
+the map, and the first two also the motions of obstacles. Their constants were chosen on the training banks, see
 `studies/planners`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -17,9 +18,14 @@ from scipy.ndimage import map_coordinates
 from leapnav.envs.field.clearance import footprint_clearances
 from leapnav.envs.field.proximity import footprint_proximities
 from leapnav.envs.geodesics import MAP_ENTRIES, geodesic_map, map_header_of
+from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import FULL_CIRCLE
+from leapnav.envs.simulation.sensing import scan
 from leapnav.envs.unwrapping import action_scale, situations, unwrap
 from leapnav.envs.utils.validation import check_choice
+from leapnav.experts.acting.feedback import Feedback
+from leapnav.experts.optimum import find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
 
@@ -38,7 +44,8 @@ class PlannerPolicy:
     Args:
         env: the environment that the actions are for: `NavigateEnv` or `NavigateVectorEnv`, wrapped or not, or a
             Stable-Baselines3 `VecEnv` of them.
-        planner: "dwa" (`DynamicWindow`), "mppi" (`PathIntegral`) or "lattice" (`LatticeTracking`).
+        planner: "dwa" (`DynamicWindow`), "mppi" (`PathIntegral`), "lattice" (`LatticeTracking`) or "freespace"
+            (`FreespaceAssumption`).
         seed: random seed of "mppi".
 
     Raises:
@@ -316,4 +323,74 @@ class LatticeTracking:
         return np.array([speed * math.cos(turn) + k_x * ahead, rate + speed * k_y * left + gain * math.sin(turn)])
 
 
-PLANNERS: dict[str, type[Any]] = {"dwa": DynamicWindow, "mppi": PathIntegral, "lattice": LatticeTracking}
+class FreespaceAssumption:
+    """The expert with the obstacles that lidar has met so far; elsewhere it assumes free space.
+
+    S. Koenig and Y. Smirnov, "Sensor-based planning with the freespace assumption" (ICRA 1997), with the optimum
+    instead of the shortest path. An obstacle is known as a whole, with its motion, from the moment at which a beam
+    meets it; the optimum from the current state is then searched again. While there is none, the robot stands still.
+
+    Args:
+        scenario: the scenario.
+        period: control period (s).
+        rng: unused.
+
+    """
+
+    BEAMS, RANGE = 128, 10.0  # of the lidar, as of the included policies with lidar alone; the range in m
+
+    def __init__(self, scenario: Scenario, period: float, rng: np.random.Generator) -> None:
+        self._scenario, self._period = scenario, period
+        angles = FULL_CIRCLE / self.BEAMS * np.arange(self.BEAMS)
+        self._beams, self._scratch = np.stack([np.cos(angles), np.sin(angles)]), np.empty((3, 2 * self.BEAMS))
+        self._empty = self._with_obstacles(())
+        self._unseen = {i: self._with_obstacles((i,)) for i in range(len(scenario.obstacles))}
+        self._plan: tuple[float, Feedback] | None = None  # the time (s) at which it begins, and the feedback
+
+    def control(self, pose: np.ndarray, time: float) -> np.ndarray:
+        """Return the control in the middle of the period; zero while no optimum is known."""
+        seen = self._seen(pose, time)
+        for i in seen:
+            del self._unseen[i]
+        if seen or time == 0.0:
+            self._plan = self._planned(pose, time)
+        if self._plan is None:
+            return np.zeros(2)
+        start, feedback = self._plan
+        feedback.update(pose, time - start)
+        return feedback.control(time - start + 0.5 * min(self._period, self._scenario.episode_limit - time))
+
+    def _with_obstacles(self, numbers: Iterable[int]) -> Scenario:
+        """Return the scenario with some of its obstacles."""
+        return self._scenario.model_copy(update={"obstacles": tuple(self._scenario.obstacles[i] for i in numbers)})
+
+    def _seen(self, pose: np.ndarray, time: float) -> list[int]:
+        """Return the numbers of the obstacles that a beam meets for the first time."""
+        if not self._unseen:
+            return []
+        ranges, without = self._ranges(self._scenario, pose, time), self._ranges(self._empty, pose, time)
+        alone = {i: self._ranges(scenario, pose, time) for i, scenario in self._unseen.items()}
+        return [i for i, found in alone.items() if ((found <= ranges) & (found < without)).any()]
+
+    def _ranges(self, scenario: Scenario, pose: np.ndarray, time: float) -> np.ndarray:
+        x, y, heading = pose[:3]
+        scan(x, y, heading, time, scenario.field, (self.RANGE, FULL_CIRCLE), self._beams, self._scratch)
+        return self._scratch[2, : self.BEAMS].copy()
+
+    def _planned(self, pose: np.ndarray, time: float) -> tuple[float, Feedback] | None:
+        """Return a plan from a pose among the obstacles seen so far."""
+        seen = self._with_obstacles(i for i in range(len(self._scenario.obstacles)) if i not in self._unseen)
+        try:
+            rest = seen.from_state(pose, time)
+        except ScenarioError:  # in contact
+            return None
+        optimum = find_optimum(rest, "medium")
+        return (time, Feedback(rest, optimum)) if optimum.success else None
+
+
+PLANNERS: dict[str, type[Any]] = {
+    "dwa": DynamicWindow,
+    "mppi": PathIntegral,
+    "lattice": LatticeTracking,
+    "freespace": FreespaceAssumption,
+}

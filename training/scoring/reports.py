@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import IO, Any
 
 import numpy as np
@@ -196,12 +195,14 @@ def scores_to_dict(comparison: Comparison) -> dict[str, Any]:
                 "family": bank.family,
                 "file": bank.path.name,
                 "identity": bank_identity(bank),
-                "scores": [asdict(row) for row in comparison.of(bank).scores()],
+                "scores": [row.to_dict() for row in comparison.of(bank).scores()],
             }
             for bank in comparison.banks
         ],
-        "scores": [asdict(row) for row in comparison.scores()],
-        "families": {family: [asdict(row) for row in comparison.of(family).scores()] for family in comparison.families},
+        "scores": [row.to_dict() for row in comparison.scores()],
+        "families": {
+            family: [row.to_dict() for row in comparison.of(family).scores()] for family in comparison.families
+        },
         "episodes": {
             name: [[episode.to_dict() for episode in run] for run in runs] for name, runs in comparison.runs.items()
         },

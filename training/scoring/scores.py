@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import norm, t, trim_mean
@@ -77,51 +78,127 @@ class Bracket:
     episodes: int
 
 
-@dataclass(frozen=True)
 class Score:
-    """The statistics of a policy: one row of the table.
+    """The statistics of a policy: one row of the table. Each is computed when it is first read.
+
+    Args:
+        policy: name of the row.
+        evaluations: the evaluation of each run, of the same scenarios.
+        seed: random seed of the bootstrap of each statistic.
 
     Attributes:
         policy: name of the row.
         runs: number of trained policies (seeds) in the row.
         episodes: number of episodes of each run.
-        success, collision: success and collision rates.
-        soc: mean success weighted by optimal cost.
-        spl, sct: mean success weighted by path length and by completion time, see `Episode`; NaN if not all scenarios
-            have the shortest length and the minimum time.
-        soc_iqm: interquartile mean of the success weighted by optimal cost, over runs and scenarios.
-        regret: median regret of the successful episodes.
-        reached_soc, reached_regret: both for the pose reached, see `Episode.reached_soc`, over the episodes for which
-            they are known.
-        unknown: number of successful episodes of all runs for which no optimum for the pose reached was found.
-        clearance: median over the episodes of the minimum clearance (m).
-        mean_return: mean return.
-        milliseconds: median computation time of one action (ms), mean over the runs.
-        true_regret: limits of the median of J / J_0 - 1, with J_0 the true optimal cost, see `Episode.true_regret`.
 
     """
 
-    policy: str
-    runs: int
-    episodes: int
-    success: Interval
-    collision: Interval
-    soc: Interval
-    spl: Interval
-    sct: Interval
-    soc_iqm: Interval
-    regret: Interval
-    reached_soc: Interval
-    reached_regret: Interval
-    unknown: int
-    clearance: Interval
-    mean_return: Interval
-    milliseconds: float
-    true_regret: Bracket
+    STATISTICS = (
+        *("success", "collision", "soc", "spl", "sct", "soc_iqm", "regret", "reached_soc", "reached_regret"),
+        *("unknown", "clearance", "mean_return", "milliseconds", "true_regret"),
+    )
+
+    def __init__(self, policy: str, evaluations: Sequence[Evaluation], seed: int) -> None:
+        self.policy, self.runs, self.episodes = policy, len(evaluations), len(evaluations[0])
+        self._evaluations, self._seed = evaluations, seed
+        self._banks = np.array([episode.bank for episode in evaluations[0]])
+
+    @cached_property
+    def success(self) -> Interval:
+        """Success rate."""
+        return _rate(self._values("success"), self._banks)
+
+    @cached_property
+    def collision(self) -> Interval:
+        """Collision rate."""
+        return _rate(self._values("collision"), self._banks)
+
+    @cached_property
+    def soc(self) -> Interval:
+        """Mean success weighted by optimal cost."""
+        return self._weighted("soc")
+
+    @cached_property
+    def spl(self) -> Interval:
+        """Mean success weighted by path length, see `Episode`; NaN if not all scenarios have the shortest length."""
+        return self._weighted("spl")
+
+    @cached_property
+    def sct(self) -> Interval:
+        """Mean success weighted by completion time, see `Episode`; NaN if not all scenarios have the minimum time."""
+        return self._weighted("sct")
+
+    @cached_property
+    def soc_iqm(self) -> Interval:
+        """Interquartile mean of the success weighted by optimal cost, over runs and scenarios."""
+        return _within_unit(self._interval("soc", _interquartile_mean))
+
+    @cached_property
+    def regret(self) -> Interval:
+        """Median regret of the successful episodes."""
+        return self._interval("regret", _median)
+
+    @cached_property
+    def reached_soc(self) -> Interval:
+        """SOC for the pose reached, see `Episode.reached_soc`, over the episodes for which it is known."""
+        return self._weighted("reached_soc", partly=True)
+
+    @cached_property
+    def reached_regret(self) -> Interval:
+        """Median regret for the pose reached, over the successful episodes for which it is known."""
+        return self._interval("reached_regret", _median)
+
+    @cached_property
+    def unknown(self) -> int:
+        """Number of successful episodes of all runs for which no optimum for the pose reached was found."""
+        return sum(
+            e.success and math.isnan(e.reached_reference) for evaluation in self._evaluations for e in evaluation
+        )
+
+    @cached_property
+    def clearance(self) -> Interval:
+        """Median over the episodes of the minimum clearance (m)."""
+        return self._interval("clearance", _median)
+
+    @cached_property
+    def mean_return(self) -> Interval:
+        """Mean return."""
+        return self._interval("episode_return", _mean)
+
+    @cached_property
+    def milliseconds(self) -> float:
+        """Median computation time of one action (ms), mean over the runs."""
+        return float(np.mean([evaluation.milliseconds for evaluation in self._evaluations]))
+
+    @cached_property
+    def true_regret(self) -> Bracket:
+        """Limits of the median of J / J_0 - 1, with J_0 the true optimal cost, see `Episode.true_regret`."""
+        return _bracket(self._evaluations)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to dictionaries, lists and numbers, with all statistics."""
+        values = {name: getattr(self, name) for name in ("policy", "runs", "episodes", *self.STATISTICS)}
+        return {name: asdict(one) if isinstance(one, (Interval, Bracket)) else one for name, one in values.items()}
+
+    def _values(self, attribute: str) -> np.ndarray:
+        """Return an attribute of all episodes (runs, scenarios)."""
+        return np.array([[getattr(e, attribute) for e in evaluation] for evaluation in self._evaluations], dtype=float)
+
+    def _interval(self, attribute: str, statistic: Statistic) -> Interval:
+        return _interval(self._values(attribute), self._banks, statistic, np.random.default_rng(self._seed))
+
+    def _weighted(self, attribute: str, *, partly: bool = False) -> Interval:
+        """Return the mean of an attribute from 0 to 1; NaN if it is unknown anywhere, unless it may be `partly`."""
+        values = self._values(attribute)
+        if np.isnan(values).any() and not partly:
+            return Interval(math.nan, math.nan, math.nan, (math.nan,) * len(values))
+        if set(values.flat) in ({0.0}, {1.0}):
+            return _rate(values, self._banks)
+        return _within_unit(self._interval(attribute, _mean))
 
 
 def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> Score:
-    """Compute the statistics of a policy, or of several runs of one method on the same scenarios.
+    """Return the statistics of a policy, or of several runs of one method on the same scenarios.
 
     Intervals over the scenarios contain the variance between scenarios only, those over runs and scenarios also that
     between runs, see `Interval`:
@@ -146,42 +223,7 @@ def score(name: str, runs: Evaluation | Sequence[Evaluation], seed: int = 0) -> 
     scenarios = [[(e.bank, e.index, e.scenario) for e in evaluation] for evaluation in evaluations]
     if any(other != scenarios[0] for other in scenarios):
         raise ValueError(f"{name}: expected runs with the same scenarios, got different ones")
-    banks = np.array([bank for bank, _, _ in scenarios[0]])
-    rng = np.random.default_rng(seed)
-
-    def values_of(attribute: Callable[..., float]) -> np.ndarray:
-        return np.array([[attribute(episode) for episode in evaluation] for evaluation in evaluations], dtype=float)
-
-    def interval(attribute: Callable[..., float], statistic: Statistic = _mean) -> Interval:
-        return _interval(values_of(attribute), banks, statistic, rng)
-
-    def weighted(attribute: Callable[..., float], *, partly: bool = False) -> Interval:
-        values = values_of(attribute)
-        if np.isnan(values).any() and not partly:
-            return Interval(math.nan, math.nan, math.nan, (math.nan,) * len(values))
-        if set(values.flat) in ({0.0}, {1.0}):
-            return _rate(values, banks)
-        return _within_unit(_interval(values, banks, _mean, rng))
-
-    return Score(
-        policy=name,
-        runs=len(evaluations),
-        episodes=len(scenarios[0]),
-        success=_rate(values_of(lambda e: e.success), banks),
-        collision=_rate(values_of(lambda e: e.collision), banks),
-        soc=weighted(lambda e: e.soc),
-        soc_iqm=_within_unit(interval(lambda e: e.soc, _interquartile_mean)),
-        regret=interval(lambda e: e.regret, _median),
-        reached_soc=weighted(lambda e: e.reached_soc, partly=True),
-        reached_regret=interval(lambda e: e.reached_regret, _median),
-        unknown=sum(e.success and math.isnan(e.reached_reference) for evaluation in evaluations for e in evaluation),
-        clearance=interval(lambda e: e.clearance, _median),
-        mean_return=interval(lambda e: e.episode_return),
-        milliseconds=float(np.mean([evaluation.milliseconds for evaluation in evaluations])),
-        true_regret=_bracket(evaluations),
-        spl=weighted(lambda e: e.spl),
-        sct=weighted(lambda e: e.sct),
-    )
+    return Score(name, evaluations, seed)
 
 
 def _bracket(evaluations: Sequence[Evaluation]) -> Bracket:
@@ -356,11 +398,9 @@ def _statistics(values: np.ndarray, draw: Callable[[int], np.ndarray], statistic
 
 def _other_scenarios(values: np.ndarray, banks: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return resamples (count, runs, scenarios) with scenarios drawn within their banks."""
-    columns = np.empty((count, len(banks)), dtype=int)
-    for bank in np.unique(banks):
-        members = np.flatnonzero(banks == bank)
-        columns[:, members] = rng.choice(members, (count, len(members)))
-    return np.moveaxis(values[:, columns], 0, 1)
+    parts = [values[:, banks == bank] for bank in np.unique(banks)]
+    drawn = [rng.choice(part, (count, part.shape[1]), axis=1) for part in parts]
+    return np.moveaxis(np.concatenate(drawn, axis=2), 0, 1)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
