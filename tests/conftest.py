@@ -15,6 +15,10 @@ from leapnav.envs.shapes.base import KINDS
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
 sys.path.append(str(Path(__file__).parent.parent / "examples"))  # for the robot of `wagon_robot.py`
 
+# The default number of processes: one, because starting others took a tenth of the time of the suite. The tests of
+# several processes ask for them.
+os.cpu_count = lambda: 1
+
 # The default profile repeats the same examples; HYPOTHESIS_PROFILE=long generates many new ones.
 settings.register_profile("default", max_examples=40, deadline=None, derandomize=True)
 settings.register_profile("long", max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
@@ -49,7 +53,7 @@ def demonstrated(tmp_path_factory):
     from leapnav.experts.data.rollouts import rollout
 
     def make(out):
-        rollout("open", 40, out, seed=300, recoveries=1, workers=2, progress=False)
+        rollout("open", 40, out, seed=300, recoveries=1, progress=False)
 
     return shared_directory(tmp_path_factory, "demonstrated", make)
 

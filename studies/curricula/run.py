@@ -105,9 +105,10 @@ def play_levels(model: PPO, venv: Any, indices: np.ndarray, penalty: float) -> d
     return {**{name: np.array(column) for name, column in rows.items()}, **ends}
 
 
-def score_levels(model: PPO, config: PPOConfig, bank: ScenarioBank) -> dict[str, np.ndarray]:
+def score_levels(model: PPO, config: PPOConfig, bank: ScenarioBank, n_episodes: int) -> dict[str, np.ndarray]:
     """Return the scores, the failure rate, the regret and the regret of the successes, (N,), of the levels of a bank.
 
+    The scores are those of `n_episodes` episodes of each level, the others of as many further ones.
     The regret is -J* minus the mean return of the episodes; that of the successes is NaN without any.
     """
     count = min(N_ROBOTS, len(bank))
@@ -116,8 +117,8 @@ def score_levels(model: PPO, config: PPOConfig, bank: ScenarioBank) -> dict[str,
     th.manual_seed(config.seed)
     for first in range(0, len(bank), count):
         indices = np.arange(first, first + count)
-        episodes = [play_levels(model, venv, indices, config.penalty) for _ in range(2 * EPISODES)]
-        found = _scores(episodes[:EPISODES], config.gae_lambda) | _targets(episodes[EPISODES:], bank.costs[indices])
+        episodes = [play_levels(model, venv, indices, config.penalty) for _ in range(2 * n_episodes)]
+        found = _scores(episodes[:n_episodes], config.gae_lambda) | _targets(episodes[n_episodes:], bank.costs[indices])
         for name, column in found.items():
             columns.setdefault(name, []).append(column)
     venv.close()
@@ -265,7 +266,7 @@ def main() -> None:
                 scores = results / f"scores-{seed}-{stage}.npz"
                 if not scores.exists():
                     model, config = PPO.load(stages / f"stage-{stage}.zip", device="cpu"), read_config(run)[1]
-                    np.savez_compressed(scores, **score_levels(model, config, bank))
+                    np.savez_compressed(scores, **score_levels(model, config, bank, 1 if tiny else EPISODES))
         (results / f"{name}-curves.json").write_text(json.dumps([curve(run) for run in found]), encoding="utf-8")
         test = ScenarioBank.shipped(FAMILY, "test")
         play(map(load, found), [test], results, name, count=2 if tiny else None, progress=not tiny)

@@ -166,7 +166,7 @@ def test_included_banks_hold_certified_optima(family):
 
 
 def test_a_bank_is_built_and_read(tmp_path):
-    bank = build_bank("open", 3, tmp_path / "free.bank", robot="car", horizon="free", workers=2, progress=False)
+    bank = build_bank("open", 3, tmp_path / "free.bank", robot="car", horizon="free", progress=False)
     assert bank.horizon == "free" and bank[0].name.startswith("car-free-open-0-")
     assert bank.robot.model == "car"
     with pytest.raises(ValueError, match="with horizon 'free' instead of 'fixed'"):

@@ -12,7 +12,7 @@ from leapnav.experts.data.rollouts import rollout
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("demonstrations") / "clutter"
-    summary = rollout("clutter", 4, out, seed=50, recoveries=3, workers=2, progress=False)
+    summary = rollout("clutter", 4, out, seed=50, recoveries=3, progress=False)
     assert summary.demonstrations >= 4 + 6
     assert summary.failed_replays == 0
     return out

@@ -274,7 +274,7 @@ def test_the_dataset_has_reference_scores_seeds_and_costs(whole, monkeypatch):
 
 
 def test_with_noise_the_expert_s_own_actions_are_recorded(tmp_path):
-    rollout("clutter", 3, tmp_path, noise=0.2, workers=2, progress=False)
+    rollout("clutter", 3, tmp_path, noise=0.2, progress=False)
     episodes = open_dataset(tmp_path).iterate_episodes()
     for demonstration, episode in zip(load_demonstrations(tmp_path), episodes, strict=True):
         assert np.array_equal(episode.actions, demonstration.executed)  # what learners of transitions need

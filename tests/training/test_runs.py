@@ -41,7 +41,7 @@ COMMON = {"family": "open", "hidden": (16, 16), "observation": "lidar", "lidar_b
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     out = tmp_path_factory.mktemp("demos") / "open"
-    rollout("open", 12, out, seed=700, workers=2, progress=False)
+    rollout("open", 12, out, seed=700, progress=False)
     return out
 
 
@@ -294,7 +294,7 @@ def test_an_interrupted_clone_keeps_its_demonstrations(tmp_path, monkeypatch):
 
 def test_dagger_is_resumed_round_by_round_and_extended(demos, tmp_path, monkeypatch, capsys):
     def config(out, **changes):
-        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, max_episodes=6, lead=0.5)}
+        settings = {"n_envs": 2, "cloning": QUICK, "dagger": DAggerConfig(rounds=2, max_episodes=3, lead=0.5)}
         return DAggerRunConfig(out=out, demos=(demos,), **{**COMMON, **settings, **changes})
 
     train_dagger(config(tmp_path / "straight"), progress=False)

@@ -27,7 +27,7 @@ CLONING = CloningConfig(epochs=4, batch_size=256)
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("demos") / "open"
-    rollout("open", 60, out, seed=500, workers=2, progress=False)
+    rollout("open", 60, out, seed=500, progress=False)
     return Dataset.of(out)
 
 
