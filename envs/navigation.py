@@ -199,7 +199,7 @@ class NavigateEnv(WithSpec, gym.Env[Any, np.ndarray]):  # type: ignore[misc] (`s
     | `previous_action` | False | whether the observation contains the last action |
     | `map_obstacles`, `map_vertices` | 8, 8 | number of discs, capsules and polygons in the map, and of vertices of each; more vertices are an error |
     | `render_mode` | None | `"rgb_array"` or `"human"` |
-    | `show_optimum` | False | whether frames contain the optimum of a scenario of a bank, and its cost; not if they are observations |
+    | `show_optimum` | False | whether frames contain the optimum of a scenario of a bank, and its cost; leave it off where frames are observed |
 
     ## Errors
     `ValueError` for an invalid argument; the message states its name and value. `ScenarioError`, a `ValueError`, for an

@@ -272,6 +272,11 @@ class ScenarioBank(Sequence[Scenario]):
         check_choice("split", split, SPLITS)
         check_choice("obstacles", obstacles, OBSTACLE_KINDS)
         known = cls.shipped_families(robot, horizon, obstacles, split)
+        if not known:
+            raise ValueError(
+                f"robot: expected one with included banks (horizon {horizon!r}, obstacles {obstacles!r}), got "
+                f"{robot!r}; build a bank of its scenarios with leapnav bank build, and pass it as bank"
+            )
         if family not in known:
             raise ValueError(
                 f"family: expected one of {', '.join(known)}, of which banks are included, got {family!r}; build a "

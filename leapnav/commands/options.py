@@ -70,7 +70,8 @@ class FamilyTaskOptions:
     """Options of commands that make scenarios of a family, which may be the file of a bank."""
 
     robot: Robot | None = None
-    """Model of the robot; by default that of the scenarios of a file, otherwise the unicycle."""
+    """Model of the robot, or JSON of one with other parameters; by default that of the scenarios of a file, otherwise
+    the unicycle."""
     horizon: Horizon | None = None
     """Fixed or free horizon; by default that of the scenarios of a file, otherwise fixed."""
     obstacles: Obstacles | None = None

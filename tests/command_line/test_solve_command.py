@@ -3,9 +3,11 @@
 import json
 
 import pytest
-from helpers import SOLVERS, best_known, failing, scenario_fields
+from helpers import SOLVERS, best_known, failing, let_newton_stall, scenario_fields
 
 from leapnav.cli import main
+from leapnav.envs import sample_scenario
+from leapnav.experts import find_optimum
 
 
 @pytest.fixture
@@ -81,6 +83,16 @@ def test_a_method_that_fails_advises_and_the_cheapest_success_is_drawn(tmp_path,
     assert extremal.success
     assert extremal.cost == min(solutions[method]["cost"] for method in METHODS - failed)
     assert extremal.cost == pytest.approx(cost, rel=1e-4)
+
+
+def test_a_cheaper_solution_without_a_certificate_is_printed_first_and_is_exit_code_1(tmp_path, capsys, monkeypatch):
+    scenario, path = sample_scenario("clutter", 0), tmp_path / "scenario.json"
+    scenario.to_json(path)
+    best = find_optimum(scenario)
+    let_newton_stall(monkeypatch, best.cost)
+    assert main(["solve", str(path)]) == 1
+    doubt, solution, *_ = capsys.readouterr().out.splitlines()
+    assert f"a cheaper solution is not certified: J = {best.cost:.3f}"[:-2] in doubt and "SUCCESS" in solution
 
 
 @pytest.mark.parametrize("method", ["optimum", "all"])

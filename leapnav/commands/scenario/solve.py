@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Solve:
     """Find the optimum of a scenario, solve it with one method, or compare the methods.
 
-    Exit code 0: certified; 1: no certified solution; 2: invalid input.
+    Exit code 0: certified; 1: no certified solution, or a cheaper one that is not certified; 2: invalid input.
     """
 
     scenario: tyro.conf.Positional[Path]
@@ -50,6 +50,9 @@ class Solve:
 
         assert self.method != "all"
         extremal = find_optimum(scenario) if self.method == "optimum" else solve(scenario, method=self.method)
+        doubts = extremal.doubts if isinstance(extremal, Optimum) else ()
+        for doubt in doubts:
+            print(f"{scenario.name}: a cheaper solution is not certified: J = {doubt.cost:.6g}: {doubt.status.value}")
         print(f"{scenario.name}: {extremal.status.name}: {extremal.status.value}")
         certificate = extremal.certificate
         if certificate is not None:
@@ -71,7 +74,7 @@ class Solve:
         if isinstance(extremal, Optimum) and extremal.success:
             _print_alternatives(extremal)
         self._write(scenario, extremal, extremal.to_dict())
-        return 0 if extremal.success else FAILED
+        return 0 if extremal.success and not doubts else FAILED
 
     @property
     def _is_animated(self) -> bool:
@@ -162,8 +165,6 @@ def _print_comparison(extremals: Mapping[str, Extremal], seconds: Mapping[str, f
 def _print_alternatives(optimum: Optimum) -> None:
     from leapnav.envs.utils.tables import print_table
 
-    for doubt in optimum.doubts:
-        print(f"  not certified      J = {doubt.cost:.6g} was also found: {doubt.status.value}")
     rows = []
     for extremal in (optimum, *optimum.alternatives):
         clearance = extremal.certificate.clearance if extremal.certificate is not None else None
