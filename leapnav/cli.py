@@ -144,7 +144,9 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenExecutor as error:  # a worker process has ended, for example because memory was short
         print(f"leapnav: {' '.join(str(error).split())}", file=sys.stderr)
         return FAILED
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise  # a kernel that is interrupted ends with a SystemError
         resumption = getattr(command, "resumption", None)
         print(f"leapnav: interrupted{f'; {resumption}' if resumption else ''}", file=sys.stderr)
         return INTERRUPTED

@@ -73,6 +73,21 @@ def test_an_interruption_says_how_to_resume(words, hint, tmp_path, monkeypatch, 
     assert line == f"leapnav: interrupted{f'; {hint}' if hint else ''}"
 
 
+def test_an_interrupted_kernel_is_an_interruption(tmp_path, monkeypatch, capsys):
+    """Its result with an exception set is a SystemError, whose cause is the interruption."""
+
+    def stopped(*_, **__):
+        raise SystemError("a kernel returned a result with an exception set") from cause
+
+    monkeypatch.setattr("leapnav.experts.data.rollouts.rollout", stopped)
+    cause = KeyboardInterrupt()
+    assert main(["rollout", "--out", str(tmp_path / "demos")]) == 130
+    assert "interrupted; the same command resumes" in capsys.readouterr().err
+    cause = None
+    with pytest.raises(SystemError):
+        main(["rollout", "--out", str(tmp_path / "demos")])
+
+
 def test_arguments_of_the_environment_are_json_or_text():
     assert parse_environment([]) is None
     found = parse_environment(["observation=map", "map_obstacles=3", "dict_observation=true"])
