@@ -11,7 +11,7 @@ from leapnav.training.scoring.policy_specs import load_policy_spec
 # that of whole test splits. One failure changes it by 0.025.
 SOC = {
     "all": 0.986,
-    "car-clutter": 0.967,
+    "car-clutter": 0.930,
     "clutter": 0.992,
     "clutter-lidar": 0.924,
     "crossing": 0.869,
