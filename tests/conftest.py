@@ -15,8 +15,8 @@ from leapnav.envs.shapes.base import KINDS
 sys.path.append(str(Path(__file__).parent))  # for `import helpers`
 sys.path.append(str(Path(__file__).parent.parent / "examples"))  # for the robot of `wagon_robot.py`
 
-# The default number of processes: one, because starting others took a tenth of the time of the suite. The tests of
-# several processes ask for them.
+# The default number of processes: one, because starting others took 29 % of the CPU time of three files of tests with
+# trainings and commands. The tests of several processes ask for them.
 os.cpu_count = lambda: 1
 
 # The default profile repeats the same examples; HYPOTHESIS_PROFILE=long generates many new ones.
