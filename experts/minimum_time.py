@@ -257,7 +257,7 @@ def _starts(problems: Sequence[OptimalControlProblem]) -> list[_Start]:
     """Return extremals from which the continuations start."""
     starts = _from_pieces(problems)
     if not starts or _has_state_cost(problems[0]):
-        for wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
+        for _, wound, path in islice(initial_paths(problems[0]), MAX_PATHS):
             extremal = solve(wound, "multiple_shooting", guess=path)
             starts += [_Start(extremal, 1)] if extremal.success else []
     return starts

@@ -168,8 +168,9 @@ def find_optimum(
 
     For a problem of another system there is no lattice. Local minima over piecewise constant controls are computed
     from the straight line and from random controls of a fixed seed, for each winding of the goal angles, and multiple
-    shooting continues from all that differ in cost. Of two mirror images only one is found. Give a scenario itself
-    rather than its problem, for which this search may find no more than a worse local optimum.
+    shooting continues from all that differ in cost, up to 20 times the lowest cost. Of two mirror images only one is
+    found. Give a scenario itself rather than its problem, for which this search may find no more than a worse local
+    optimum.
 
     With the proximity weight 0, obstacles cost nothing and must not be touched. The search then uses a small weight,
     and the best local optima are followed to the weight at which the proximity cost is negligible, see

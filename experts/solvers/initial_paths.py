@@ -21,7 +21,10 @@ from leapnav.experts.transcription.direct import DirectPath, optimise
 from leapnav.experts.transcription.discrete_problem import roll_out
 
 INTERVALS = 64
-MAX_STARTS = 16  # initial controls per winding of the goal angles
+# Initial controls per winding of the goal angles, and the common logarithms between which the relative amplitudes of
+# random ones are distributed. Of 10 seeds, 7 find the optimum of a bicycle that starts at rest, and 5 that of the
+# swing-up of a double pendulum; with 16 initial controls of one amplitude, none and 1.
+MAX_STARTS, AMPLITUDES = 48, (-2.0, 0.5)
 N_AGREEING = 6  # if this number of initial controls leads to one cost, the problem is assumed to have one minimum
 MAX_VIOLATION = 1e-2  # sum of the constraint violations of a path, relative to the largest state
 HARMONICS = 4  # of random initial controls
@@ -37,8 +40,8 @@ FIRST_HORIZON, MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE, HORIZON
 
 def initial_paths(
     problem: OptimalControlProblem, seeds: Iterable[int] = (0,)
-) -> Iterator[tuple[OptimalControlProblem, Trajectory]]:
-    """Yield nearly feasible paths with costates, in order of cost, each with the problem that has its winding.
+) -> Iterator[tuple[float, OptimalControlProblem, Trajectory]]:
+    """Yield costs of nearly feasible paths, in order, with the problem of their winding, and the paths with costates.
 
     Yields nothing if no path to the goal was found.
 
@@ -55,7 +58,7 @@ def initial_paths(
     for cost, variant, path in found:
         if last is None or cost > last + COST_TOLERANCE * (abs(last) + abs(cost)):
             last = cost
-            yield variant, path
+            yield cost, variant, path
 
 
 def first_barrier_weight(problem: OptimalControlProblem, seed: int = 0) -> float:
@@ -146,6 +149,7 @@ def local_minima(
         U = along.copy() if index == 0 else np.zeros_like(along)
         if index > 1:
             U = phases @ (rng.normal(size=(HARMONICS, m)) / (1.0 + np.arange(HARMONICS))[:, None]) * size
+            U *= 10.0 ** rng.uniform(*AMPLITUDES)
         path = _optimise(problem, _clip(problem, U))
         if path is None:
             continue

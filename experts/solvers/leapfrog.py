@@ -54,9 +54,11 @@ def _sweep_and_polish(iterate: FeasiblePath, options: SolverOptions) -> Extremal
     """Sweep until Newton's method converges to an extremal that is no more expensive than the path."""
     done = 0
     for sweeps in SWEEPS_BEFORE_NEWTON:
-        while done < sweeps:
+        gains = True
+        while gains and done < sweeps:
+            before = iterate.cost
             iterate.sweep(options.order == "red_black")
-            done += 1
+            gains, done = before - iterate.cost > MIN_GAIN * abs(before), done + 1
         times, nodes = iterate.times.copy(), iterate.nodes.copy()
         status, rows, evaluations = polish(iterate.problem, times, nodes, options.tol, options.max_iterations)
         iterate.evaluations += evaluations
@@ -68,6 +70,8 @@ def _sweep_and_polish(iterate: FeasiblePath, options: SolverOptions) -> Extremal
             is_saddle = extremal.status in (Status.CONJUGATE_POINT, Status.TIME_NOT_MINIMAL)
             if not is_saddle or sweeps == SWEEPS_BEFORE_NEWTON[-1]:
                 return extremal
+        if not gains and iterate.reduce() == 0:
+            break
     # Newton's method did not converge, so the problem is solved by sweeps alone.
     iterate.accuracy = LONG_ARC_ACCURACY
     return _sweep_and_reduce(iterate, options)

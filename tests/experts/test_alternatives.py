@@ -4,10 +4,20 @@ import itertools
 
 import numpy as np
 import pytest
+import sympy
 from helpers import known_problems, scenario_fields
 
 from leapnav.envs import Scenario
-from leapnav.experts import OptimalControlProblem, Status, find_optimum, plot_extremal, solve, unicycle
+from leapnav.experts import (
+    ControlAffineSystem,
+    OptimalControlProblem,
+    Status,
+    find_optimum,
+    plot_extremal,
+    solve,
+    unicycle,
+)
+from leapnav.experts.solve import METHODS
 
 KNOWN = {entry.name: entry for entry in known_problems()}
 
@@ -21,6 +31,22 @@ def test_the_swing_up_of_a_cart_pole_has_two_local_optima():
         [58.80796], rel=1e-5
     )  # IPOPT in 40 intervals
     assert all(other.success for other in optimum.alternatives)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_bicycle_at_rest_whose_heading_no_small_control_changes(method):
+    # At rest and with the wheel straight, the linearised system cannot turn, so most initial controls lead nowhere.
+    x, y, heading, speed, steer = sympy.symbols("x y heading speed steer")
+    bicycle = ControlAffineSystem(
+        state=(x, y, heading, speed, steer),
+        drift=(speed * sympy.cos(heading), speed * sympy.sin(heading), speed * sympy.tan(steer) / 2.5, 0, 0),
+        fields=((0, 0, 0, 1, 0), (0, 0, 0, 0, 1)),
+        angles=(heading,),
+    )
+    problem = OptimalControlProblem(bicycle, (0, 0, 0, 0, 0), (8, 3, 0.5, 0, 0), 6.0, (1, 1))
+    extremal = solve(problem, method)
+    assert extremal.success
+    assert extremal.cost == pytest.approx(2.140960196, rel=1e-8)
 
 
 def test_local_optima_are_distinct_and_in_order_of_cost():

@@ -164,6 +164,15 @@ def test_an_angle_is_reached_by_its_cheapest_winding(method):
     assert abs(sides[0] - sides[1]) > 1e-3
 
 
+def test_initial_paths_that_cost_more_than_the_best_extremal_are_not_solved(monkeypatch):
+    solver, calls = METHODS["multiple_shooting"], []
+    monkeypatch.setitem(METHODS, "multiple_shooting", lambda *given: calls.append(given) or solver(*given))
+    # The other windings cost at least four times as much.
+    problem = OptimalControlProblem(PENDULUM, (0, 0), (math.pi / 2, 0), 1.0, (1.0,))
+    assert solve(problem, "multiple_shooting").success
+    assert len(calls) == 1
+
+
 def test_the_robot_with_other_controls_or_with_inertia():
     # Speeds of the wheels are a linear change of the unicycle's controls: (left^2 + right^2) / 2 = v^2 + (track omega /
     # 2)^2, so with these weights it is the same problem.

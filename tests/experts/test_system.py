@@ -125,7 +125,7 @@ def test_the_compiled_flow_computes_what_was_declared():
         control = -np.array([z[9], z[10] / 2, z[11] / 3])
         expected = np.array(drift(*z[:6])) + np.concatenate([np.zeros(3), control / (1, 2, 3)])
         assert rates(problem, z)[:6] == pytest.approx(expected, abs=1e-12)
-    _, guess = next(initial_paths(problem))  # the same guess that each solve would compute again
+    *_, guess = next(initial_paths(problem))  # the same guess that each solve would compute again
     costs = [solve(problem, method=method, guess=guess).cost for method in METHODS]
     assert costs == pytest.approx([0.80069849692] * 4, rel=1e-9)
 
