@@ -51,7 +51,10 @@ def leapfrog(problem: OptimalControlProblem, path: Trajectory, options: SolverOp
 
 
 def _sweep_and_polish(iterate: FeasiblePath, options: SolverOptions) -> Extremal:
-    """Sweep until Newton's method converges to an extremal that is no more expensive than the path."""
+    """Sweep until Newton's method converges to an extremal that is no more expensive than the path.
+
+    Nodes are removed after a sweep that hardly reduces the cost, with Newton's method tried after each removal.
+    """
     done = 0
     for sweeps in SWEEPS_BEFORE_NEWTON:
         gains = True
