@@ -92,8 +92,9 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
         minima = local_minima(problem.with_horizon(horizon), starts=HORIZON_STARTS, seed=seed)
         minima = [(cost, path) for cost, path in minima if state_margin(problem.state_limits, path.states) > 0]
         if not minima:
-            if horizon < reachable:
-                too_short = horizon
+            if horizon > reachable:  # there are paths, but none was found
+                break
+            too_short = horizon
             horizon = math.sqrt(too_short * reachable) if reachable < math.inf else horizon / MIN_HORIZON_FACTOR
             continue
         reachable = horizon

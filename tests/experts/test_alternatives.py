@@ -49,6 +49,26 @@ def test_a_bicycle_at_rest_whose_heading_no_small_control_changes(method):
     assert extremal.cost == pytest.approx(2.140960196, rel=1e-8)
 
 
+def test_a_planar_quadrotor_with_a_free_horizon():
+    # Of the estimates of the horizon, the search finds paths for a short one and none for the longer one that follows.
+    x, y, angle, u, v, rate = sympy.symbols("x y angle u v rate")
+    quadrotor = ControlAffineSystem(
+        state=(x, y, angle, u, v, rate),
+        drift=(u, v, rate, 0, -9.81, 0),
+        fields=((0, 0, 0, -sympy.sin(angle), sympy.cos(angle), 0), (0, 0, 0, 0, 0, 1)),
+        angles=(angle,),
+    )
+    problem = OptimalControlProblem(quadrotor, (0,) * 6, (3, 1, 0, 0, 0, 0), None, (1, 1), time_weight=1.0)
+    extremal = solve(problem, "multiple_shooting")
+    assert extremal.success
+    # It is a minimum over the horizon.
+    for factor in (0.9, 1.1):
+        horizon = factor * extremal.horizon
+        other = solve(problem.with_horizon(horizon), "multiple_shooting", guess=extremal)
+        assert other.success
+        assert other.cost > extremal.cost
+
+
 def test_local_optima_are_distinct_and_in_order_of_cost():
     problem = OptimalControlProblem(unicycle(), (0.0, 0.0, 0.0), (1.0, 1.0, 0.5), 3.0, (1.0, 1.0))
     optimum = find_optimum(problem)
