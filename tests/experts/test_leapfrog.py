@@ -1,6 +1,8 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from helpers import best_known
+from helpers import best_known, known_problems
 
 from leapnav.envs import sample_scenario
 from leapnav.experts import Trajectory, find_optimum, solve
@@ -74,3 +76,13 @@ def test_a_hundred_scenarios_feasible_at_every_sweep_and_cheaper_with_each():
             assert extremal.cost <= sweeps[-1].cost + 1e-8
     # The others are in contact with an obstacle, or are saddles; find_optimum takes another path there.
     assert certified >= 95
+
+
+def test_nodes_are_removed_when_a_sweep_gains_nothing():
+    # The first path costs 10,000 times as much as the optimum, and some of its nodes cannot be moved.
+    (entry,) = (entry for entry in known_problems() if entry.name == "cart-pole-swing-up" and entry.method == "leapfrog")
+    extremal = solve(replace(entry.problem, control_bounds=None), "leapfrog")
+    assert extremal.success
+    phases = [row.phase for row in extremal.history]
+    assert "reduce" in phases[: phases.index("newton")]
+    assert phases.count("sweep") < 16
