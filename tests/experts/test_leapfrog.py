@@ -80,7 +80,9 @@ def test_a_hundred_scenarios_feasible_at_every_sweep_and_cheaper_with_each():
 
 def test_nodes_are_removed_when_a_sweep_gains_nothing():
     # The first path costs 10,000 times as much as the optimum, and some of its nodes cannot be moved.
-    (entry,) = (entry for entry in known_problems() if entry.name == "cart-pole-swing-up" and entry.method == "leapfrog")
+    (entry,) = (
+        entry for entry in known_problems() if entry.name == "cart-pole-swing-up" and entry.method == "leapfrog"
+    )
     extremal = solve(replace(entry.problem, control_bounds=None), "leapfrog")
     assert extremal.success
     phases = [row.phase for row in extremal.history]

@@ -18,6 +18,7 @@ from scipy.ndimage import map_coordinates
 from leapnav.envs.field.clearance import footprint_clearances
 from leapnav.envs.field.proximity import footprint_proximities
 from leapnav.envs.geodesics import MAP_ENTRIES, geodesic_map, map_header_of
+from leapnav.envs.scenarios.faults import ScenarioError
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import FULL_CIRCLE
 from leapnav.envs.simulation.sensing import scan
@@ -381,9 +382,14 @@ class FreespaceAssumption:
         seen = self._with_obstacles(i for i in range(len(self._scenario.obstacles)) if i not in self._unseen)
         try:
             rest = seen.from_state(pose, time)
-            optimum = find_optimum(rest, "medium")
-            return (time, Feedback(rest, optimum)) if optimum.success else None
-        except ValueError:  # in contact, or no feedback along the optimum
+        except ScenarioError:  # in contact
+            return None
+        optimum = find_optimum(rest, "medium")
+        if not optimum.success:
+            return None
+        try:
+            return time, Feedback(rest, optimum)
+        except ValueError:  # no feedback along the optimum
             return None
 
 
