@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -101,6 +102,12 @@ class Assignments:
         expression = self._reduced[name]
         require(expression)
         return [*lines, f"{indent}{target} = {PRINTER.doprint(expression)}"]
+
+
+def unpack(sources: Mapping[str, str], body: Sequence[str]) -> list[str]:
+    """Return a body after the assignments of those variables that it uses, whose expressions are given by name."""
+    used = set(re.findall(r"\w+", "\n".join(body)))
+    return [*(f"    {name} = {source}" for name, source in sources.items() if name in used), *body]
 
 
 def load(kind: str, generator: str, declaration: str, generate: Callable[[], str]) -> ModuleType:

@@ -18,7 +18,7 @@ from leapnav.envs.kernels.internals import FunctionPointer
 from leapnav.envs.utils.caching import computed_once
 from leapnav.experts.numerics.flow import CONTROL_FUNCTION, FLOW_FUNCTION, PIECE_FUNCTION
 from leapnav.experts.numerics.state_bounds import ENTRIES
-from leapnav.experts.problem.code_generation import Assignments, load
+from leapnav.experts.problem.code_generation import Assignments, load, unpack
 from leapnav.experts.problem.system import ControlAffineSystem
 
 # What obstacles contribute: None for nothing, () for the proximity cost of one disc at the position with the radius of
@@ -113,12 +113,12 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
     first = 3 * m + len(parameters)
     costs = call_costs(terms, limited, first)
     features = " + ".join(term.call("features", first + ENTRIES * len(limited)) for term in terms) or "0"
-    unpack = [
-        "    " + "; ".join(f"q{i} = z[{i}]" for i in range(n)),
-        "    " + "; ".join(f"lam{i} = z[{n + i}]" for i in range(n)),
-        *(f"    parameter{i} = data[{3 * m + i}]" for i in range(len(parameters))),
-    ]
-    return _render(unpack, switching, value, rate, jacobian, costs, features, import_costs(limited))
+    sources = {
+        **{f"q{i}": f"z[{i}]" for i in range(n)},
+        **{f"lam{i}": f"z[{n + i}]" for i in range(n)},
+        **{f"parameter{i}": f"data[{3 * m + i}]" for i in range(len(parameters))},
+    }
+    return _render(sources, switching, value, rate, jacobian, costs, features, import_costs(limited))
 
 
 class ObstacleTerm(NamedTuple):
@@ -228,7 +228,7 @@ def import_costs(limited: Sequence[int]) -> list[str]:
 
 
 def _render(
-    unpack: list[str],
+    sources: dict[str, str],
     switching: Sequence[Any],
     value: Any,
     rate: list[sp.Expr],
@@ -239,8 +239,8 @@ def _render(
 ) -> str:
     """Return the source of a module that computes the given expressions, with common subexpressions removed.
 
-    All functions begin with the lines `unpack`, and the flow computes the lines `costs` first. These lines and the
-    expression `features` for the number of the closest features call functions of the lines `imports`.
+    The functions begin with the variables `sources` that they use, and the flow computes the lines `costs` first. These
+    lines and the expression `features` for the number of the closest features call functions of the lines `imports`.
     """
     m, size = len(switching), len(rate)
     expressions = {
@@ -264,7 +264,7 @@ def _render(
     piece_body = [*controls, f"    number = {features}"]
     piece_body += [f"    number = 2 * number + (1 if slope{j} == 0.0 else 0)" for j in range(m)]
 
-    lines = [*unpack, *controls, *costs]
+    lines = [*controls, *costs]
     lines += assign("value", "value", "    ")
     for i in range(size):
         lines += assign(f"dz[{i}]", f"rate{i}", "    ")
@@ -272,8 +272,9 @@ def _render(
     for a, b in jacobian:
         lines += assign(f"A{a}_{b}", f"A{a}_{b}", "        ")
     lines.append("        for c in range(S.shape[1]):")
+    lines += [f"            s{b} = S[{b}, c]" for b in sorted({b for _, b in jacobian})]
     for a in range(size):
-        terms = [f"A{a}_{b} * S[{b}, c]" for b in range(size) if (a, b) in jacobian]
+        terms = [f"A{a}_{b} * s{b}" for b in range(size) if (a, b) in jacobian]
         lines.append(f"            dS[{a}, c] = {' + '.join(terms) or '0.0'}")
     effort = " + ".join(f"0.5 * data[{j}] * u{j} * u{j}" for j in range(m))
     lines.append(f"    return value + {effort}")
@@ -288,18 +289,16 @@ def _render(
             "",
             "@kernel(FLOW_SIGNATURE)",
             "def flow(z, data, field, S, dz, dS):",
-            *lines,
+            *unpack(sources, lines),
             "",
             "@kernel(PIECE_SIGNATURE)",
             "def piece(z, data, field):",
-            *unpack,
-            *piece_body,
+            *unpack(sources, piece_body),
             "    return number",
             "",
             "@kernel(CONTROL_SIGNATURE)",
             "def control(z, data, u):",
-            *unpack,
-            *control_body,
+            *unpack(sources, control_body),
             "",
         ]
     )
