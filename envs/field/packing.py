@@ -23,6 +23,7 @@ from leapnav.envs.field.layout import (
     PART_SIZE,
     read_header,
 )
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.shapes.base import Shape
 from leapnav.envs.shapes.polygon import edge_rows
 
@@ -262,8 +263,7 @@ def with_weight(packed: np.ndarray, weight: float, least_distance: float | None 
     field = packed.copy()
     header = read_header(field)
     header["weight"], header["least_distance"] = weight, least_distance
-    field.flags.writeable = False
-    return field
+    return constant(field)
 
 
 def check_field(packed: np.ndarray) -> np.ndarray:

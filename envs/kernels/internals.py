@@ -20,6 +20,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
+from leapnav.envs.kernels.compilation import prepare
+
 __all__ = [
     "FunctionPointer",
     "carray",
@@ -42,6 +44,7 @@ class FunctionPointer:
     @cached_property
     def address(self) -> int:
         """The address; the kernel is compiled when it is first needed."""
+        prepare(self._kernel)  # which compiles no callee for literals
         self._kernel.compile(self._numba_type_.signature.args)
         result = self._kernel.get_compile_result(self._numba_type_.signature)
         return types.CompileResultWAP(result).__wrapper_address__()

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, WrapValidator, model_serializer
 
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.utils.records import Finite, Frozen, Positive, as_tuples, inside
 
 
@@ -73,9 +74,7 @@ def outline_of(footprint: Sequence[Disc] | Box, ahead: float = 0.0, joint: int =
         rows = [(middle - half, middle + half, footprint.width / 2, 0.0, joint)]
     else:
         rows = [(ahead + disc.offset, ahead + disc.offset, 0.0, disc.radius, joint) for disc in footprint]
-    outline = np.array(rows, dtype=float)
-    outline.flags.writeable = False
-    return outline
+    return constant(rows)
 
 
 def sizes_of(outline: np.ndarray) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from numba import float64
 from pydantic import Field, model_validator
 
 from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.robots.base import ADVANCE_SIGNATURE, CostWeights, Dynamics, RobotModel, Symmetry, register
 from leapnav.envs.robots.car import Car
 from leapnav.envs.robots.car import advance as advance_car
@@ -88,9 +89,7 @@ class _Towing(RobotModel):
 
     def outline(self) -> np.ndarray:
         trailer = outline_of(self.trailer, ahead=-self.hitch_length, joint=len(self.state_names) - 1)
-        outline = np.concatenate([super().outline(), trailer])
-        outline.flags.writeable = False
-        return outline
+        return constant(np.concatenate([super().outline(), trailer]))
 
     def parameters(self, cost: CostWeights) -> tuple[float, ...]:
         return (*super().parameters(cost), self.hitch_length)

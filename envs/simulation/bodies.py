@@ -24,7 +24,7 @@ from leapnav.envs.field.layout import read_header
 from leapnav.envs.field.packing import FieldPart, displacements, field_parts, parts_at, replace_parts
 from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR
+from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, VECTOR, constant
 from leapnav.envs.robots.footprints import axis_of, corners_of
 from leapnav.envs.settings import Motor
 from leapnav.envs.simulation.stepping import GRAVITY
@@ -108,9 +108,8 @@ class ContactWorld:
     ) -> None:
         self.field, self._outline, self._motor = field, outline, motor
         # For the proximity cost: Chipmunk does not resolve the position of a robot in contact more finely.
-        self._smaller = outline - CONTACT_MARGIN * np.where(
-            outline[:, 1:2] > outline[:, :1], (-1, 1, 1, 0, 0), (0, 0, 0, 1, 0)
-        )
+        margins = np.where(outline[:, 1:2] > outline[:, :1], (-1, 1, 1, 0, 0), (0, 0, 0, 1, 0))
+        self._smaller = constant(outline - CONTACT_MARGIN * margins)
         self._space = pymunk.Space()
         self._space.collision_slop = CONTACT_MARGIN  # in metres; the default of 0.1 is meant for pixels
         static = self._space.static_body
@@ -187,12 +186,12 @@ class ContactWorld:
         self._space.add(body, *outline)
         step = duration / substeps
         lowest, speed_integral, turn_integral = math.inf, 0.0, 0.0
-        phi = footprint_value(state, self._smaller, self._field_at(time))
+        phi = footprint_value(constant(state), self._smaller, self._field_at(time))
         phi_sum = phi / 2  # trapezoidal rule
         for k in range(substeps):
             self._start_moving(time + k * step, step)
             self._space.step(step)
-            before = state.copy()
+            before = constant(state.copy())
             state[:3] = _pose(body)
             self._move_obstacles()
             field = self._field_at(time + (k + 1) * step)
@@ -201,7 +200,7 @@ class ContactWorld:
             moved = (state[:3] - before[:3]).tolist()
             speed_integral += (moved[0] ** 2 + moved[1] ** 2) / step
             turn_integral += moved[2] ** 2 / step
-            phi = footprint_value(state, self._smaller, field)
+            phi = footprint_value(constant(state), self._smaller, field)
             phi_sum += phi
         velocity[:] = *body.velocity, body.angular_velocity
         self._space.remove(body, *outline)

@@ -14,6 +14,7 @@ from leapnav.envs.field.rectangle import OUTLINE_ENTRIES
 from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
 from leapnav.envs.kernels.internals import FunctionPointer
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.scenarios.sources import get_scenario
@@ -265,8 +266,7 @@ class BatchSimulator:
         """Simulate the rest of a period after a contact."""
         sim, episode, state, model = self._simulation, self.episodes[i], self.states[i], self.settings.model
         controls = sim.controls[i]
-        outline = sim.outlines[i][sim.outlines[i, :, 2:4].any(axis=1)]
-        outline.flags.writeable = False
+        outline = constant(sim.outlines[i][sim.outlines[i, :, 2:4].any(axis=1)])
         if i not in self._contacts:
             self._contacts[i] = ContactWorld(self.fields[i], outline, self.settings.motor, self._masses[i])
         duration = float(episode["remaining"])
@@ -296,7 +296,8 @@ class BatchSimulator:
         else:
             episode["effort"] += stepping.effort(sim.weights[i], controls) * duration
         if model.state_cost is not None:
-            ends = sum(model.state_cost(q, sim.parameters[i]) for q in (np.array([*pose, *before[3:]]), state))
+            parameters, states = constant(sim.parameters[i]), (np.array([*pose, *before[3:]]), state)
+            ends = sum(model.state_cost(q, parameters) for q in states)
             episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
         timed = np.append(state, time + duration)
@@ -314,11 +315,12 @@ class BatchSimulator:
                 return vx + fx / motor.mass * step, vy + fy / motor.mass * step, spin + torque / motor.moment * step
 
             return track
+        parameters = constant(sim.parameters[i])
         new, joints = np.zeros(len(state)), np.unique(sim.outlines[i, :, 4]).astype(int)
         joints = joints[joints > 0]  # a trailer does not turn relative to a robot in contact
 
         def follow(vx: float, vy: float, heading: float, spin: float) -> tuple[float, float, float]:
-            model.advance(np.array([0.0, 0.0, heading, *state[3:]]), controls, step, sim.parameters[i], new)
+            model.advance(np.array([0.0, 0.0, heading, *state[3:]]), controls, step, parameters, new)
             new[joints] = state[joints]
             state[3:] = new[3:]
             return new[0] / step, new[1] / step, (new[2] - heading) / step

@@ -93,7 +93,9 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
     }
     terms = obstacle_terms(system, obstacles)
     costs = _costs(sp.sympify(state_cost).xreplace(rename), q, terms, limited)
-    sources = {str(s): f"{name}[{i}]" for name, array in (("q", q), ("u", u), ("lam", lam)) for i, s in enumerate(array)}
+    sources = {
+        str(s): f"{name}[{i}]" for name, array in (("q", q), ("u", u), ("lam", lam)) for i, s in enumerate(array)
+    }
     sources |= {f"parameter{i}": f"data[{3 * m + i}]" for i in range(k)}
     return "\n".join(
         [

@@ -15,6 +15,7 @@ from leapnav.envs.field.layout import read_header
 from leapnav.envs.field.packing import check_field, with_weight
 from leapnav.envs.field.proximity import footprint_proximities
 from leapnav.envs.kernels.internals import FunctionPointer
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.robots.footprints import Box, Disc, outline_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import as_matrix, as_vector
@@ -267,7 +268,7 @@ class OptimalControlProblem:
         states = as_matrix("states", states, None, self.system.n)
         cost = np.zeros(len(states))
         for state, bound, slope in self.state_limits:
-            cost += limit_costs(states[:, state].copy(), _constant([bound, slope, self.barrier_weight]))
+            cost += limit_costs(states[:, state].copy(), constant([bound, slope, self.barrier_weight]))
         if self.field is None or self.proximity_weight == 0.0:
             return cost
         added = 1.0 - float(read_header(self.field)["weight"]) / self.proximity_weight
@@ -334,8 +335,8 @@ class OptimalControlProblem:
         outline = self.outline.ravel().tolist() if self._obstacles else ()
         parameters = self.parameters if self.time_weight == 0.0 else (*self.parameters, self.time_weight)
         barriers = [number for limit in limits for number in (limit.bound, limit.slope, self.barrier_weight)]
-        data = _constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *outline])
-        field = _constant([]) if self.field is None else with_weight(self.field, self.proximity_weight)
+        data = constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *outline])
+        field = constant([]) if self.field is None else with_weight(self.field, self.proximity_weight)
         return ProblemArrays(
             flow=ExtremalFlow(flow, piece, data, field),
             control=control,
@@ -431,13 +432,6 @@ def _is_number(value: Any) -> bool:
 
 def _is_finite(value: Any) -> bool:
     return _is_number(value) and math.isfinite(float(value))
-
-
-def _constant(values: Any) -> np.ndarray:
-    """Return a read-only array, as the kernels expect for constants."""
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
-    return array
 
 
 def as_problem(problem: OptimalControlProblem | Scenario) -> OptimalControlProblem:

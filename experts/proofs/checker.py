@@ -331,7 +331,7 @@ def spline_value(values: np.ndarray, cells: CellSet, pose: Pose) -> float:
     """Return the value of a spline at a pose in a cell of the set."""
     k, i, j = cells.grid.cell(pose)
     local = np.empty((BLOCK + 2, BLOCK + 2, BLOCK + 2))
-    slot = cells.layout.slots[k // BLOCK, i // BLOCK, j // BLOCK]
+    slot = int(cells.layout.slots[k // BLOCK, i // BLOCK, j // BLOCK])
     gather(values, cells.layout, slot, local)
     around = local[k % BLOCK : k % BLOCK + 3, i % BLOCK : i % BLOCK + 3, j % BLOCK : j % BLOCK + 3]
     x, y, heading = pose

@@ -65,7 +65,7 @@ BACKWARD_SIGNATURE = boolean(DISCRETE_PROBLEM, PATH, REGULARISATION, EVALUATION,
 BACKWARD_FUNCTION = types.FunctionType(BACKWARD_SIGNATURE)
 
 
-@kernel(boolean(*BACKWARD_SIGNATURE.args, int64, int64), inline="always")
+@kernel(boolean(*BACKWARD_SIGNATURE.args, int64, int64), forceinline=True)
 def backward_of_size(problem, path, regularisation, evaluation, expansion, model, n, m):
     """Compute the model, for n states and m controls. With literals, the compiler unrolls the loops."""
     u, held = path.u, path.held

@@ -98,6 +98,7 @@ def test_limits_of_states_are_reached_by_the_best():
     assert optimum.cost == pytest.approx(entry.value, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_problem_of_a_scenario_is_solved_without_its_lattice():
     """Which finds fewer local optima."""
     scenario = Scenario.from_dict(scenario_fields())
@@ -116,10 +117,10 @@ def test_a_problem_without_a_solution_is_a_failure():
     assert find_optimum(there).status is Status.ZERO_HORIZON
 
 
-def test_an_optimum_with_alternatives_is_drawn_and_converted(tmp_path):
-    for problem in (KNOWN["cart-pole-swing-up"].problem, KNOWN["elastica-clamped"].problem):
-        optimum = find_optimum(problem)
-        content = optimum.to_dict()
-        assert len(content["alternatives"]) == len(optimum.alternatives)
-        assert "driving_modes" not in content
-        plot_extremal(optimum, tmp_path / "optimum.png")
+@pytest.mark.parametrize("name", ["elastica-clamped", pytest.param("cart-pole-swing-up", marks=pytest.mark.slow)])
+def test_an_optimum_with_alternatives_is_drawn_and_converted(name, tmp_path):
+    optimum = find_optimum(KNOWN[name].problem)
+    content = optimum.to_dict()
+    assert len(content["alternatives"]) == len(optimum.alternatives)
+    assert "driving_modes" not in content
+    plot_extremal(optimum, tmp_path / "optimum.png")

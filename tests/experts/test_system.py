@@ -125,6 +125,11 @@ def test_the_compiled_flow_computes_what_was_declared():
         control = -np.array([z[9], z[10] / 2, z[11] / 3])
         expected = np.array(drift(*z[:6])) + np.concatenate([np.zeros(3), control / (1, 2, 3)])
         assert rates(problem, z)[:6] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_all_methods_turn_a_body_at_the_same_cost():
+    problem = OptimalControlProblem(attitude(), (0,) * 6, (0.3, 0.5, -0.2, 0, 0, 0), 5.0, (1, 1, 1))
     *_, guess = next(initial_paths(problem))  # the same guess that each solve would compute again
     costs = [solve(problem, method=method, guess=guess).cost for method in METHODS]
     assert costs == pytest.approx([0.80069849692] * 4, rel=1e-9)

@@ -23,6 +23,7 @@ from leapnav.training import (
     print_scores,
     write_report,
 )
+from leapnav.training.scoring.reports import training_notes
 
 
 def towards_the_goal(observation):
@@ -40,6 +41,7 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
             "class": ExpertPolicy,
             "factory": PolicyFactory(lambda env: ExpertPolicy(env, feedback="gains")),
             "name": "go-to-goal",
+            "included": "slalom",
             "other observations": (lambda observation: [0.0, 0.0], {"observation": "state"}),
             "seeds": [make_policy(env.observation_space, env.action_space, seed, SMALL) for seed in (0, 1)],
         },
@@ -48,14 +50,15 @@ def test_all_kinds_of_policies_are_compared(env, tmp_path):
         progress=False,
     )
     rows = {row.policy: row for row in found.scores()}
-    assert list(rows) == ["function", "object", "class", "factory", "name", "other observations", "seeds"]
+    assert list(rows) == ["function", "object", "class", "factory", "name", "included", "other observations", "seeds"]
     assert rows["class"].soc.value == pytest.approx(1.0, abs=1e-3) and rows["factory"].success.value == 1.0
     assert rows["seeds"].runs == 2 and rows["other observations"].success.value == 0.0
     assert rows["function"].mean_return.value > rows["object"].mean_return.value
     assert repr(found).startswith("<Comparison: open; SOC: function ")
     frame = found.to_dataframe()
-    assert len(frame) == 8 and set(frame.policy) == set(rows)
+    assert len(frame) == 9 and set(frame.policy) == set(rows) and set(frame.bank) == {"open"}
     assert frame[frame.policy == "seeds"].run.tolist() == [0, 1]
+    assert training_notes(found) == ["open: included trained in another family: slalom"]
     print_scores(found)
     plot_scores(found, tmp_path / "scores.png")
     plot_episodes(found.banks, found.runs["function"][0].episodes, tmp_path / "episodes.png")

@@ -97,6 +97,7 @@ def test_takeovers_after_the_first_one_without_an_optimum_are_skipped():
     assert left[-1] > find_optimum(scenario).horizon / 4
 
 
+@pytest.mark.slow
 def test_dagger_is_the_same_with_any_number_of_workers(env, monkeypatch):
     monkeypatch.setattr("leapnav.training.learning.dagger.LABELLED_PER_TASK", 1)
     found = []

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch as th
 from helpers import QUICK, fresh
+from stable_baselines3 import PPO
 
 from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.experts.data.demonstrations import load_demonstrations
-from leapnav.training import Dataset, behaviour_clone
+from leapnav.training import Dataset, behaviour_clone, make_vec_env
 from leapnav.training.learning.symmetries import mirror, time_reverse
 
 
@@ -145,6 +146,8 @@ def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):
     assert seen.observations[:, 9::2] == pytest.approx(found.observations[:, 9:], abs=1e-4)
     assert seen.observations[:, :9] == pytest.approx(found.observations[:, :9], abs=1e-4)
     assert found.observed(found.settings) is found
+    model = PPO("MlpPolicy", make_vec_env(n_envs=1, lidar_beams=64), n_steps=2, batch_size=2)
+    assert found.observed(model).observations.tobytes() == seen.observations.tobytes()
     seen.save(tmp_path / "seen.npz")
     assert Dataset.load(tmp_path / "seen.npz").settings == EnvironmentSettings(lidar_beams=64)
     # Settings that do not belong to the sensors are ignored.

@@ -14,6 +14,7 @@ from typing import Any
 from zipfile import is_zipfile
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from leapnav.envs.robots import RobotModel, Symmetry
 from leapnav.envs.scenarios.cost import Cost
@@ -94,15 +95,17 @@ class Dataset:
         The history of a sample and its last action are those of the samples before it in its episode.
 
         Args:
-            settings: the `EnvironmentSettings` of an environment with these sensors, or the environment itself. Only
-                the settings of the sensors are used.
+            settings: the `EnvironmentSettings` of an environment with these sensors, the environment itself, or a
+                Stable-Baselines3 algorithm with it. Only the settings of the sensors are used.
 
         Raises:
-            TypeError: the environment is not one of leapnav.
+            TypeError: the environment is not one of leapnav, or the algorithm has none.
             ValueError: the environment has another actuation, whose state the samples do not contain.
 
         """
-        settings = settings if isinstance(settings, EnvironmentSettings) else unwrap(settings)[0].settings
+        if not isinstance(settings, EnvironmentSettings):
+            env = settings.get_env() if isinstance(settings, BaseAlgorithm) else settings
+            settings = unwrap(env)[0].settings
         if settings.actuation != self.settings.actuation:
             expected, given = self.settings.actuation, settings.actuation
             raise ValueError(f"actuation: expected that of the samples, {expected!r}, got {given!r}")

@@ -119,7 +119,10 @@ def _name_of(what: str, known: Mapping[str, type], value: object) -> str:
     name = next((name for name, kind in known.items() if kind is value), None)
     if name is None:
         names = ", ".join(kind.__name__ for kind in known.values())
-        raise ValueError(f"model: {what}: expected one of {names}, got {getattr(value, '__name__', value)}")
+        raise ValueError(
+            f"model: {what}: expected one of {names}, got {getattr(value, '__name__', value)}; a model with another "
+            "one is saved by its method `save`"
+        )
     return name
 
 

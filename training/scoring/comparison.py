@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of
+from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of, is_built_in
 from leapnav.training.config import PPOConfig, RunConfig, read_config
 from leapnav.training.scoring.adapters import PolicyOrFactory
 from leapnav.training.scoring.evaluation import evaluate
@@ -31,16 +30,14 @@ class Comparison:
         banks: the banks.
         runs: for each row of the table, the evaluations of its runs on all banks.
         seed: random seed of the bootstrap.
-        folders: directories of the training runs of the rows that have any.
-        robots: for each row, the robots with which its policies were trained, as far as they are known.
+        specs: for each row, what is known of its policies.
 
     """
 
     banks: tuple[ScenarioBank, ...]
     runs: Mapping[str, Sequence[Evaluation]]
     seed: int
-    folders: Mapping[str, Sequence[Path]] = field(default_factory=dict)
-    robots: Mapping[str, Sequence[RobotModel]] = field(default_factory=dict)
+    specs: Mapping[str, Sequence[PolicySpec]] = field(default_factory=dict)
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -64,16 +61,20 @@ class Comparison:
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a pandas data frame with one row per episode: policy, run, and the columns of `Episode.to_dict`.
 
+        The column `bank` contains the names of the banks.
+
         Raises:
             ImportError: pandas is not installed.
 
         """
         frames = []
+        names = dict(zip(map(bank_identity, self.banks), self.bank_names, strict=True))
         for name, runs in self.runs.items():
             for number, run in enumerate(runs):
                 frame = run.to_dataframe()
                 frame.insert(0, "policy", name)
                 frame.insert(1, "run", number)
+                frame["bank"] = [names[identity] for identity in frame["bank"]]
                 frames.append(frame)
         import pandas  # `Evaluation.to_dataframe` has reported if it is missing
 
@@ -95,20 +96,30 @@ class Comparison:
             name: [replace(run, episodes=tuple(e for e in run if e.bank in identities)) for run in evaluations]
             for name, evaluations in self.runs.items()
         }
-        return Comparison(banks, runs, self.seed, self.folders, self.robots)
+        return Comparison(banks, runs, self.seed, self.specs)
+
+    @property
+    def folders(self) -> dict[str, list[Path]]:
+        """Directories of the training runs of the rows that have any."""
+        found = {row: [spec.run for spec in specs if spec.run] for row, specs in self.specs.items()}
+        return {row: folders for row, folders in found.items() if folders}
 
     def trained_on(self, bank: ScenarioBank) -> list[str]:
         """Return the rows with a run that was trained in the scenarios of a bank."""
         rows = self.folders.items()
         return [row for row, folders in rows if any(_trains_on(read_config(folder)[1], bank) for folder in folders)]
 
-    def other_robots(self, bank: ScenarioBank) -> dict[str, str]:
-        """Return the parameters in which the robot of the training differs from that of a bank, by row."""
+    def trained_elsewhere(self, bank: ScenarioBank) -> dict[str, str]:
+        """Return in what the training differs from a bank, by row: the robot's parameters, and a built-in family."""
         found = {}
-        for row, robots in self.robots.items():
-            differences = [text for robot in robots for text in robot.differences(bank.robot)]
-            if differences:
-                found[row] = "; ".join(dict.fromkeys(differences))
+        for row, specs in self.specs.items():
+            robots = [spec.trained_robot.differences(bank.robot) for spec in specs if spec.trained_robot]
+            texts = [f"with another robot: {text}" for text in dict.fromkeys("; ".join(one) for one in robots if one)]
+            families = dict.fromkeys(spec.family for spec in specs if spec.family and is_built_in(spec.family))
+            others = [family for family in families if family != bank.family]
+            texts += [f"in another family: {', '.join(others)}"] if others else []
+            if texts:
+                found[row] = "; ".join(texts)
         return found
 
 
@@ -360,14 +371,4 @@ def compare_policies(
             episodes = tuple(episode for evaluation in evaluations for episode in evaluation)
             milliseconds = float(np.mean([evaluation.milliseconds for evaluation in evaluations]))
             runs[row].append(Evaluation(episodes, milliseconds, evaluations[0].settings))
-    folders = {row: [member.run for member in members if member.run] for row, members in rows.items()}
-    robots = {
-        row: [member.trained_robot for member in members if member.trained_robot] for row, members in rows.items()
-    }
-    return Comparison(
-        tuple(banks),
-        runs,
-        seed,
-        {row: found for row, found in folders.items() if found},
-        {row: found for row, found in robots.items() if found},
-    )
+    return Comparison(tuple(banks), runs, seed, rows)

@@ -83,13 +83,13 @@ def print_scores(comparison: Comparison) -> None:
 
 
 def training_notes(comparison: Comparison) -> list[str]:
-    """Return sentences on policies that were trained in the scenarios of a bank, or with another robot than its own."""
+    """Return sentences on policies that were trained in the scenarios of a bank, or in another family or robot."""
     notes = []
     for name, bank in zip(comparison.bank_names, comparison.banks, strict=True):
         if rows := comparison.trained_on(bank):
             notes.append(f"{name}: {', '.join(rows)} trained in these scenarios")
-        for row, differences in comparison.other_robots(bank).items():
-            notes.append(f"{name}: {row} trained with another robot: {differences}")
+        for row, differences in comparison.trained_elsewhere(bank).items():
+            notes.append(f"{name}: {row} trained {differences}")
     return notes
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from leapnav.envs.field.clearance import footprint_clearances
 from leapnav.envs.field.layout import read_header
 from leapnav.envs.field.proximity import footprint_value
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.robots.footprints import arm_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.utils.validation import is_integer
@@ -213,7 +214,7 @@ def _check_states(scenario: Scenario, states: np.ndarray, times: np.ndarray, cer
 def _check_motion(scenario: Scenario, states: np.ndarray, controls: np.ndarray, interval: float) -> None:
     """Check that the states are the motion of the robot under the controls, and that these are within the limits."""
     robot = scenario.robot
-    bounds, parameters = robot.control_bounds(), np.array(robot.parameters(scenario.cost), dtype=float)
+    bounds, parameters = robot.control_bounds(), constant(robot.parameters(scenario.cost))
     slack = PRECISION * np.abs(bounds).max(axis=1)
     if not ((controls >= bounds[:, 0] - slack) & (controls <= bounds[:, 1] + slack)).all():
         raise ValueError(f"controls: expected values within {bounds.tolist()}, the limits of the robot")
@@ -229,7 +230,7 @@ def _check_costates(scenario: Scenario, states: np.ndarray, controls: np.ndarray
     """Check that the controls minimise the Hamiltonian: u = -b(q)' lambda / weights, within the limits."""
     robot = scenario.robot
     (low, high), weights = robot.control_bounds().T, np.array(robot.control_weight(scenario.cost))
-    parameters = np.array(robot.parameters(scenario.cost), dtype=float)
+    parameters = constant(robot.parameters(scenario.cost))
     held = np.vstack([np.zeros(len(low)), np.eye(len(low))])
     moved = np.empty((len(states), len(held), states.shape[1]))
     for state, ends in zip(states, moved, strict=True):
@@ -257,10 +258,10 @@ def _check_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray, co
 def _path_cost(scenario: Scenario, states: np.ndarray, controls: np.ndarray) -> float:
     """Return the cost of a path by the trapezoidal rule."""
     robot = scenario.robot
-    parameters = np.array(robot.parameters(scenario.cost), dtype=float)
+    parameters = constant(robot.parameters(scenario.cost))
     running = np.square(controls) @ np.array(robot.control_weight(scenario.cost)) / 2 + scenario.cost.time_weight
     state_cost = type(robot).state_cost
     for k, state in enumerate(states):
-        running[k] += footprint_value(state, scenario.outline, scenario.field)
+        running[k] += footprint_value(constant(state), scenario.outline, scenario.field)
         running[k] += 0.0 if state_cost is None else state_cost(state, parameters)
     return float(np.trapezoid(running, states[:, -1]))
