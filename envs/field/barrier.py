@@ -22,7 +22,7 @@ from leapnav.envs.kernels.types import tuple_of
 CONTACT, CORNER_CONTACT = 5e-4, 5e-5
 
 
-@kernel(tuple_of(*[float64] * 3)(float64, float64), inline="always")
+@kernel(tuple_of(*[float64] * 3)(float64, float64), forceinline=True)
 def barrier(s, contact):
     """Return b(s), with a relative error of 1e-12, and its first and second derivative.
 

@@ -23,14 +23,14 @@ MIN_CENTRE_DISTANCE, MIN_DISTANCE = 1e-3, 1e-6
 HASH_FACTOR = 31  # of numbers that are combined to one
 
 
-@kernel(float64(float64, float64, HEADER_TYPE, int64), inline="always")
+@kernel(float64(float64, float64, HEADER_TYPE, int64), forceinline=True)
 def wall_distance(x, y, header, side):
     """Distance (m) to a wall, positive inside the arena; `side` is 0 to 3 for x_min, y_min, x_max, y_max."""
     sign = 1.0 if side < 2 else -1.0
     return sign * ((x if side % 2 == 0 else y) - header.arena[side])
 
 
-@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, PART_TYPE), inline="always")
+@kernel(tuple_of(float64, int64, float64)(float64, float64, CONSTANT, PART_TYPE), forceinline=True)
 def _nearest_edge(x, y, field, part):
     """Edge of a polygon whose line is farthest away: (signed distance of the line (m), number of the edge, beyond).
 
@@ -48,7 +48,7 @@ def _nearest_edge(x, y, field, part):
     return largest, nearest, min(along, max(along - edge.length, 0.0))
 
 
-@kernel(int64(float64, float64, CONSTANT, PART_TYPE, float64), inline="always")
+@kernel(int64(float64, float64, CONSTANT, PART_TYPE, float64), forceinline=True)
 def closest_feature(x, y, field, part, reach):
     """Number of the edge or of the vertex of a rounded polygon that is closest to a point outside.
 
@@ -63,7 +63,7 @@ def closest_feature(x, y, field, part, reach):
     return 2 * (1 + part.first + nearest) + (1 if beyond != 0.0 else 0)
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, CONSTANT, PART_TYPE), inline="always")
+@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, CONSTANT, PART_TYPE), forceinline=True)
 def part_geometry(x, y, radius, field, part):
     """Signed distance (m) from a disc to a part, its gradient (2), and the curvature (1/m) of its level line.
 
@@ -91,7 +91,7 @@ def part_geometry(x, y, radius, field, part):
     return distance - part.rounding - radius, nx, ny, curvature
 
 
-@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, HEADER_TYPE), inline="always")
+@kernel(tuple_of(*[float64] * 6)(float64, float64, float64, float64, HEADER_TYPE), forceinline=True)
 def barrier_term(distance, nx, ny, curvature, header):
     """Barrier of a distance, with gradient and Hessian.
 

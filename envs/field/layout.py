@@ -148,7 +148,7 @@ def motion_of(field, part, time):
     return knot.x + elapsed * knot.vx, knot.y + elapsed * knot.vy, knot.vx, knot.vy
 
 
-@kernel(types.UniTuple(types.float64, 2)(CONSTANT, PART_TYPE, types.float64), inline="always")
+@kernel(types.UniTuple(types.float64, 2)(CONSTANT, PART_TYPE, types.float64), forceinline=True)
 def displacement_of(field, part, time):
     """Return the displacement (2) (m) of a part at a time (s); 0 of one at rest."""
     if part.knots == 0:
@@ -157,7 +157,7 @@ def displacement_of(field, part, time):
     return dx, dy
 
 
-@kernel(types.float64(CONSTANT, CONSTANT), inline="always")
+@kernel(types.float64(CONSTANT, CONSTANT), forceinline=True)
 def time_of(q, field):
     """Return the time (s) of a state, which is its entry with the index `clock` of the field; 0 if it has none."""
     clock = header_of(field).clock

@@ -56,7 +56,7 @@ def moving_disc_proximity(x, y, time, radius, field):
     return k * value, k * gx, k * gy, k * gt, k * hxx, k * hxy, k * hxt, k * hyy, k * hyt, k * htt
 
 
-@kernel(NOTHING(float64, float64, float64, float64, ROW, float64, CONSTANT, VECTOR), inline="always")
+@kernel(NOTHING(float64, float64, float64, float64, ROW, float64, CONSTANT, VECTOR), forceinline=True)
 def _add_row(x, y, cos, sin, row, time, field, total):
     """Add the proximity cost of a row of an outline, divided by its weight, to the first 15 entries of total (25,)."""
     header, parts, local = header_of(field), parts_in(field), total[ENTRIES:]

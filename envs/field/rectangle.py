@@ -30,13 +30,13 @@ OUTLINE_ENTRIES = 5  # in a row of an outline
 ROW = tuple_of(*[float64] * 4)  # of an outline, without the joint
 
 
-@kernel(float64(CONSTANT, float64), inline="always")
+@kernel(float64(CONSTANT, float64), forceinline=True)
 def row_axis(q, joint):
     """Angle (rad) of the axis of a row of an outline with a joint, at a state q of the robot."""
     return q[2] + (q[int(joint)] if joint > 0.0 else 0.0)
 
 
-@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, float64, float64), inline="always")
+@kernel(tuple_of(*[float64] * 4)(float64, float64, float64, float64, float64), forceinline=True)
 def point_geometry(ahead, left, rear, front, half_width):
     """Signed distance (m) from a point in the frame of a rectangle, its gradient (2), and the curvature (1/m).
 
@@ -116,7 +116,7 @@ def separation(x, y, cos, sin, row, field, part):
     return nearest - rounding
 
 
-@kernel(NOTHING(float64, float64, float64, float64, float64, float64, HEADER_TYPE, VECTOR), inline="always")
+@kernel(NOTHING(float64, float64, float64, float64, float64, float64, HEADER_TYPE, VECTOR), forceinline=True)
 def _add_corner(distance, nx, ny, curvature, ox, oy, header, total):
     """Add the barrier of the distance of a corner (ox, oy) (m), relative to the robot's position, from an obstacle."""
     value, gx, gy, hxx, hxy, hyy = barrier_term(distance, nx, ny, curvature, header)
@@ -133,7 +133,7 @@ def _add_corner(distance, nx, ny, curvature, ox, oy, header, total):
     total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - (gx * ox + gy * oy)
 
 
-@kernel(NOTHING(float64, float64, float64, float64, ROW, float64, HEADER_TYPE, VECTOR), inline="always")
+@kernel(NOTHING(float64, float64, float64, float64, ROW, float64, HEADER_TYPE, VECTOR), forceinline=True)
 def _add_point(rx, ry, cos, sin, row, rounding, header, total):
     """Add the barrier of the distance of the rectangle from a fixed point (rx, ry) (m), relative to the position."""
     ahead, left = cos * rx + sin * ry, cos * ry - sin * rx
@@ -153,7 +153,7 @@ def _add_point(rx, ry, cos, sin, row, rounding, header, total):
     total[9] += (hxx * dx + 2.0 * hxy * dy) * dx + hyy * dy * dy - (gx * rx + gy * ry)
 
 
-@kernel(NOTHING(float64, float64, float64, float64, ROW, CONSTANT, PART_TYPE, VECTOR), inline="always")
+@kernel(NOTHING(float64, float64, float64, float64, ROW, CONSTANT, PART_TYPE, VECTOR), forceinline=True)
 def add_part(x, y, cos, sin, row, field, part, total):
     """Add the proximity cost of a rectangle near a part, see `add_rectangle`."""
     header, radius = header_of(field), row[3]
@@ -206,7 +206,7 @@ def add_rectangle(x, y, cos, sin, row, field, total):
             add_part(x, y, cos, sin, row, field, part, total)
 
 
-@kernel(int64(float64, float64, float64, float64, ROW), inline="always")
+@kernel(int64(float64, float64, float64, float64, ROW), forceinline=True)
 def _side(rx, ry, cos, sin, row):
     """Number of the edge or of the corner of a rectangle that is closest to a point outside, relative to the robot."""
     ahead, left = cos * rx + sin * ry, cos * ry - sin * rx
@@ -214,7 +214,7 @@ def _side(rx, ry, cos, sin, row):
     return 3 * along + (0 if left < -row[2] else 2 if left > row[2] else 1)
 
 
-@kernel(int64(int64, float64, float64, float64, float64, ROW, CONSTANT, PART_TYPE), inline="always")
+@kernel(int64(int64, float64, float64, float64, float64, ROW, CONSTANT, PART_TYPE), forceinline=True)
 def part_features(features, x, y, cos, sin, row, field, part):
     """Combine a number with that of the closest edges and vertices of a rectangle and a part."""
     if part.edges == 0:

@@ -122,7 +122,7 @@ def _fill(waiting: list[Any]) -> None:
 
 def _compile(one: Any) -> bool:
     """Compile a kernel, and return True, unless another process is compiling it."""
-    signature, directory, callees, _ = DECLARATIONS[one]
+    signature, directory, callees = DECLARATIONS[one]
     try:
         with FileLock(directory / "lock", timeout=0):
             for callee in callees:  # otherwise Numba would compile them for the exact types of the arguments

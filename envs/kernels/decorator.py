@@ -30,15 +30,13 @@ class Declaration(NamedTuple):
     Attributes:
         signature: its signature.
         directory: its cache directory.
-        callees: the kernels that it calls; instead of one that Numba inlines, the callees of that one.
-        inlined: whether Numba inlines it, so that it is compiled only if Python calls it.
+        callees: the kernels that it calls.
 
     """
 
     signature: Any
     directory: Path
     callees: tuple[Any, ...]
-    inlined: bool
 
 
 DECLARATIONS: dict[Any, Declaration] = {}  # of all kernels of the imported modules; callees come first
@@ -50,7 +48,7 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any
     Args:
         signature: Numba's types of the result and the arguments, such as `float64(float64)`, see
             `leapnav.envs.kernels.types`. Other arguments are possible, but the function is then compiled again.
-        options: further options of `numba.njit`, such as `fastmath`. Division by zero gives infinity or NaN, and the
+        options: further options of `numba.njit`, such as `forceinline`. Division by zero gives infinity or NaN, and the
             interpreter lock is released.
 
     Raises:
@@ -77,11 +75,8 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any
             )
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
-        callees: list[Any] = []
-        for value in filter(_is_kernel, used.values()):
-            callees += DECLARATIONS[value].callees if DECLARATIONS[value].inlined else [value]
-        inlined = options.get("inline") == "always"
-        DECLARATIONS[compiled] = Declaration(signature, directory, tuple(dict.fromkeys(callees)), inlined)
+        callees = tuple(dict.fromkeys(filter(_is_kernel, used.values())))
+        DECLARATIONS[compiled] = Declaration(signature, directory, callees)
         return compiled
 
     return declare
@@ -96,11 +91,9 @@ def record_type(record: type[NamedTuple], **fields: types.Type) -> Any:
 
 
 def kernels_of(*modules: str) -> list[Any]:
-    """Return the kernels of the imported modules with these names, and of those below them, except inlined ones."""
+    """Return the kernels of the imported modules with these names, and of those below them."""
     names = tuple(f"{module}." for module in modules)
-    return [
-        one for one, own in DECLARATIONS.items() if not own.inlined and f"{one.py_func.__module__}.".startswith(names)
-    ]
+    return [one for one in DECLARATIONS if f"{one.py_func.__module__}.".startswith(names)]
 
 
 def _globals(function: Callable[..., Any]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ def advance_arc(x, y, heading, distance, turn):
     return x + chord * math.cos(middle), y + chord * math.sin(middle), heading + turn
 
 
-@kernel(types.UniTuple(float64, 2)(float64, float64, float64, float64, float64), inline="always")
+@kernel(types.UniTuple(float64, 2)(float64, float64, float64, float64, float64), forceinline=True)
 def until_limit(value, rate, low, high, h):
     """Return the rate of a state, 0 at its limit, and the time, at most h, before it reaches its limit."""
     if (rate > 0.0 and value >= high) or (rate < 0.0 and value <= low):

@@ -28,7 +28,7 @@ from leapnav.envs.robots.unicycle import POSE_LABELS
 from leapnav.envs.utils.records import MAX_MAGNITUDE, Interval, Positive
 
 
-@kernel(NOTHING(VECTOR, float64, float64, float64, VECTOR), inline="always")
+@kernel(NOTHING(VECTOR, float64, float64, float64, VECTOR), forceinline=True)
 def _accelerate(q, acceleration, angular, h, new):
     """Integrate exactly: speed, turn rate and heading in closed form, the position by Gauss's rule."""
     x, y, heading, speed, turn_rate = q[0], q[1], q[2], q[3], q[4]

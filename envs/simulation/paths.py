@@ -57,7 +57,7 @@ MOTION = record_type(RobotMotion, advance=ADVANCE_FUNCTION, state_cost=STATE_COS
 ADDRESSES = types.UniTuple(int64, 2)  # of both kernels: Numba takes 4 us to receive a function from Python
 
 
-@kernel(MOTION(ADDRESSES), inline="always")
+@kernel(MOTION(ADDRESSES), forceinline=True)
 def motion_at(addresses):
     """Return the motion with the kernels at two addresses."""
     return RobotMotion(function_at(addresses[0], ADVANCE_FUNCTION), function_at(addresses[1], STATE_COST_FUNCTION))
@@ -114,7 +114,7 @@ def coast(q, u, h, parameters, new):
     new[0], new[1], new[2] = q[0] + u[0] * h, q[1] + u[1] * h, q[2] + u[2] * h
 
 
-@kernel(NOTHING(PATH, float64, VECTOR), inline="always")
+@kernel(NOTHING(PATH, float64, VECTOR), forceinline=True)
 def state_after(path, fraction, new):
     """Write the state at a fraction of the path, and its time, to new (n + 1,)."""
     path.motion.advance(path.q, path.u, path.duration * fraction, path.parameters, new)
@@ -122,13 +122,13 @@ def state_after(path, fraction, new):
     new[last] = path.q[last] + path.duration * fraction
 
 
-@kernel(float64(PATH, VECTOR), inline="always")
+@kernel(float64(PATH, VECTOR), forceinline=True)
 def clearance_at(path, q):
     """Return the clearance (m) at a state of the path."""
     return footprint_clearance(q, path.outline, path.field)[0]
 
 
-@kernel(float64(PATH, VECTOR), inline="always")
+@kernel(float64(PATH, VECTOR), forceinline=True)
 def _speed_after(path, q):
     """Return the largest speed (m/s) of the robot's position and of its outline at a state of the path."""
     new, time = path.samples[4], SHORT * path.duration
@@ -143,7 +143,7 @@ def _speed_after(path, q):
     return speed + sweep / time
 
 
-@kernel(float64(PATH, VECTOR), inline="always")
+@kernel(float64(PATH, VECTOR), forceinline=True)
 def largest_distance(path, end):
     """Return a bound of the distance (m) that a disc or corner of the robot travels along the path to a state.
 
@@ -154,7 +154,7 @@ def largest_distance(path, end):
     return path.duration * (robot + header_of(path.field).top_speed)
 
 
-@kernel(types.UniTuple(float64, 3)(PATH, float64, float64, VECTOR), inline="always")
+@kernel(types.UniTuple(float64, 3)(PATH, float64, float64, VECTOR), forceinline=True)
 def first_contact(path, before, total, new):
     """Find the smallest clearance along a path, and the first contact.
 
@@ -218,7 +218,7 @@ def first_contact(path, before, total, new):
     return min(lowest, 0.0), fraction, c0
 
 
-@kernel(types.boolean(MATRIX), inline="always")
+@kernel(types.boolean(MATRIX), forceinline=True)
 def _has_rectangle(outline):
     """Return whether a row of an outline is a rectangle."""
     found = False
@@ -227,7 +227,7 @@ def _has_rectangle(outline):
     return found
 
 
-@kernel(types.UniTuple(float64, 2)(PATH, float64, float64), inline="always")
+@kernel(types.UniTuple(float64, 2)(PATH, float64, float64), forceinline=True)
 def _panel_costs(path, start, width):
     """Return the integrals of the proximity cost and of the state cost over a panel of a path (Gauss's rule).
 
@@ -258,7 +258,7 @@ def _panel_costs(path, start, width):
     return proximity * width, state_cost * width
 
 
-@kernel(types.UniTuple(float64, 2)(PATH, float64, float64), inline="always")
+@kernel(types.UniTuple(float64, 2)(PATH, float64, float64), forceinline=True)
 def path_costs(path, total, lowest):
     """Return the means of the proximity cost and of the state cost over a path.
 
@@ -294,7 +294,7 @@ def path_costs(path, total, lowest):
     return proximity, state_cost
 
 
-@kernel(types.UniTuple(float64, 5)(PATH, float64, VECTOR), inline="always")
+@kernel(types.UniTuple(float64, 5)(PATH, float64, VECTOR), forceinline=True)
 def drive_path(path, before, new):
     """Follow a path up to the first contact.
 

@@ -24,7 +24,7 @@ GRAVITY = 9.81  # m/s^2
 MIN_MISS_FRACTION, MISS_FRACTION_SLOPE = 0.2, 0.1
 
 
-@kernel(MATRIX(SIMULATION, int64), inline="always")
+@kernel(MATRIX(SIMULATION, int64), forceinline=True)
 def outline_of(sim, i):
     """Return the outline (K, 5) of robot i, a view."""
     rows, entries = sim.outlines.shape[1], sim.outlines.shape[2]
@@ -93,7 +93,7 @@ def start_episodes(robots, packed):
             episode.potential = potential(i, sim)
 
 
-@kernel(NOTHING(SIMULATION, int64, VECTOR), inline="always")
+@kernel(NOTHING(SIMULATION, int64, VECTOR), forceinline=True)
 def _disturb(sim, i, controls):
     """Change the controls of robot i by actuation noise and slip.
 
@@ -114,7 +114,7 @@ def _disturb(sim, i, controls):
         controls[j] *= 1.0 - min(slip * abs(noise[m + j]), 1.0)
 
 
-@kernel(int64(MATRIX, FLAGS, SIMULATION), inline="always")
+@kernel(int64(MATRIX, FLAGS, SIMULATION), forceinline=True)
 def _begin_periods(actions, active, sim):
     """Begin a period, and set the controls; for robots that are not active, its duration is 0.
 
@@ -151,7 +151,7 @@ def begin_periods(actions, active, packed):
     return _begin_periods(actions, active, Simulation(*packed))
 
 
-@kernel(float64(SIMULATION, int64, MOTION, VECTOR, float64, float64, MATRIX), inline="always")
+@kernel(float64(SIMULATION, int64, MOTION, VECTOR, float64, float64, MATRIX), forceinline=True)
 def _follow(sim, i, motion, u, time, duration, scratch):
     """Move robot i with controls u for a duration (s), up to the first contact, and add the proximity and state cost.
 
@@ -238,7 +238,7 @@ def wheel_forces(velocity, heading, controls, duration, motor):
     return cos * along - sin * across, sin * along + cos * across, half * (right - left)
 
 
-@kernel(NOTHING(MATRIX, SIMULATION, int64), inline="always")
+@kernel(NOTHING(MATRIX, SIMULATION, int64), forceinline=True)
 def _read_bodies(bodies, sim, substeps):
     """Read the poses and velocities of bodies after a substep; those of a robot in contact are unchanged."""
     for i in range(len(bodies)):

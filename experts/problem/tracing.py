@@ -158,7 +158,7 @@ def trace(flow, control, times, Z, clock, accuracy, record):
     return rows + 1, defect, conjugate
 
 
-@kernel(NOTHING(float64, INTEGERS, VECTOR, MATRIX, VECTOR), inline="always")
+@kernel(NOTHING(float64, INTEGERS, VECTOR, MATRIX, VECTOR), forceinline=True)
 def _interpolate(s, places, start, terms, q):
     """Write the pose, or the state if it has further entries, at a fraction of a step to q."""
     for i in range(len(q)):

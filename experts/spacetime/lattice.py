@@ -125,7 +125,7 @@ def sample_layers(field, at_rest, outline, places, costs):
                         costs[k, i, j] += step * header.weight * value
 
 
-@kernel(int64(float64, float64, float64, float64), inline="always")
+@kernel(int64(float64, float64, float64, float64), forceinline=True)
 def crossing(x, y, to_x, to_y):
     """Return 1 if a step relative to an obstacle crosses the ray above it from left to right, -1 from right to left."""
     if (x < 0.0) == (to_x < 0.0):
