@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -17,7 +18,10 @@ from filelock import FileLock, Timeout
 from leapnav.envs.kernels.decorator import DECLARATIONS, cache_root
 from leapnav.envs.utils.progress import progress_bar
 
-MIN_KERNELS = 6  # for each process, whose start takes two seconds
+# Kernels for each process that is started, which takes two seconds. The eight kernels of a problem are compiled by this
+# process: two others take as long, and 1.5 times the CPU time.
+MIN_KERNELS = 16
+MIN_SHOWN = 6  # kernels, whose progress is shown
 # Level of LLVM's optimisation. At level 2, all kernels compile in 0.77 of the time of level 3, the default, and are as
 # fast. At level 1 they compile in 0.73 of the time, but the checks of proofs take 1.2 times as long.
 LLVM_LEVEL = "2"
@@ -46,20 +50,22 @@ def prepare(*kernels: Any, jobs: int | None = None) -> int:
     importable = [name for name in names if name.startswith(("leapnav.", f"{GENERATED}."))]
     command = [sys.executable, "-P", "-c", WORK, *importable]
     count = min(jobs or usable_cores(), math.ceil(len(waiting) / MIN_KERNELS)) if len(waiting) >= MIN_KERNELS else 0
+    is_shown = count > 0 or len(waiting) >= MIN_SHOWN
     environment = {"NUMBA_OPT": LLVM_LEVEL, **os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     quiet = subprocess.DEVNULL
     helpers = [subprocess.Popen(command, stdout=quiet, stderr=quiet, env=environment) for _ in range(count)]
     try:
-        with progress_bar(total=len(names), label=LABEL, unit="kernels", show=count > 0) as bar:
+        with progress_bar(total=len(names), label=LABEL, unit="kernels", show=is_shown) as bar:
             while any(helper.poll() is None for helper in helpers):
                 time.sleep(PAUSE)
                 waiting = missing(waiting)
                 bar.update(len(names) - len(waiting) - bar.n)
+            # Few kernels, those that other processes cannot import, and those that failed, to raise the error
+            _fill(waiting, bar.update)
     finally:
         for helper in helpers:
             helper.kill()
             helper.wait()
-    _fill(waiting)  # few kernels, those that other processes cannot import, and those that failed, to raise the error
     return len(names)
 
 
@@ -107,14 +113,18 @@ def import_generated(name: str) -> ModuleType:
     return module
 
 
-def _fill(waiting: list[Any]) -> None:
-    """Compile kernels, callees first, apart from those that another process compiles meanwhile."""
+def _fill(waiting: list[Any], on_compiled: Callable[[int], Any] = lambda _: None) -> None:
+    """Compile kernels, callees first, apart from those that another process compiles meanwhile.
+
+    `on_compiled` is called with 1 after each kernel.
+    """
     while waiting:
-        remaining = [
-            one
-            for one in waiting
-            if not is_cached(one) and not (all(map(is_cached, DECLARATIONS[one].callees)) and _compile(one))
-        ]
+        remaining: list[Any] = []
+        for one in waiting:
+            if is_cached(one) or (all(map(is_cached, DECLARATIONS[one].callees)) and _compile(one)):
+                on_compiled(1)
+            else:
+                remaining.append(one)
         if len(remaining) == len(waiting):
             time.sleep(PAUSE)
         waiting = remaining

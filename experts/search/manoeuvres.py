@@ -217,7 +217,7 @@ def _guess(scenario: Scenario, robot: Car, arcs: np.ndarray) -> DirectPath:
             controls.append((control, 0.0))
             steps.append(step)
     times = np.append(0.0, np.cumsum(steps))
-    stacked = np.stack(states)[:, : len(robot.state_names)]
+    stacked = np.ascontiguousarray(np.stack(states)[:, : len(robot.state_names)])
     return DirectPath(times, stacked, np.array(controls), np.zeros_like(stacked), math.inf, math.inf, False)
 
 

@@ -156,7 +156,7 @@ class _Descent:
         times, states = path.times, path.states
         steps, fineness = np.diff(times), 0.5**mesh
         middles = 0.5 * (times[1:] + times[:-1])
-        clearances = footprint_clearances(np.ascontiguousarray(states), self._outline, self._field)
+        clearances = footprint_clearances(states, self._outline, self._field)
         clearances = np.minimum(np.minimum(clearances[1:], clearances[:-1]), self._between(states))
         motion = np.hypot(*np.diff(states[:, :2], axis=0).T) + self._reach * np.abs(np.diff(states[:, 2]))
         resolved = RESOLUTION * fineness * (np.maximum(clearances, 0.0) + self._smallest)

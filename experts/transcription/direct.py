@@ -83,19 +83,14 @@ class DirectPath:
         first = np.cumsum(pieces) - pieces
         fractions = (np.arange(len(index)) - first[index]) / pieces[index]
         times = np.append(self.times[index] + fractions * np.diff(self.times)[index], self.times[-1])
-        states, costates = self._interpolate(times)
+        states, costates = (interpolate(times, self.times, array) for array in (self.states, self.costates))
         return DirectPath(times, states, self.controls[index], costates, self.cost, self.violation, False)
 
     def resampled(self, times: np.ndarray) -> DirectPath:
         """Return the path at other times (M,), which begin and end as those of the path, as an initial guess."""
-        states, costates = self._interpolate(times)
+        states, costates = (interpolate(times, self.times, array) for array in (self.states, self.costates))
         index = np.searchsorted(self.times, 0.5 * (times[1:] + times[:-1])) - 1
         return DirectPath(times, states, self.controls[index], costates, self.cost, self.violation, False)
-
-    def _interpolate(self, times: np.ndarray) -> list[np.ndarray]:
-        """Return states and costates at other times."""
-        rows = map(np.ascontiguousarray, (self.states, self.costates))
-        return [interpolate(times, self.times, array) for array in rows]
 
     def scaled(self, factor: float) -> DirectPath:
         """Return the path with all times multiplied by a factor, which keeps the cost of the path."""

@@ -16,6 +16,7 @@ from leapnav.envs.field.proximity import (
     footprint_value,
 )
 from leapnav.envs.field.sampling import OFFSET, PointGrid, sample_grid
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.robots.footprints import arm_of, corners_of, enclosed_radius, sizes_of
 from leapnav.envs.shapes.capsule import Capsule
 
@@ -83,7 +84,7 @@ def test_an_overlap_is_the_smallest_translation_that_separates():
 @pytest.mark.parametrize("others", [0, 20], ids=["no grid", "grid"])
 def test_derivatives_of_the_proximity_cost(others):
     scenario = scenario_with(others)
-    data, checked = scenario.outline.ravel().copy(), 0
+    data, checked = constant(scenario.outline.ravel()), 0
     for pose in poses(1500, seed=2):
         clearance = footprint_clearance(pose, scenario.outline, scenario.field)[0]
         step = 1e-4 * min(clearance, 0.1)
@@ -97,7 +98,7 @@ def test_derivatives_of_the_proximity_cost(others):
         differences = (values[1::2] - values[::2]) / (2 * step)
         assert gradient == pytest.approx(differences[:, 0], rel=1e-5, abs=1e-6 * max(1, np.abs(gradient).max()))
         assert hessian == pytest.approx(differences[:, 1:], rel=1e-5, abs=1e-6 * max(1, np.abs(hessian).max()))
-        assert footprint_value(pose, scenario.outline, scenario.field) == phi
+        assert footprint_value(constant(pose), scenario.outline, scenario.field) == phi
         assert footprint_proximities(pose[None], scenario.outline, scenario.field)[0] == phi
         checked += 1
     assert checked > 800

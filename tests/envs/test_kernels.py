@@ -138,9 +138,11 @@ print(*sorted(declaration.directory.name for declaration in DECLARATIONS.values(
 
 
 USED = """
+import pickle
 import gymnasium as gym
 import leapnav
-from leapnav.envs import sample_scenario
+import numpy as np
+from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.kernels import compilation
 from leapnav.envs.kernels.decorator import DECLARATIONS
 from leapnav.experts import find_optimum
@@ -152,8 +154,18 @@ for robot in ("unicycle", "car"):
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert find_optimum(sample_scenario("clutter", 1, robot)).success
+NavigateEnv("clutter", split="test").reset(seed=0)  # checks the optimum of a bank
+wall = {"polygon": {"vertices": [[3, 1], [4, 1], [4, 3], [3, 3]]}, "mass": 10.0}
+fields = {"arena": [0, 0, 8, 4], "start": [1, 2, 0], "goal": [7, 2, 0], "horizon": 8.0, "obstacles": [wall]}
+scenario = Scenario.from_dict({**fields, "robot": {"model": "dynamic_unicycle"}, "start_motion": [1.0, 0.0]})
+env = NavigateEnv(scenario=scenario, terminate_on_collision=False)
+env.reset(seed=0)
+for _ in range(40):  # until it pushes the obstacle
+    env = pickle.loads(pickle.dumps(env))
+    *_, info = env.step(np.array([0.2, 0.0], np.float32))
+assert info["collision"]
 prepared = [one for one in DECLARATIONS if one.py_func.__module__.startswith("leapnav.")]
-print([one.__name__ for one in prepared if sum(one.stats.cache_misses.values())])
+print([one.__name__ for one in prepared if sum(one.stats.cache_misses.values()) or len(one.signatures) > 1])
 """
 
 

@@ -8,6 +8,7 @@ from helpers import info_of_plan, scenario_fields
 from scipy.integrate import cumulative_trapezoid
 
 from leapnav.envs import DifferentialDrive, DynamicCar, DynamicUnicycle, NavigateEnv, Scenario, ScenarioError, Unicycle
+from leapnav.envs.kernels.types import constant
 from leapnav.experts import ExpertPolicy, find_optimum
 from leapnav.training.policies.baselines import GoToGoal
 
@@ -107,7 +108,7 @@ LIMITED = {"model": "dynamic_unicycle", "max_speed": 0.8, "turn_rate": [-1.0, 1.
 @pytest.mark.parametrize(("acceleration", "angular"), [(1.0, 3.0), (-2.0, -1.0), (3.0, 0.0), (0.0, -3.0)])
 def test_a_robot_does_not_accelerate_beyond_the_limits_of_its_states(acceleration, angular):
     scenario = task(LIMITED)
-    parameters, new = np.array(scenario.robot.parameters(scenario.cost)), np.zeros(5)
+    parameters, new = constant(scenario.robot.parameters(scenario.cost)), np.zeros(5)
     start = np.array([0.0, 0.0, 0.0, 0.5, -0.5])
     DynamicUnicycle.advance(start, np.array([acceleration, angular]), 1.5, parameters, new)
     times = np.linspace(0.0, 1.5, 200_001)
@@ -120,7 +121,7 @@ def test_a_robot_does_not_accelerate_beyond_the_limits_of_its_states(acceleratio
 @pytest.mark.parametrize(("acceleration", "steering_rate"), [(1.5, 2.0), (-3.0, -1.0), (0.0, 4.0)])
 def test_a_car_does_not_accelerate_beyond_the_limits_of_its_speed(acceleration, steering_rate):
     scenario = task({"model": "dynamic_car", "speed": [-0.6, 1.2]})
-    parameters, new = np.array(scenario.robot.parameters(scenario.cost)), np.zeros(5)
+    parameters, new = constant(scenario.robot.parameters(scenario.cost)), np.zeros(5)
     start = np.array([0.0, 0.0, 0.3, -0.2, 0.5])
     DynamicCar.advance(start, np.array([acceleration, steering_rate]), 1.5, parameters, new)
     times = np.linspace(0.0, 1.5, 200_001)

@@ -27,6 +27,7 @@ from leapnav.envs import (
     sample_scenario,
 )
 from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.robots import register
 from leapnav.envs.robots.base import MODELS
 from leapnav.envs.scenarios.cost import Cost
@@ -91,7 +92,7 @@ def test_every_model_of_the_package_is_tested():
 def test_the_simulated_motion_is_that_of_the_declared_dynamics(name):
     scenario, rng = task(name), np.random.default_rng(0)
     rates, limits = rates_of(scenario), scenario.robot.action_scale()[1]
-    parameters = np.array(scenario.robot.parameters(scenario.cost))
+    parameters = constant(scenario.robot.parameters(scenario.cost))
     for h in (0.05, 0.3) if name != "wagon" else (0.05,):
         for _ in range(5):
             q = rng.uniform(-1.5, 1.5, len(scenario.start_state))
@@ -130,7 +131,7 @@ def test_an_optimum_is_certified_and_satisfies_the_minimum_principle_independent
         axle = states[:, :2] - scenario.robot.hitch_length * np.column_stack([np.cos(angle), np.sin(angle)])
         discs.append((axle, disc.radius))
     state_cost = ROBOTS[name].state_cost or (lambda q, parameters: 0.0)
-    parameters = np.array(scenario.robot.parameters(scenario.cost))
+    parameters = constant(scenario.robot.parameters(scenario.cost))
     running = np.array([state_cost(np.ascontiguousarray(q), parameters) for q in states])
     running += 0.5 * controls**2 @ weights
     for centres, radius in discs:

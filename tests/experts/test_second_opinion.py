@@ -7,6 +7,7 @@ from helpers import ROBOTS, scenario_fields
 from leapnav.envs import Scenario, ScenarioBank, sample_scenario
 from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.field.proximity import disc_proximity, footprint_proximity
+from leapnav.envs.kernels.types import constant
 from leapnav.experts import find_optimum
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.second_opinion import Opinion, second_opinion, verify_bank
@@ -92,7 +93,7 @@ def test_the_proximity_cost_of_a_rectangle_in_the_transcription_is_that_of_the_k
     value = _proximity(small, q, small.outline[0].tolist())
     hessian, gradient = casadi.hessian(value, q)
     entries = [value, *(gradient[i] for i in range(3)), *(hessian[i, j] for i in range(3) for j in range(i, 3))]
-    function, data = casadi.Function("proximity", [q], entries), small.outline.ravel().copy()
+    function, data = casadi.Function("proximity", [q], entries), constant(small.outline.ravel())
     for pose in np.random.default_rng(0).uniform((0, 0, -3), (10, 10, 3), (500, 3)):
         if footprint_clearance(np.array(pose), small.outline, small.field)[0] > 1e-3:
             expected = np.array(footprint_proximity(*pose, 0, data, 0, small.field))
