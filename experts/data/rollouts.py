@@ -45,6 +45,7 @@ VERSION = 1  # format of the shards
 MIN_SEED = 2  # seeds 0 and 1 give the first scenarios of the included training and test banks
 SHARD_SIZE = 16  # scenarios per shard
 WORK = ".rollout"  # directory of an unfinished rollout
+FORCE = ", or use force=True (--force)"
 DONE = WORK + DISCARDED  # the same directory while it is removed
 RECORD = "rollout.json"  # arguments and summary of a finished rollout, beside its dataset
 # Arrays of a demonstration, and whether they have one entry more than the number of steps.
@@ -156,7 +157,7 @@ def rollout(
         return finished
     _prepare(directory, force)
     # The settings of the store exclude `count`: a longer rollout continues a shorter one.
-    with ResumableStore(directory / WORK, "rollout", settings) as store:
+    with ResumableStore(directory / WORK, "rollout", settings, advice=FORCE) as store:
         sample = partial(sample_scenario, chosen, robot=body, horizon=horizon, obstacles=obstacles)
         compute = partial(_shard, sample=sample, seed=seed, recoveries=recoveries, noise=float(noise))
         with process_pool(workers, dask) as pool:

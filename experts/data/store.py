@@ -31,6 +31,7 @@ class ResumableStore:
         kind: name of the computation, such as "rollout"; used in error messages and for the manifest, `<kind>.json`.
         settings: JSON values that determine the content of the shards; a directory with other settings is refused.
         error: type of the exceptions for a directory or shard that cannot be used.
+        advice: end of the message about another unfinished computation in the directory.
 
     Raises:
         ValueError: (or `error`) on entering: the directory has other settings, or another process uses it.
@@ -39,9 +40,15 @@ class ResumableStore:
     """
 
     def __init__(
-        self, directory: Path, kind: str, settings: Mapping[str, Any], error: type[ValueError] = ValueError
+        self,
+        directory: Path,
+        kind: str,
+        settings: Mapping[str, Any],
+        error: type[ValueError] = ValueError,
+        advice: str = "",
     ) -> None:
         self.directory, self.kind = directory, kind
+        self._advice = advice
         self._header = json.dumps({"format": f"leapnav-{kind}", **settings}, sort_keys=True)
         self._error = error
         self._open = ExitStack()
@@ -77,7 +84,7 @@ class ResumableStore:
             if found.get(name) != expected.get(name):
                 raise self._error(
                     f"{manifest}: holds an unfinished {self.kind} of other settings: {name} is {found.get(name)!r}, "
-                    f"got {expected.get(name)!r}; finish that one, or remove {self.directory}"
+                    f"got {expected.get(name)!r}; finish that one, or remove {self.directory}{self._advice}"
                 )
 
     def path(self, number: int) -> Path:

@@ -294,7 +294,7 @@ class OptimalControlProblem:
     def _compiled(self) -> tuple[ControlAffineSystem, sp.Expr]:
         """System and state cost in the form that is compiled: a time weight is an additional parameter."""
         state_cost = as_expression("state_cost", self.state_cost)
-        return (self.system, state_cost) if self.time_weight == 0.0 else weighted_by_time(self.system, state_cost)
+        return weighted_by_time(self.system, state_cost)
 
     @property
     def _obstacles(self) -> Obstacles:
@@ -333,7 +333,7 @@ class OptimalControlProblem:
         )
         goal = np.array([0.0 if g is None else g for g in self.goal], dtype=float)
         outline = self.outline.ravel().tolist() if self._obstacles else ()
-        parameters = self.parameters if self.time_weight == 0.0 else (*self.parameters, self.time_weight)
+        parameters = *self.parameters, self.time_weight
         barriers = [number for limit in limits for number in (limit.bound, limit.slope, self.barrier_weight)]
         data = constant([*self.control_weight, *bounds[:, 0], *bounds[:, 1], *parameters, *barriers, *outline])
         field = constant([]) if self.field is None else with_weight(self.field, self.proximity_weight)

@@ -119,14 +119,14 @@ def test_a_corner_may_come_close_to_a_vertex():
     for gap in (1e-2, 1e-3, 1e-4):  # along the diagonal, from the vertex (4, 4) to the corner
         pose = np.array([4 - 0.3 - gap * math.sqrt(0.5), 4 - 0.2 - gap * math.sqrt(0.5), 0.0])
         assert footprint_clearance(pose, task.outline, task.field)[0] == pytest.approx(gap)
-        data = task.outline.ravel().copy()
+        data = constant(task.outline.ravel())
         gradient = np.array(footprint_proximity(*pose, 0, data, 0, task.field)[1:4])
         value = lambda q, data=data: footprint_proximity(*q, 0, data, 0, task.field)[0]  # noqa: E731
         assert gradient == pytest.approx(approx_fprime(pose, value, 1e-6 * gap), rel=1e-4)
 
 
 def test_the_features_change_where_the_second_derivatives_jump():
-    data = SCENARIO.outline.ravel().copy()
+    data = constant(SCENARIO.outline.ravel())
     path = np.stack([np.linspace(4.0, 8.0, 6000), np.full(6000, 4.3), np.full(6000, 0.2)], axis=1)
     numbers = [footprint_features(*q, 0, data, 0, SCENARIO.field) for q in path]
     hessians = np.array([footprint_proximity(*q, 0, data, 0, SCENARIO.field)[4:] for q in path])

@@ -73,7 +73,7 @@ def test_fresh_scenarios_with_a_rectangle(obstacles):
         optimum = find_optimum(scenario, "medium")
         assert optimum.success
         states = optimum.evaluate(np.linspace(0, optimum.horizon, 401))[0]
-        assert footprint_clearances(states, scenario.outline, scenario.field).min() > 0
+        assert footprint_clearances(np.ascontiguousarray(states), scenario.outline, scenario.field).min() > 0
         assert not touches(scenario, states)
 
 

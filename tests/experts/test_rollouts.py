@@ -161,7 +161,9 @@ def test_a_damaged_shard_is_refused_by_name(tmp_path, monkeypatch):
 def test_other_arguments_do_not_continue_it(tmp_path, monkeypatch):
     unfinished(tmp_path / "out", monkeypatch)
     for changes in ({"seed": 4}, {"noise": 0.1}, {"family": "slalom"}, {"recoveries": 2}):
-        message = rf"rollout\.json: holds an unfinished rollout of other settings: {next(iter(changes))} is"
+        message = (
+            rf"(?s)rollout\.json: holds an unfinished rollout of other settings: {next(iter(changes))} is .*--force"
+        )
         with pytest.raises(ValueError, match=message):
             rollout(**{"count": 4, "out": tmp_path / "out", "progress": False, **SETTINGS, **changes})
     # A longer one goes on.

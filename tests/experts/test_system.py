@@ -146,7 +146,7 @@ def test_a_slip_in_the_generated_code_is_found_before_it_is_used():
     ("cost", "fields", "start", "goal", "segments"),
     [
         (sp.sqrt(x**2 + v**2), ((1, 0), (0, 1)), (0, 0), (1, 1), None),
-        (sp.log(x), ((1, 0), (0, 1)), (0, 0), (1, 1), None),
+        pytest.param(sp.log(x), ((1, 0), (0, 1)), (0, 0), (1, 1), None, marks=pytest.mark.slow),
         # The singularity is crossed: Leapfrog searches for each arc around it, with 32 segments for a minute.
         pytest.param(0, ((1, 0), (0, 1 / x)), (-1, 0), (1, 1), 2, marks=pytest.mark.slow),
         (0, ((1, sp.sqrt(x)), (0, 1)), (0, 0), (1, 1), None),

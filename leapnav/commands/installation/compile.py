@@ -64,14 +64,13 @@ def compile_missing(jobs: int | None = None) -> dict[str, Any]:
 
 
 def _load_robots() -> None:
-    """Generate the functions of the problems of all robots, with fixed and with free horizon."""
+    """Generate the functions of the problems of all robots."""
     from leapnav.envs.robots.base import MODELS
     from leapnav.envs.scenarios.scenario import Scenario
     from leapnav.experts.problem.problem import OptimalControlProblem
     from leapnav.experts.transcription.direct import generated_functions
 
-    fields = {"arena": (0, 0, 4, 4), "start": (1, 2, 0), "goal": (3, 2, 0), "cost": {"time_weight": 1.0}}
+    fields = {"arena": (0, 0, 4, 4), "start": (1, 2, 0), "goal": (3, 2, 0), "horizon": 2.0}
     for robot in MODELS:
-        for horizon in (2.0, None):
-            scenario = Scenario.from_dict({**fields, "robot": {"model": robot}, "horizon": horizon})
-            generated_functions(OptimalControlProblem.from_scenario(scenario))
+        scenario = Scenario.from_dict({**fields, "robot": {"model": robot}})
+        generated_functions(OptimalControlProblem.from_scenario(scenario))
