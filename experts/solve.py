@@ -69,7 +69,7 @@ MIN_INTERVAL = 1e-9  # of the nodes on the way, in units of the horizon: steps o
 
 def solve(
     problem: OptimalControlProblem | Scenario,
-    method: Method = "leapfrog",
+    method: Method = "multiple_shooting",
     guess: Trajectory | Extremal | None = None,
     tol: float = 1e-9,
     max_iterations: int = 60,
@@ -92,7 +92,7 @@ def solve(
 
     Args:
         problem: an optimal control problem, or a scenario.
-        method: "leapfrog", "multiple_shooting", "single_shooting" or "collocation".
+        method: "multiple_shooting", "single_shooting", "leapfrog" or "collocation".
         guess: a path, whose costates are estimated from its motion if it has none, or an extremal, possibly of a
             problem with another horizon, goal or obstacle. Its duration is the guess of a free horizon. None: for a
             scenario the best path of the lattice search, improved by direct transcription; for a problem the cheapest

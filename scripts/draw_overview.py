@@ -64,7 +64,7 @@ def main() -> None:
     figure = Figure(figsize=(11, 4.9), layout="constrained")
     plane, bars = figure.subplots(1, 2, width_ratios=(1.5, 1))
     draw_scenario(plane, scenario)
-    leapfrog = solve(scenario, guess=initial_guess(scenario), polish=False)
+    leapfrog = solve(scenario, "leapfrog", guess=initial_guess(scenario), polish=False)
     rows = [row for row in leapfrog.history if row.times is not None]
     shown = [k for k in SWEEPS if k < len(rows)]
     for k, color in zip(shown, colormaps["viridis_r"](np.linspace(0.1, 0.8, len(shown))), strict=True):

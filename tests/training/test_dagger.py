@@ -134,6 +134,7 @@ def test_bad_arguments_of_dagger_are_named(arguments, message, env, dataset):
         DAgger(fresh(env), "open", dataset=dataset, **arguments)
 
 
+@pytest.mark.slow
 def test_dagger_improves_a_clone(env, dataset):
     """A few rounds raise the success of a clone of few demonstrations in the test split."""
     policy = fresh(env)
