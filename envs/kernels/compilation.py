@@ -27,7 +27,7 @@ MIN_SHOWN = 6  # kernels, whose progress is shown
 LLVM_LEVEL = "2"
 PAUSE = 0.1  # s, while other processes compile
 GENERATED = "leapnav_generated"  # package of the modules in the cache directory
-_FOUND: set[Any] = set()  # kernels that are known to be in the cache
+_FOUND: set[Any] = set()  # kernels that are known to be in the cache, or were compiled by this process
 LABEL = "Compiling, once per installation"
 WORK = "import sys; from leapnav.envs.kernels import compilation; compilation.work(*sys.argv[1:])"
 
@@ -144,4 +144,5 @@ def _compile(one: Any) -> bool:
     finally:
         for callee in callees:
             callee.disable_compile(False)
+    _FOUND.add(one)  # also a kernel of a notebook, for which there is no cache
     return True

@@ -176,6 +176,25 @@ def test_what_is_prepared_suffices_for_a_step_and_a_search(cache, tmp_path):
     assert run(USED, **environment).stdout == "[]\n"
 
 
+def test_kernels_without_a_file_that_call_each_other_are_compiled():
+    """Those of a notebook have no cache."""
+    code = """
+from numba import float64
+from leapnav.envs.kernels import kernel, prepare
+
+@kernel(float64(float64))
+def doubled(x):
+    return 2.0 * x
+
+@kernel(float64(float64))
+def one_more(x):
+    return doubled(x) + 1.0
+
+print(prepare(one_more), prepare(one_more), one_more(3.0))
+"""
+    assert run(code).stdout == "2 0 7.0\n"
+
+
 SCRIPT = """
 from beside import SCALE
 from numba import float64
