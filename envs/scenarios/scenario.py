@@ -20,6 +20,7 @@ from pydantic import BaseModel, SerializeAsAny, ValidationError, field_validator
 
 from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.field.packing import field_parts, pack_field, replace_parts
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.robots import Box, Disc, RobotModel, Unicycle
 from leapnav.envs.robots.base import robot_class
 from leapnav.envs.robots.footprints import sizes_of
@@ -144,12 +145,12 @@ class Scenario(Frozen):
             # Whether a moving obstacle is at the goal when the robot arrives is not known if the horizon is free.
             field = self.field if time is not None or not self.moves else replace_parts(self.field, at_rest)
             state = np.array([*(value or 0.0 for value in given), time or 0.0])
-            distance, nearest = footprint_clearance(state, self.outline, field)
+            distance, nearest = footprint_clearance(constant(state), self.outline, field)
             free = [k for k in {2, *self.outline[:, 4].astype(int)} - {0} if given[k] is None]
             circle = np.linspace(-np.pi, np.pi, N_HEADINGS)
             for angles in product(circle, repeat=len(free)) if free and not distance > 0 else ():
                 state[free] = angles  # at some heading and hitch angle there must be no contact
-                distance, nearest = max((distance, nearest), footprint_clearance(state, self.outline, field))
+                distance, nearest = max((distance, nearest), footprint_clearance(constant(state), self.outline, field))
             if not distance > 0:
                 faults.append(
                     f"{end}: ({state[0]:g}, {state[1]:g}) is inside {names[nearest]} (clearance {distance:.3g} m)"
@@ -220,9 +221,7 @@ class Scenario(Frozen):
             message = f"cost.time_weight: environments and banks with a fixed horizon need 0, got {cost.time_weight:g}"
             raise ScenarioError(one_line(self.name, [message]))
         vectors = self.start_state, self.goal_state, *bot.action_scale(), bot.control_weight(cost), bot.parameters(cost)
-        for array in (task := Task(*(np.array(vector, dtype=float) for vector in vectors))):
-            array.flags.writeable = False
-        return task
+        return Task(*map(constant, vectors))
 
     def from_state(self, state: Sequence[float] | np.ndarray, time: float) -> Self:
         """Return the rest of the scenario from a state (n,) of the robot at a time (s).

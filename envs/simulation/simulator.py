@@ -300,7 +300,7 @@ class BatchSimulator:
             ends = sum(model.state_cost(q, parameters) for q in states)
             episode["effort"] += ends / 2 * duration
         episode["proximity"] += proximity
-        timed = np.append(state, time + duration)
+        timed = constant(np.append(state, time + duration))
         episode["pose_clearance"] = footprint_clearance(timed, outline, self.fields[i])[0]
         episode["clearance"] = min(episode["clearance"], lowest)
 

@@ -108,7 +108,7 @@ class FieldStore:
 
     def __setitem__(self, i: int, field: np.ndarray) -> None:
         assert field.dtype == np.float64 and field.flags.c_contiguous  # as kernels read it
-        field.flags.writeable = False  # which an array is not after unpickling
+        field.flags.writeable = False  # arrays are writable after unpickling
         self._fields[i] = field  # keeps the memory at the address
         self.places[i] = field.ctypes.data, len(field)
 

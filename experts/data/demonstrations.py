@@ -15,6 +15,7 @@ from minari.data_collector import EpisodeBuffer
 
 from leapnav.envs.episodes import play_episode
 from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.kernels.types import constant
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.scenario import Scenario
@@ -195,7 +196,7 @@ def recovery(
     n = scenario.robot.sizes()[0]
     perturbation = rng.normal(size=n) * np.append(PERTURBATION, np.full(n - 3, MOTION_PERTURBATION))
     state = extremal.evaluate(time)[0][:n] + perturbation
-    at_time = np.append(state, time)
+    at_time = constant(np.append(state, time))
     if footprint_clearance(at_time, scenario.outline, scenario.field)[0] < MIN_RECOVERY_CLEARANCE or time == 0.0:
         return None
     rest = scenario.from_state(state, time).model_copy(update={"name": name})

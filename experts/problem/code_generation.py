@@ -105,7 +105,7 @@ class Assignments:
 
 
 def unpack(sources: Mapping[str, str], body: Sequence[str]) -> list[str]:
-    """Return a body after the assignments of those variables that it uses, whose expressions are given by name."""
+    """Return the lines of a body after those that assign the variables it uses; `sources` are their expressions."""
     used = set(re.findall(r"\w+", "\n".join(body)))
     return [*(f"    {name} = {source}" for name, source in sources.items() if name in used), *body]
 

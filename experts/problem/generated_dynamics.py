@@ -144,7 +144,7 @@ def _costs(cost: Any, q: Sequence[sp.Symbol], terms: Sequence[ObstacleTerm], lim
 
 
 def _symmetric(name: str, upper: dict[tuple[int, int], Any]) -> dict[str, Any]:
-    """Return the entries of the upper triangle of a symmetric matrix by target, which is that of both triangles."""
+    """Return the upper triangle of a symmetric matrix by target; each target assigns the entries of both triangles."""
     return {f"{name}[{a}, {b}]" + (f" = {name}[{b}, {a}]" if a != b else ""): e for (a, b), e in upper.items()}
 
 

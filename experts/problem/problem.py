@@ -292,7 +292,7 @@ class OptimalControlProblem:
 
     @property
     def _compiled(self) -> tuple[ControlAffineSystem, sp.Expr]:
-        """System and state cost in the form that is compiled, of which the time weight is a parameter."""
+        """System and state cost in the form that is compiled; the time weight is one of its parameters."""
         state_cost = as_expression("state_cost", self.state_cost)
         return weighted_by_time(self.system, state_cost)
 

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from leapnav.envs.field.clearance import footprint_clearance
+from leapnav.envs.kernels.types import constant
 from leapnav.experts.problem.extremal import Extremal
 
 Kind = Literal["straight", "turn", "contact"]
@@ -83,7 +84,7 @@ def pieces_of(extremal: Extremal) -> tuple[Piece, ...]:
         has_joints = problem.outline[:, 4].any()  # only the outline of a robot model has them
         rows = states if has_joints else np.ascontiguousarray(poses)
         for k in np.flatnonzero(is_close):
-            touched[k] = footprint_clearance(rows[k], problem.outline, problem.field)[1]
+            touched[k] = footprint_clearance(constant(rows[k]), problem.outline, problem.field)[1]
     labels = np.where(touched > -2, touched + 10, labels)
     return tuple(
         _piece(poses[first : last + 1], float(times[last] - times[first]), int(labels[(first + last) // 2]))
