@@ -234,6 +234,8 @@ class _ImitationConfig(RunConfig):
     """Directories written by `leapnav rollout`; if none is given, demonstrations are generated in the run directory."""
     scenarios: int = 10_000
     """Number of scenarios to demonstrate if no demonstrations are given."""
+    symmetric: bool = True
+    """Actions that are means over the symmetries of the robot, as far as the observation has them."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
     """Settings of the clone, in DAgger the first learner; its loss and batch size are those of all fits. The seed is
     that of the run."""
@@ -391,9 +393,7 @@ class SACConfig(_LearnerConfig):
 
 def _as_paths(value: Any) -> list[Path]:
     """Return one path, several or none as a list."""
-    if not value:
-        return []
-    return [Path(path) for path in ([value] if isinstance(value, (str, Path)) else value)]
+    return [Path(path) for path in ([value] if isinstance(value, (str, Path)) else value or ())]
 
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:

@@ -21,9 +21,9 @@ from leapnav.training import Dataset, evaluate, load_policy, make_vec_env, save_
 from leapnav.training.config import CloningConfig, DAggerConfig, DAggerRunConfig, PPOConfig, SACConfig
 from leapnav.training.effort import effort_weights
 from leapnav.training.learning.cloning import behaviour_clone
-from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.policies.baselines import GoToGoal
 from leapnav.training.policies.navigation_policy import add_momentum
+from leapnav.training.policies.symmetries import mirror, time_reversal
 from leapnav.training.runs.imitation import train_dagger
 from leapnav.training.runs.reinforcement import train_ppo, train_sac
 
@@ -252,10 +252,10 @@ def test_symmetries_of_observations_are_those_of_scenarios():
     mirrored = env.reset(options={"scenario": Scenario.from_dict(fields)})[0]
     action = th.tensor([[0.3, 0.2]])
     free = env.unwrapped.settings
-    observation, turned = mirror(first, action, free)
+    observation, turned = mirror(free)(first, action)
     assert observation[0].numpy() == pytest.approx(mirrored, abs=1e-4)
     assert turned[0].tolist() == pytest.approx([0.3, -0.2])
-    observation, _ = time_reverse(first, action, free)
+    observation, _ = time_reversal(free)(first, action)
     (x, y, heading), (goal_x, goal_y, goal_heading) = task.start, task.goal
     backwards = task.model_copy(
         update={"start": (x, y, heading + math.pi), "goal": (goal_x, goal_y, goal_heading + math.pi)}

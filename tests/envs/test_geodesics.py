@@ -15,8 +15,8 @@ from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import find_optimum
 from leapnav.training import CloningConfig, Dataset, NavigationFeatures, load_policy, make_policy, policy_environment
 from leapnav.training.learning.cloning import behaviour_clone
-from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.learning.takeovers import Labeller
+from leapnav.training.policies.symmetries import mirror, time_reversal
 
 ID, GOAL = "leapnav/Navigate-v0", 9
 BEAMS = 16
@@ -132,7 +132,7 @@ def test_symmetries_move_the_detours_with_the_beams():
     env = geodesic_env(scenario)
     seen, settings = th.as_tensor(env.reset()[0])[None], env.settings
     action = th.tensor([[0.5, 0.2]])
-    observation, changed = mirror(seen, action, settings)
+    observation, changed = mirror(settings)(seen, action)
     expected = geodesic_env(mirrored(scenario)).reset()[0]
     assert observation[0].numpy() == pytest.approx(expected, abs=0.02)
     assert changed.tolist() == [[0.5, pytest.approx(-0.2)]]
@@ -142,7 +142,7 @@ def test_symmetries_move_the_detours_with_the_beams():
             for name in ("start", "goal")
         }
     )
-    observation, changed = time_reverse(seen, action, settings)
+    observation, changed = time_reversal(settings)(seen, action)
     assert observation[0].numpy() == pytest.approx(geodesic_env(turned).reset()[0], abs=1e-3)
     assert changed.tolist() == [[-0.5, pytest.approx(0.2)]]
 

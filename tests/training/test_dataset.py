@@ -12,7 +12,7 @@ from leapnav.envs import NavigateEnv, Scenario, sample_scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.experts.data.demonstrations import load_demonstrations
 from leapnav.training import Dataset, behaviour_clone, make_vec_env
-from leapnav.training.learning.symmetries import mirror, time_reverse
+from leapnav.training.policies.symmetries import mirror, time_reversal
 
 
 def test_a_dataset_is_the_same_from_a_folder_and_from_demonstrations(demonstrated, dataset):
@@ -83,17 +83,17 @@ def test_mirroring_and_time_reversal_are_symmetries_of_the_environment(fov):
                 for o in fields["obstacles"]
             ],
         },
-        time_reverse: {**fields, "start": rotated(fields["start"]), "goal": rotated(fields["goal"])},
+        time_reversal: {**fields, "start": rotated(fields["start"]), "goal": rotated(fields["goal"])},
     }
     if fov < 2 * math.pi:
-        del transformed[time_reverse]  # the robot does not see what is behind it
+        del transformed[time_reversal]  # the robot does not see what is behind it
     for transform, other_fields in transformed.items():
         env = NavigateEnv(scenario=Scenario.from_dict(fields), lidar_fov=fov)
         other = NavigateEnv(scenario=Scenario.from_dict(other_fields), lidar_fov=fov)
         observation, other_observation = env.reset()[0], other.reset()[0]
         for step in range(20):
             action = np.array([0.2, 0.3 * math.cos(step)], np.float32)
-            inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None], env.settings)
+            inputs, targets = transform(env.settings)(th.as_tensor(observation)[None], th.as_tensor(action)[None])
             assert inputs[0].numpy() == pytest.approx(other_observation, abs=1e-4)
             observation, reward, *_ = env.step(action)
             other_observation, other_reward, *_ = other.step(targets[0].numpy())
@@ -113,7 +113,7 @@ def test_the_velocities_of_obstacles_have_the_symmetries_too():
 
     ends = {"start": [10.0 - x, y, math.pi - heading], "goal": [10.0 - goal_x, goal_y, math.pi - goal_heading]}
     turned = {"start": [x, y, heading + math.pi], "goal": [goal_x, goal_y, goal_heading + math.pi]}
-    transformed = {mirror: {**ends, "obstacles": list(map(reflected, fields["obstacles"]))}, time_reverse: turned}
+    transformed = {mirror: {**ends, "obstacles": list(map(reflected, fields["obstacles"]))}, time_reversal: turned}
     for transform, changes in transformed.items():
         env, other = (
             NavigateEnv(scenario=Scenario.from_dict(one), observation="geodesic", lidar_beams=64)
@@ -122,7 +122,7 @@ def test_the_velocities_of_obstacles_have_the_symmetries_too():
         observation, expected = env.reset()[0], other.reset()[0]
         for _ in range(20):
             action = np.array([0.2, 0.1], np.float32)
-            inputs, targets = transform(th.as_tensor(observation)[None], th.as_tensor(action)[None], env.settings)
+            inputs, targets = transform(env.settings)(th.as_tensor(observation)[None], th.as_tensor(action)[None])
             found, part = inputs[0].numpy(), env._simulator.layout.parts["velocities"]
             assert np.abs(expected[part]).max() > 0.0
             close = np.abs(found - expected) < 1e-3
@@ -132,9 +132,9 @@ def test_the_velocities_of_obstacles_have_the_symmetries_too():
 
 def test_time_reversal_needs_an_even_number_of_beams():
     with pytest.raises(ValueError, match="even number of lidar beams, got 3"):
-        time_reverse(th.zeros(1, 12), th.zeros(1, 2), EnvironmentSettings(lidar_beams=3))
+        time_reversal(EnvironmentSettings(lidar_beams=3))
     with pytest.raises(ValueError, match="lidar_fov of 2 pi rad, got 4"):
-        time_reverse(th.zeros(1, 41), th.zeros(1, 2), EnvironmentSettings(lidar_fov=4.0))
+        time_reversal(EnvironmentSettings(lidar_fov=4.0))
 
 
 def test_samples_can_be_seen_with_other_sensors(demonstrated, tmp_path):

@@ -33,10 +33,10 @@ from leapnav.training import (
 from leapnav.training.config import DAggerRunConfig, WarmStartConfig
 from leapnav.training.environments.playing import PlayedEpisode
 from leapnav.training.learning.driving import DrivenEpisode
-from leapnav.training.learning.symmetries import mirror, time_reverse
 from leapnav.training.learning.takeovers import Labeller
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy
 from leapnav.training.policies.onnx_export import export_onnx
+from leapnav.training.policies.symmetries import mirror, time_reversal
 
 AGES = (0.4, 1.2, 2.8)
 HISTORY = {"history": AGES, "previous_action": True}
@@ -129,14 +129,14 @@ def test_a_symmetry_transforms_all_frames_and_the_last_action(dataset, rememberi
     observed = dataset.observed(remembering.settings)
     plain, full = th.as_tensor(dataset.observations), th.as_tensor(observed.observations)
     actions = th.as_tensor(dataset.actions)
-    for symmetry in (mirror, time_reverse):
-        expected, moved = symmetry(plain, actions)
-        found, same = symmetry(full, actions, remembering.settings)
+    for symmetry in (mirror, time_reversal):
+        expected, moved = symmetry(EnvironmentSettings())(plain, actions)
+        found, same = symmetry(remembering.settings)(full, actions)
         assert th.equal(moved, same)
         frames = found.reshape(len(found), 4, FRAME)
         assert th.equal(th.cat([frames[:, 0, :9], frames[:, 0, 11:]], dim=1), expected)
         assert th.equal(frames[1:, 0, 9:11], th.where((full[1:, 9:11] == 0).all(1, True), 0.0, moved[:-1]))
-        assert th.equal(symmetry(found, moved, remembering.settings)[0], full)
+        assert th.equal(symmetry(remembering.settings)(found, moved)[0], full)
 
 
 def test_the_displacements_are_those_of_the_robot():

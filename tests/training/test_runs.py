@@ -388,7 +388,8 @@ def test_ppo_may_let_the_critic_learn_first_and_end_with_little_noise(demos, tmp
         train_ppo(config, progress=False)
         policy = load_policy(config.out)
         same = [th.equal(a, b) for a, b in zip(actor_parameters(start), actor_parameters(policy), strict=True)]
-        assert all(same) if fraction == 0.99 else not any(same)
+        # The bias of the actions cancels in the mean over the symmetries.
+        assert all(same) if fraction == 0.99 else same == [False] * (len(same) - 1) + [True]
         assert not th.equal(start.value_net.weight, policy.value_net.weight)
         assert th.allclose(policy.log_std.exp(), th.tensor(0.2))
 

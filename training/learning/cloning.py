@@ -8,7 +8,6 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch as th
@@ -30,9 +29,9 @@ from leapnav.envs.utils.validation import (
 from leapnav.experts.data.demonstrations import Demonstration
 from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
-from leapnav.training.learning.samples import Batch, Samples, Symmetry, split_courses
-from leapnav.training.learning.symmetries import mirror, time_reverse
+from leapnav.training.learning.samples import Batch, Samples, split_courses
 from leapnav.training.policies.actors import actor_parameters, parts_of_dict, policy_of, set_noise, update_target
+from leapnav.training.policies.symmetries import Transformation
 from leapnav.training.threads import limit_threads
 
 # Gradient steps of a fit with the default epochs, and bounds of the default batch size. A network that has learned from
@@ -126,16 +125,7 @@ class _Fit:
     def __init__(self, policy: BasePolicy, dataset: Dataset, config: CloningConfig, stream: int) -> None:
         check_cloning(config)
         check_observations(policy, dataset)
-        settings = dataset.settings
-        is_map = settings.observation == "map"  # whose rows have no such symmetry
-        can_reverse = dataset.is_reversible and not is_map and (settings.has_full_circle or not settings.has_lidar)
-        self._symmetries = [
-            *([partial(mirror, settings=settings)] if dataset.is_mirrored and not is_map else []),
-            *([partial(time_reverse, settings=settings)] if can_reverse else []),
-        ]
-        beams = settings.lidar_beams if settings.has_lidar else 0
-        if config.augment and can_reverse and beams % 2:
-            raise ValueError(f"augment: expected an even number of lidar beams, got {beams}; set augment=False")
+        self._symmetries = dataset.symmetries
         self.config = config
         self.losses: list[EpochLoss] = []
         self._policy = policy
@@ -224,7 +214,7 @@ class _Fit:
         set_noise(self._policy, (th.stack(squares).sum(dim=0) / len(samples)).sqrt().clamp(min=MIN_STD))
         update_target(self._policy)
 
-    def _random_symmetries(self) -> list[Symmetry]:
+    def _random_symmetries(self) -> list[Transformation]:
         """Return a random combination of the robot's symmetries."""
         combination = int(th.randint(2 ** len(self._symmetries), (1,), generator=self._rng))
         return [transform for number, transform in enumerate(self._symmetries) if combination & 2**number]

@@ -16,7 +16,7 @@ from zipfile import is_zipfile
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from leapnav.envs.robots import RobotModel, Symmetry
+from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.families import is_built_in
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
@@ -28,6 +28,7 @@ from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.files import atomic_path
 from leapnav.experts.data.datasets import CONTROL_PERIOD, ENVIRONMENT, open_dataset
 from leapnav.experts.data.demonstrations import Demonstration
+from leapnav.training.policies.symmetries import Transformation, symmetries
 
 FORMAT = 3  # version of the file format
 # Arguments of the environment that select the scenarios; the meaning of an observation does not depend on them.
@@ -178,21 +179,9 @@ class Dataset:
         return -self.returns / (2.0 * self._per_sample([cost.time_weight for _, cost in self._robots]))
 
     @property
-    def is_reversible(self) -> bool:
-        """Whether a rotation of all headings by 180 degrees changes neither footprints nor limits of the robots."""
-        return self._has("reversal") and all(
-            bool((robot.outline()[:, :2].sum(axis=1) == 0.0).all()) for robot, _ in self._robots
-        )
-
-    @property
-    def is_mirrored(self) -> bool:
-        """Whether a mirror image does not change the limits of the robots."""
-        return self._has("mirror")
-
-    def _has(self, name: str) -> bool:
-        """Whether the model and the limits of all robots have a symmetry."""
-        symmetry: Symmetry | None = getattr(self.settings.model, name)
-        return symmetry is not None and all(robot.has_symmetric_limits(symmetry) for robot, _ in self._robots)
+    def symmetries(self) -> tuple[Transformation, ...]:
+        """The symmetries that the observations and all robots have."""
+        return symmetries(self.settings, (robot for robot, _ in self._robots))
 
     @cached_property
     def _robots(self) -> list[tuple[RobotModel, Cost]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,9 @@ from stable_baselines3.common.policies import BasePolicy
 from leapnav.experts.problem.system import switching_functions
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import mean_action
+from leapnav.training.policies.symmetries import Transformation
 
 SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
-
-Symmetry = Callable[..., tuple[th.Tensor, th.Tensor]]
 
 
 @dataclass(frozen=True)
@@ -81,13 +80,13 @@ class Samples:
         """Yield what `batch` takes, for one pass over the samples in their order."""
         yield from th.arange(len(self)).split(size)
 
-    def batch(self, chosen: th.Tensor, symmetries: Sequence[Symmetry] = ()) -> Batch:
+    def batch(self, chosen: th.Tensor, symmetries: Sequence[Transformation] = ()) -> Batch:
         """Return some samples, after transformations by symmetries."""
         rows = self._rows[chosen]
         observations = self._observations[rows]
         actions, slopes, weights = (column[rows] for column in self._columns)
         for transform in symmetries:
-            _, slopes = transform(observations[:1], slopes)  # the slopes change sign with the actions
+            _, slopes = transform(observations[:0], slopes)  # the slopes change sign with the actions
             observations, actions = transform(observations, actions)
         return Batch(observations, actions, slopes, weights)
 

@@ -14,7 +14,7 @@ from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from leapnav.envs.simulation.observations import OFFSETS
-from leapnav.training.policies.navigation_policy import MomentumActor
+from leapnav.training.policies.navigation_policy import MomentumActor, network_action
 from leapnav.training.policies.network import NavigationFeatures
 
 
@@ -85,7 +85,7 @@ def as_observation(policy: BasePolicy, rows: Any) -> Any:
 
 
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
-    """Compute the deterministic actions of a policy without momentum, not clipped, with gradients.
+    """Compute the actions of a policy's network, without momentum and symmetries, not clipped, with gradients.
 
     They are in units of [-1, 1] also if the bounds of the policy's action space are others, as with Gymnasium's
     `RescaleAction`.
@@ -100,9 +100,9 @@ def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
     """
     observations = as_observation(policy, observations)
     if isinstance(policy, ActorCriticPolicy):
-        features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
-        middle, half = (th.as_tensor(part, device=features.device) for part in action_range(policy.action_space))
-        return (policy.action_net(policy.mlp_extractor.forward_actor(features)) - middle) / half
+        actions = network_action(policy, observations)
+        middle, half = (th.as_tensor(part, device=actions.device) for part in action_range(policy.action_space))
+        return (actions - middle) / half
     actor = _actor(policy)
     if isinstance(actor, MomentumActor):
         return th.tanh(Actor.get_action_dist_params(actor, cast(Any, observations))[0])
@@ -125,7 +125,7 @@ def set_noise(policy: BasePolicy, std: th.Tensor | float) -> None:
 
 
 def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
-    """Copy the weights of the mean action between policies with the same network.
+    """Copy the weights of the mean action between policies with the same network, without momentum and symmetries.
 
     If the observation of the target has a part `motion` and that of the source has none, the weights of its features
     are 0, so that the actions do not depend on it yet.

@@ -16,8 +16,14 @@ from torch import nn
 
 from leapnav.envs.utils.validation import check_choice
 from leapnav.training.policies.actors import parts_of_dict
-from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, has_momentum
+from leapnav.training.policies.navigation_policy import (
+    MomentumSACPolicy,
+    NavigationPolicy,
+    has_momentum,
+    symmetries_of,
+)
 from leapnav.training.policies.network import NavigationFeatures, check_spaces
+from leapnav.training.policies.symmetries import Transformation
 
 KINDS = ("actor-critic", "sac", "td3", "tqc")
 EXTRACTORS = {"navigation": NavigationFeatures, "flatten": FlattenExtractor, "combined": CombinedExtractor}
@@ -35,6 +41,7 @@ class Architecture:
             an observation in a Dict).
         activation: name of the activation function in `torch.nn`.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`, or None.
+        symmetries: transformations over which the mean action is averaged, see `leapnav.training.policies.symmetries`.
 
     """
 
@@ -44,6 +51,7 @@ class Architecture:
     extractor: str = "navigation"
     activation: str = "ReLU"
     effort_weights: tuple[float, ...] | None = None
+    symmetries: tuple[Transformation, ...] = ()
 
     def make(self, observation_space: spaces.Box | spaces.Dict, action_space: spaces.Space) -> BasePolicy:
         """Create an untrained policy on the CPU.
@@ -67,7 +75,9 @@ class Architecture:
         }
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
-        kind = _policy_class(self.kind, momentum=self.effort_weights is not None)
+        if self.symmetries:
+            arguments["symmetries"] = self.symmetries
+        kind = _policy_class(self.kind, own=self.effort_weights is not None or bool(self.symmetries))
         return kind(observation_space, action_space, lambda _: 3e-4, **arguments)
 
     @classmethod
@@ -92,7 +102,7 @@ class Architecture:
             raise ValueError("model: expected a policy without state-dependent exploration, got use_sde=True")
         hidden, critic = widths(given.net_arch)
         weights = given.effort_weights if has_momentum(policy) else None
-        return cls(kind, hidden, critic, extractor, activation, weights)
+        return cls(kind, hidden, critic, extractor, activation, weights, symmetries_of(policy))
 
 
 def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -130,9 +140,9 @@ def _is_installed(kind: str) -> bool:
     return kind != "tqc" or find_spec("sb3_contrib") is not None
 
 
-def _policy_class(kind: str, *, momentum: bool = False) -> Any:
-    """Return the class of a kind of policies."""
-    if momentum:
+def _policy_class(kind: str, *, own: bool = False) -> Any:
+    """Return the class of a kind of policies, with momentum or symmetries the one of leapnav."""
+    if own:
         return {"actor-critic": NavigationPolicy, "sac": MomentumSACPolicy}[kind]
     if kind == "tqc":
         from sb3_contrib.tqc.policies import TQCPolicy  # from the extra `contrib`

@@ -14,6 +14,7 @@ from torch import nn
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, frame_size, parts_of
 from leapnav.experts.data.datasets import ENVIRONMENT
 from leapnav.training.policies.navigation_policy import NavigationPolicy
+from leapnav.training.policies.symmetries import Transformation
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
 ROBOT_RADIUS = 0.25  # radius of the robots in all families (m); a range minus this is the clearance along a beam
@@ -238,6 +239,7 @@ def make_policy(
     hidden: Sequence[int] = HIDDEN,
     critic: Sequence[int] | None = None,
     effort_weights: Sequence[float] | None = None,
+    symmetries: Sequence[Transformation] = (),
 ) -> ActorCriticPolicy:
     """Create an untrained actor-critic policy for `leapnav/Navigate-v0`, which PPO and A2C can train.
 
@@ -248,6 +250,7 @@ def make_policy(
         critic: widths of the critic's hidden layers; None: those of the actor.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`; None:
             without.
+        symmetries: transformations over which the mean action is averaged, see `leapnav.training.policies.symmetries`.
 
     Raises:
         ValueError: the spaces are not those of the environment with a lidar, or the observations of a policy with
@@ -257,8 +260,9 @@ def make_policy(
     check_spaces(observation_space, action_space)
     arguments = network(hidden, critic)
     kind: Any = ActorCriticPolicy
-    if effort_weights is not None:
-        kind, arguments = NavigationPolicy, {**arguments, "effort_weights": effort_weights}
+    if effort_weights is not None or symmetries:
+        kind = NavigationPolicy
+        arguments = {**arguments, "effort_weights": effort_weights, "symmetries": symmetries}
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         return kind(observation_space, action_space, lr_schedule=lambda _: 3e-4, log_std_init=-2.0, **arguments)

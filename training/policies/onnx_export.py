@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import asdict, replace
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ class _Actor(nn.Module):
         self.policy: Any = policy
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
-        return deterministic_action(self.policy, mean_action(self.policy, observation), observation)
+        return deterministic_action(self.policy, partial(mean_action, self.policy), observation)
 
 
 def export_onnx(

@@ -23,6 +23,7 @@ from leapnav.training.learning.dataset import Dataset
 from leapnav.training.policies.actors import copy_actor
 from leapnav.training.policies.files import load_policy
 from leapnav.training.policies.network import make_policy
+from leapnav.training.policies.symmetries import symmetries
 from leapnav.training.runs.checks import check_config, check_demonstrations
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
@@ -182,7 +183,13 @@ def _new_policy(config: BCConfig | DAggerRunConfig) -> ActorCriticPolicy:
     """Return an untrained policy with the network and the observations of a run."""
     env = make_env(config)
     spaces = env.observation_space, env.action_space
-    return make_policy(*spaces, config.seed, config.hidden, effort_weights=config.effort_weights)
+    return make_policy(
+        *spaces,
+        config.seed,
+        config.hidden,
+        effort_weights=config.effort_weights,
+        symmetries=symmetries(env.settings, [env.source.robot]) if config.symmetric else (),
+    )
 
 
 def mean_scores(evaluations: Sequence[Evaluation]) -> tuple[float, float]:

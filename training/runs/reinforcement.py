@@ -32,8 +32,9 @@ from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.learning.warm_start import warm_start
 from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
 from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
-from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy
+from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, symmetries_of
 from leapnav.training.policies.network import network
+from leapnav.training.policies.symmetries import symmetries
 from leapnav.training.runs.checks import check_config, check_demonstrations
 from leapnav.training.runs.imitation import mean_scores, observed_settings
 from leapnav.training.runs.run import Run
@@ -72,7 +73,8 @@ def train_ppo(
     if not isinstance(cast(object, config), PPOConfig):
         raise TypeError(f"config: expected a PPOConfig, got {type(config).__name__}")
 
-    def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
+    def make(venv: VecEnv, dataset: Dataset | None, start: BasePolicy | None) -> BaseAlgorithm:
+        inner = unwrap(venv)[0]
         return PPO(
             NavigationPolicy,
             venv,
@@ -89,6 +91,7 @@ def train_ppo(
                 "log_std_init": math.log(config.std),
                 "quiet": config.quiet,
                 "effort_weights": config.effort_weights,
+                "symmetries": symmetries(inner.settings, [inner.source.robot]) if symmetries_of(start) else (),
             },
             seed=config.seed,
             device="cpu",
@@ -124,7 +127,7 @@ def train_sac(
         except ModuleNotFoundError:
             raise ModuleNotFoundError('TQC needs sb3-contrib: pip install "leapnav[contrib]"') from None
 
-    def make(venv: VecEnv, dataset: Dataset | None) -> BaseAlgorithm:
+    def make(venv: VecEnv, dataset: Dataset | None, start: BasePolicy | None) -> BaseAlgorithm:
         weights = config.effort_weights
         policy, options = "MlpPolicy", network(config.hidden)
         if weights is not None:
@@ -151,12 +154,12 @@ def train_sac(
 def _train(
     algorithm: str,
     config: Config,
-    make: Callable[[VecEnv, Dataset | None], BaseAlgorithm],
+    make: Callable[[VecEnv, Dataset | None, BasePolicy | None], BaseAlgorithm],
     callback: MaybeCallback,
     wrapper: Callable[[VecEnv], VecEnv] | None,
     progress: bool,
 ) -> list[Evaluation]:
-    """Train the model that `make` returns for the training environment and the demonstrations."""
+    """Train the model that `make` returns for the training environment, the demonstrations and the first policy."""
     # Invalid arguments are reported before the run directory is created.
     check_config(config)
     demos, start = _resolve_warm_start(config)
@@ -171,7 +174,7 @@ def _train(
         venv = wrapper(venv)
         if not isinstance(cast(object, venv), VecEnv):
             raise TypeError(f"wrapper: expected a function that returns a VecEnv, got {type(venv).__name__}")
-    model = make(venv, dataset)
+    model = make(venv, dataset, start)
     if start is not None and config.start.actor:
         copy_actor(start, model.policy)
     run = Run(algorithm, config)

@@ -1,0 +1,112 @@
+"""Policies whose actions are means over the symmetries of the robot."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+
+from leapnav.envs import NavigateEnv
+from leapnav.envs.settings import EnvironmentSettings
+from leapnav.training import BCConfig, CloningConfig, PPOConfig, load_policy, save_policy, train_bc, train_ppo
+from leapnav.training.policies.navigation_policy import NavigationPolicy
+from leapnav.training.policies.network import make_policy, network
+from leapnav.training.policies.symmetries import symmetries
+
+ENVIRONMENTS = {
+    "unicycle": {},
+    "history": {"history": (0.4, 1.2)},
+    "geodesic": {"observation": "geodesic", "velocities": True},
+    "differential_drive": {"robot": "differential_drive"},
+    "car": {"robot": "car"},
+    "dynamic_unicycle": {"robot": "dynamic_unicycle"},
+    "free": {"horizon": "free", "previous_action": True},
+}
+
+
+def environment(**arguments):
+    return NavigateEnv("open", split="fresh", lidar_beams=16, **arguments)
+
+
+def symmetric_policy(env, hidden=(16, 16), **arguments):
+    found = symmetries(env.settings, [env.source.robot])
+    return make_policy(env.observation_space, env.action_space, 0, hidden, symmetries=found, **arguments)
+
+
+def observations_of(env):
+    """Return observations of an episode with random actions."""
+    env.action_space.seed(0)
+    rows = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(20))]
+    return th.as_tensor(np.array(rows))
+
+
+def actions_of(policy, observations):
+    return th.as_tensor(policy.predict(observations.numpy(), deterministic=True)[0])
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_a_transformed_observation_leads_to_the_transformed_action(name):
+    env = environment(**ENVIRONMENTS[name])
+    policy = symmetric_policy(env, effort_weights=(1.0, 1.0) if name == "free" else None)
+    observations = observations_of(env)
+    actions = actions_of(policy, observations)
+    assert actions.abs().max() > 1e-4
+    assert len(policy.symmetries) == 2
+    for transformation in policy.symmetries:
+        found, expected = transformation(observations, actions)
+        assert th.equal(transformation(found, expected)[0], observations)
+        th.testing.assert_close(actions_of(policy, found), expected, atol=1e-6, rtol=1e-4)
+
+
+def test_what_is_not_symmetric():
+    robot = environment().source.robot
+    assert len(symmetries(EnvironmentSettings(lidar_beams=16), [robot])) == 2
+    for arguments, count in (
+        ({"lidar_beams": 15}, 1),
+        ({"lidar_fov": 4.0}, 1),
+        ({"observation": "map"}, 0),
+        ({"dict_observation": True}, 0),
+    ):
+        assert len(symmetries(EnvironmentSettings(**arguments), [robot])) == count
+    limited = type(robot)(speed=(0.0, 1.0), turn_rate=(-1.0, 1.0))
+    assert len(symmetries(EnvironmentSettings(), [limited])) == 1
+    env = environment()
+    env.action_space.high[:] = 2.0
+    with pytest.raises(ValueError, match="symmetries: expected none for actions with other bounds than -1 and 1"):
+        symmetric_policy(env)
+
+
+def test_files_contain_the_symmetries(tmp_path):
+    env = environment()
+    options = {**network((16, 16)), "symmetries": symmetries(env.settings, [env.source.robot])}
+    model = PPO(NavigationPolicy, env, policy_kwargs=options, n_steps=32, batch_size=32, device="cpu", seed=0)
+    model.learn(32)
+    observations = observations_of(env)
+    expected = actions_of(model.policy, observations)
+    save_policy(model, tmp_path / "policy")
+    model.save(tmp_path / "model.zip")
+    for saved in (tmp_path / "policy", tmp_path / "model.zip"):
+        loaded = load_policy(saved)
+        assert loaded.symmetries == model.policy.symmetries
+        th.testing.assert_close(actions_of(loaded, observations), expected)
+    again = PPO.load(tmp_path / "model.zip", device="cpu")
+    th.testing.assert_close(actions_of(again.policy, observations), expected)
+
+
+def test_runs_of_imitation_are_symmetric_and_ppo_starts_from_them(tmp_path):
+    cloning = CloningConfig(epochs=1, validation_share=0.0)
+    settings = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 2, "cloning": cloning}
+    for symmetric in (True, False):
+        config = BCConfig(
+            out=tmp_path / str(symmetric), observation="lidar", scenarios=2, symmetric=symmetric, **settings
+        )
+        train_bc(config, progress=False)
+        clone = load_policy(config.out)
+        assert bool(getattr(clone, "symmetries", ())) == symmetric
+    start = tmp_path / "True"
+    options = {"n_envs": 2, "n_steps": 8, "batch_size": 16, "total_timesteps": 16, "warm_start": (start,)}
+    config = PPOConfig(out=tmp_path / "ppo", learning_rate=1e-12, **options, **settings)
+    train_ppo(config, progress=False)
+    trained, clone = load_policy(config.out), load_policy(start)
+    observations = observations_of(environment())
+    assert trained.symmetries == clone.symmetries
+    th.testing.assert_close(actions_of(trained, observations), actions_of(clone, observations), atol=1e-4, rtol=1e-4)
