@@ -7,6 +7,9 @@ INSTALL := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --constraint constra
 # One process per core; torch's threads would only compete with them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
+# Many tests start processes, which load faster with byte code.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo compile test test-all lint types docs bench coverage clean
 .DELETE_ON_ERROR:
 

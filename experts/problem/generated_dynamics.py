@@ -82,15 +82,6 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
         **{f"drift[{i}]": a for i, a in enumerate(drift)},
         **{f"fields[{i}, {j}]": fields[j][i] for i in range(n) for j in range(m)},
     }
-    variables = (*q, *u)
-    slopes = [[sp.diff(e, s) for s in variables] for e in end]
-    weighted = [sp.Add(*(p * row[a] for p, row in zip(lam, slopes, strict=True))) for a in range(n + m)]
-    curvature = {(a, b): sp.diff(weighted[a], variables[b]) for a in range(n + m) for b in range(a, n + m)}
-    derivatives = {
-        **{f"A[{i}, {j}]": slopes[i][j] for i in range(n) for j in range(n)},
-        **{f"B[{i}, {j}]": slopes[i][n + j] for i in range(n) for j in range(m)},
-        **_symmetric("W", curvature),
-    }
     terms = obstacle_terms(system, obstacles)
     costs = _costs(sp.sympify(state_cost).xreplace(rename), q, terms, limited)
     sources = {
@@ -117,7 +108,7 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             "",
             "@kernel(STEP_DERIVATIVES_SIGNATURE)",
             "def step_derivatives(q, u, h, lam, data, A, B, W):",
-            *unpack(sources, _body(derivatives, "A", "B", "W")),
+            *unpack(sources, _body(_step_derivatives(rates, q, u, h, lam), "A", "B", "W")),
             "",
             "@kernel(STATE_COST_SIGNATURE)",
             "def state_cost(q, data, field, gradient, hessian):",
@@ -126,6 +117,73 @@ def _generate(system: ControlAffineSystem, state_cost: sp.Expr, obstacles: Obsta
             "",
         ]
     )
+
+
+def _step_derivatives(
+    rates: list[Any], q: Sequence[Any], u: Sequence[Any], h: Any, lam: Sequence[Any]
+) -> dict[str, Any]:
+    """Return the derivatives of a step, and what they are computed from, by target, in the order of the computation.
+
+    They follow from those of the rates f at the start q and at the midpoint y = q + h/2 f(q, u) by the chain rule. With
+    the derivatives Y of (y, u) by (q, u), the Jacobian of the step is that of q, plus h f'(y, u) Y, and the Hessian of
+    lam' (q + h f(y, u)) is h Y' H(lam) Y at the midpoint, plus h^2/2 H(p) at the start with p = lam' df/dq(y, u), where
+    H(p) is the Hessian of p' f. The step as one expression, differentiated twice, is many times longer.
+    """
+    n, size, variables = len(q), len(q) + len(u), (*q, *u)
+    computed: dict[str, Any] = {}
+
+    def named(name: str, expression: Any) -> Any:
+        """Return the symbol of an expression that is computed once; numbers and symbols stay as they are."""
+        if sp.sympify(expression).is_Atom:
+            return expression
+        computed[name] = expression
+        return sp.Symbol(name, real=True)
+
+    middle = {s: named(f"mid{i}", s + h / 2 * rate) for i, (s, rate) in enumerate(zip(q, rates, strict=True))}
+    first = [[sp.diff(rate, s) for s in variables] for rate in rates]
+    second = [[[sp.diff(one, s) for s in variables] for one in row] for row in first]
+    slopes = [[named(f"slope{i}_{a}", first[i][a].xreplace(middle)) for a in range(size)] for i in range(n)]
+    changes = [
+        [named(f"change{i}_{a}", int(i == a) + (h / 2 * first[i][a] if i < n else 0)) for a in range(size)]
+        for i in range(size)
+    ]
+    jacobian = [
+        [int(i == a) + h * sp.Add(*(slopes[i][b] * changes[b][a] for b in range(size))) for a in range(size)]
+        for i in range(n)
+    ]
+    pulled = [named(f"pulled{j}", sp.Add(*(lam[i] * slopes[i][j] for i in range(n)))) for j in range(n)]
+    bent = [
+        [
+            named(f"bent{a}_{b}", sp.Add(*(lam[i] * second[i][a][b].xreplace(middle) for i in range(n))))
+            for b in range(size)
+        ]
+        for a in range(size)
+    ]
+    turned = [
+        [named(f"turned{a}_{b}", sp.Add(*(bent[a][c] * changes[c][b] for c in range(size)))) for b in range(size)]
+        for a in range(size)
+    ]
+    hessian = {
+        (a, b): h
+        * (
+            sp.Add(*(changes[c][a] * turned[c][b] for c in range(size)))
+            + h / 2 * sp.Add(*(pulled[i] * second[i][a][b] for i in range(n)))
+        )
+        for a in range(size)
+        for b in range(a, size)
+    }
+    derivatives = {
+        **{f"A[{i}, {j}]": jacobian[i][j] for i in range(n) for j in range(n)},
+        **{f"B[{i}, {j}]": jacobian[i][n + j] for i in range(n) for j in range(size - n)},
+        **_symmetric("W", hessian),
+    }
+    used = set().union(*(sp.sympify(e).free_symbols for e in derivatives.values()))
+    for name, expression in reversed(list(computed.items())):
+        if sp.Symbol(name, real=True) in used:
+            used |= expression.free_symbols
+        else:
+            del computed[name]
+    return {**computed, **derivatives}
 
 
 def _costs(cost: Any, q: Sequence[sp.Symbol], terms: Sequence[ObstacleTerm], limited: Sequence[int]) -> dict[str, Any]:

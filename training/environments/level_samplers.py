@@ -17,7 +17,6 @@ from typing import Any, Literal, cast, get_args
 
 import gymnasium as gym
 import numpy as np
-from scipy.stats import rankdata
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.sources import LevelOutcome
@@ -165,6 +164,8 @@ class PrioritizedSampler(UniformSampler):
         known = np.flatnonzero(~np.isnan(self.scores))
         if len(known) == 0:
             return result
+        from scipy.stats import rankdata  # takes half a second to load
+
         by_score = rankdata(-self.scores[known]) ** (-1.0 / self._temperature)
         by_age = (self._draws - self._drawn[known] + 1).astype(float)
         result[known] = (1 - self._staleness) * by_score / by_score.sum() + self._staleness * by_age / by_age.sum()

@@ -21,7 +21,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import norm, t, trim_mean
+from scipy.special import ndtri, stdtrit
 
 from leapnav.training.scoring.results import Evaluation
 
@@ -29,7 +29,7 @@ N_RESAMPLES = 2000  # bootstrap resamples of an interval with one run
 N_VARIANCE_RESAMPLES = 500  # bootstrap resamples of each of the three variances with several runs
 CONFIDENCE = 0.95
 QUANTILE = (1 + CONFIDENCE) / 2
-NORMAL_QUANTILE = float(norm.ppf(QUANTILE))
+NORMAL_QUANTILE = float(ndtri(QUANTILE))
 MAX_RESAMPLED_VALUES = 2_000_000  # values in memory at the same time
 Statistic = Callable[[np.ndarray], np.ndarray]  # reduces the last axis
 
@@ -289,7 +289,7 @@ class _Variances:
         runs, scenarios = n_runs - 1, max(1, n_scenarios - 1)
         parts = self.runs**2 / runs + self.scenarios**2 / scenarios + self.interaction**2 / (runs * scenarios)
         total = self.scenarios + self.excess
-        return float(t.ppf(QUANTILE, max(1.0, total**2 / parts))) if parts > 0 else NORMAL_QUANTILE
+        return float(stdtrit(max(1.0, total**2 / parts), QUANTILE)) if parts > 0 else NORMAL_QUANTILE
 
 
 def _rate(values: np.ndarray, banks: np.ndarray) -> Interval:
@@ -417,4 +417,6 @@ def _median(values: np.ndarray) -> np.ndarray:
 
 
 def _interquartile_mean(values: np.ndarray) -> np.ndarray:
+    from scipy.stats import trim_mean  # takes half a second to load
+
     return trim_mean(values, 0.25, axis=-1)
