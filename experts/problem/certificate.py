@@ -103,7 +103,9 @@ def certify(
     # The time is free at the end, but no control changes it.
     has_free_end = arrays.free.sum() > (problem.clock >= 0)
     try:
-        if has_free_end:
+        if converged is not Status.SUCCESS:  # no extremal, whose segments do not even have to meet
+            conjugate_point = math.nan
+        elif has_free_end:
             conjugate_point = first_focal_time(extremal, arrays.free)
         else:
             conjugate_point = first_even_conjugate_time(extremal, out[:, -1].copy())

@@ -33,9 +33,10 @@ COST_TOLERANCE = 1e-4  # relative; paths whose costs agree to this are one local
 WINDINGS = (0, -1, 1)
 # First weight of a barrier, as a fraction of the cost per second; smaller costs per unit controls are rounding errors.
 FIRST_BARRIER, NEGLIGIBLE = 0.1, 1e-12
-# Free horizon: first guess (s), smallest factor and largest number of its steps, relative tolerance, and initial
-# controls per step.
-FIRST_HORIZON, MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE, HORIZON_STARTS = 1.0, 0.25, 12, 0.05, 4
+# Free horizon: first guess (s), largest number of times it is doubled or halved, then smallest factor and largest
+# number of steps, relative tolerance, and initial controls per horizon.
+FIRST_HORIZON, MAX_DOUBLINGS, HORIZON_STARTS = 1.0, 12, 4
+MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE = 0.5, 8, 0.05
 
 
 def initial_paths(
@@ -83,31 +84,53 @@ def _with_horizon(problem: OptimalControlProblem, seed: int) -> OptimalControlPr
 def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
     """Estimate the optimal horizon (s) of a problem with a free horizon.
 
-    The best local minimum in a fixed time gives the derivative of its cost by the horizon, which is the Hamiltonian.
-    The next horizon minimises a cost of the form a / T + b T with this value and derivative. If no path to the goal is
-    found, or none within the limits of the states, the horizon is too short.
+    The cost of the best path of a fixed time may have several local minima over this time, and paths of some times are
+    not found. Powers of 2 are tried first: longer times until the time alone costs more than the best path, and shorter
+    ones until a path costs twice as much. The derivative of the cost by the time, which is the Hamiltonian, then gives
+    the time that minimises a cost of the form a / T + b T; the step to it is shortened until the cost decreases.
     """
-    horizon, too_short, reachable = FIRST_HORIZON, 0.0, math.inf
-    for _ in range(MAX_HORIZON_STEPS):
+    found: dict[float, tuple[float, Trajectory]] = {}
+
+    def lowest_cost(horizon: float) -> float:
+        """Return the lowest cost of the paths of a fixed time within the limits of the states, which is kept."""
         minima = local_minima(problem.with_horizon(horizon), starts=HORIZON_STARTS, seed=seed)
         minima = [(cost, path) for cost, path in minima if state_margin(problem.state_limits, path.states) > 0]
         if not minima:
-            if horizon > reachable:  # there are paths, but none was found
-                break
-            too_short = horizon
-            horizon = math.sqrt(too_short * reachable) if reachable < math.inf else horizon / MIN_HORIZON_FACTOR
-            continue
-        reachable = horizon
-        cost, path = min(minima, key=lambda entry: entry[0])
-        assert path.costates is not None  # `local_minima` computes them
-        # On a coarse path the Hamiltonian varies where Phi does, so its mean is used.
-        values = hamiltonians(problem.arrays.flow, np.concatenate([path.states, path.costates], axis=1))
-        slope = float(np.trapezoid(values, path.times))
-        factor = time_factor(cost, slope, MIN_HORIZON_FACTOR)
-        horizon = max(factor * horizon, math.sqrt(too_short * reachable))
-        if abs(horizon / reachable - 1.0) < HORIZON_TOLERANCE:
+            return math.inf
+        found[horizon] = min(minima, key=lambda entry: entry[0])
+        return found[horizon][0]
+
+    best = math.inf
+    for horizon in (FIRST_HORIZON * 2.0**k for k in range(MAX_DOUBLINGS)):
+        if problem.time_weight * horizon >= best:
             break
-    return reachable if reachable < math.inf else horizon
+        best = min(best, lowest_cost(horizon))
+    for horizon in (FIRST_HORIZON * 2.0**-k for k in range(1, MAX_DOUBLINGS)):
+        cost = lowest_cost(horizon)
+        if math.isfinite(best) and cost > 2.0 * best:
+            break
+        best = min(best, cost)
+    if not found:
+        return FIRST_HORIZON
+    horizon = min(found, key=lambda one: found[one][0])
+    factor = _time_factor(problem, *found[horizon])
+    for _ in range(MAX_HORIZON_STEPS):
+        if abs(factor - 1.0) < HORIZON_TOLERANCE:
+            break
+        if lowest_cost(factor * horizon) < found[horizon][0]:
+            horizon *= factor
+            factor = _time_factor(problem, *found[horizon])
+        else:
+            factor = math.sqrt(factor)
+    return horizon
+
+
+def _time_factor(problem: OptimalControlProblem, cost: float, path: Trajectory) -> float:
+    """Return the factor of the horizon of a path with costates that is expected to minimise the cost."""
+    assert path.costates is not None  # `local_minima` computes them
+    # On a coarse path the Hamiltonian varies where Phi does, so its mean is used.
+    values = hamiltonians(problem.arrays.flow, np.concatenate([path.states, path.costates], axis=1))
+    return time_factor(cost, float(np.trapezoid(values, path.times)), MIN_HORIZON_FACTOR)
 
 
 def _windings(problem: OptimalControlProblem) -> Iterator[OptimalControlProblem]:
@@ -175,7 +198,9 @@ def _optimise(problem: OptimalControlProblem, controls: np.ndarray) -> DirectPat
         return None
     path = optimise(problem, DirectPath(times, states, controls, np.zeros_like(states), math.inf, math.inf, False))
     scale = 1.0 + np.abs(path.states).max()
-    return path if path.violation < MAX_VIOLATION * scale and math.isfinite(path.cost) else None
+    # In a problem without a minimum, controls may be so large that their squares overflow.
+    is_finite = math.isfinite(path.cost + float(np.vdot(path.controls, path.controls)))
+    return path if path.violation < MAX_VIOLATION * scale and is_finite else None
 
 
 def _clip(problem: OptimalControlProblem, U: np.ndarray) -> np.ndarray:

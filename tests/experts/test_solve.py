@@ -434,6 +434,7 @@ def test_a_diverging_collocation_is_reported_and_nothing_is_printed_below(capfd)
         position=(x, y),
     )
     goal = (5.433850416929541, 7.6235428761024515, -1.4032183662462445, 0)
-    extremal = solve(OptimalControlProblem(car, (0, 0, 0, 0), goal, 0.5, (1, 0.3)), method="collocation")
+    problem = OptimalControlProblem(car, (0, 0, 0, 0), goal, 0.5, (1, 0.3))
+    extremal = solve(problem, "collocation", guess=problem.straight_line())
     assert extremal.status is Status.DIVERGED
     assert "On entry to" not in "".join(capfd.readouterr())
