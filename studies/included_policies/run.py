@@ -14,27 +14,36 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from leapnav.envs import NavigateEnv
 from leapnav.envs.scenarios.families import families_of
 from leapnav.training import DAggerRunConfig, load_policy, policy_environment, read_episodes, save_policy, score
 from leapnav.training.config import read_config
-from leapnav.training.policies.files import SHIPPED, read_description
+from leapnav.training.policies.architecture import with_symmetries
+from leapnav.training.policies.files import read_description
+from leapnav.training.policies.symmetries import symmetries
 from leapnav.training.scoring.reports import markdown_cells
 
 sys.path.append(str(Path(__file__).parents[1]))
 from common import fresh_bank, load, play, read_arguments, train
 
 HERE = Path(__file__).parent
+INCLUDED = HERE.parents[1] / "training/policies/pretrained"  # the sources, which an editable installation links to
 HARD = {"clutter-hard": "clutter"}  # results of policies among hard obstacles, for which they were not trained
 NAMES = (*sorted(path.stem for path in (HERE / "configurations").glob("*.json")), *HARD)
+# Policies that were trained without the means over the symmetries of the robot, which they have since then.
+AVERAGED = ("car-clutter", "polygons-lidar", "rooms-lidar", "slalom-lidar")
 SCENARIOS = 4000  # of each bank of fresh scenarios
 TABLES = {"included-policies": "docs/results.md"}  # with the files that contain them
 
 
-def include(run: Path, included: Path) -> None:
+def include(run: Path, included: Path, *, average: bool) -> None:
     """Write the actor of a run, in half precision, into the directory of the policies."""
+    training, environment, policy = read_description(run)["training"], policy_environment(run), load_policy(run)
+    if average:
+        env = NavigateEnv(training["family"], split="fresh", **environment)
+        policy = with_symmetries(policy, symmetries(env.settings, [env.source.robot]))
     shutil.rmtree(included, ignore_errors=True)
-    training = read_description(run)["training"]
-    save_policy(load_policy(run), included, policy_environment(run), training=training, half=True)
+    save_policy(policy, included, environment, training=training, half=True)
 
 
 def tables(results: Path) -> dict[str, str]:
@@ -62,12 +71,13 @@ def main() -> None:
     for name in arguments.names:
         policy = HARD.get(name, name)
         is_trained = arguments.train and name not in HARD
-        folder = arguments.results / "policies" if tiny and is_trained else SHIPPED
+        folder = arguments.results / "policies" if tiny and is_trained else INCLUDED
         settings = HERE / "configurations" / f"{policy}.json"
         _, config = read_config(settings)
         assert isinstance(config, DAggerRunConfig)
         if is_trained:
-            include(train(settings, arguments.runs / "included_policies" / name, tiny=tiny), folder / name)
+            run = train(settings, arguments.runs / "included_policies" / name, tiny=tiny)
+            include(run, folder / name, average=name in AVERAGED)
         obstacles = "hard" if name in HARD else config.obstacles
         task = {"robot": config.robot, "horizon": config.horizon, "obstacles": obstacles}
         banks = [fresh_bank(arguments.runs, one, count, tiny=tiny, **task) for one in families_of(config.family)]

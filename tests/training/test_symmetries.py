@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from onnxruntime import InferenceSession
+from stable_baselines3 import PPO, SAC
 
 from leapnav.envs import NavigateEnv
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.training import BCConfig, CloningConfig, PPOConfig, load_policy, save_policy, train_bc, train_ppo
+from leapnav.training.policies.architecture import with_symmetries
 from leapnav.training.policies.navigation_policy import NavigationPolicy
 from leapnav.training.policies.network import make_policy, network
+from leapnav.training.policies.onnx_export import export_onnx
 from leapnav.training.policies.symmetries import symmetries
 
 ENVIRONMENTS = {
@@ -88,8 +91,27 @@ def test_files_contain_the_symmetries(tmp_path):
         loaded = load_policy(saved)
         assert loaded.symmetries == model.policy.symmetries
         th.testing.assert_close(actions_of(loaded, observations), expected)
+    export_onnx(tmp_path / "policy", tmp_path / "policy.onnx")
+    session = InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    (exported,) = session.run(None, {"observation": observations.numpy()})
+    th.testing.assert_close(th.as_tensor(exported), expected, atol=1e-5, rtol=0.0)
     again = PPO.load(tmp_path / "model.zip", device="cpu")
     th.testing.assert_close(actions_of(again.policy, observations), expected)
+
+
+def test_symmetries_are_added_to_a_policy():
+    env = environment()
+    found = symmetries(env.settings, [env.source.robot])
+    plain = make_policy(env.observation_space, env.action_space, 0, (16, 16))
+    symmetric, observations = with_symmetries(plain, found), observations_of(env)
+    expected = actions_of(plain, observations)
+    for transformation in found:
+        images, _ = transformation(observations, expected)
+        _, back = transformation(images, actions_of(plain, images))
+        assert not th.allclose(back, expected, atol=1e-4)
+    th.testing.assert_close(actions_of(symmetric, observations), actions_of(symmetric_policy(env), observations))
+    with pytest.raises(ValueError, match="policy: expected one of PPO or A2C, got SACPolicy"):
+        with_symmetries(SAC("MlpPolicy", env, policy_kwargs=network((16, 16)), device="cpu").policy, found)
 
 
 def test_runs_of_imitation_are_symmetric_and_ppo_starts_from_them(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -103,6 +103,27 @@ class Architecture:
         hidden, critic = widths(given.net_arch)
         weights = given.effort_weights if has_momentum(policy) else None
         return cls(kind, hidden, critic, extractor, activation, weights, symmetries_of(policy))
+
+
+def with_symmetries(policy: BasePolicy, symmetries: tuple[Transformation, ...]) -> BasePolicy:
+    """Return a policy with the weights of another one, whose actions are means over symmetries.
+
+    Args:
+        policy: a policy of PPO or A2C.
+        symmetries: see `leapnav.training.policies.symmetries`.
+
+    Raises:
+        ValueError: the policy is of another algorithm, or has an architecture that is not supported.
+
+    """
+    architecture = Architecture.of(policy)
+    if architecture.kind != "actor-critic":
+        raise ValueError(f"policy: expected one of PPO or A2C, got {type(policy).__name__}")
+    assert isinstance(policy.observation_space, (spaces.Box, spaces.Dict))
+    symmetric = replace(architecture, symmetries=symmetries).make(policy.observation_space, policy.action_space)
+    symmetric.load_state_dict(policy.state_dict())
+    symmetric.set_training_mode(False)
+    return symmetric
 
 
 def widths(net_arch: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
