@@ -17,8 +17,7 @@ LATER_SENSORS = {"velocities": False, "lidar_fov": math.tau}  # those that older
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
 PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
 
-# Literals, so that the command line shows and completes the choices; a test compares them with `FAMILIES`. Families and
-# robots of the user are text as well.
+# The command line shows and completes literals; a test compares them with `FAMILIES`. Those of the user are text.
 AtRest = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
 Moving = Literal["crossing", "traffic", "crowd", "doors"]
 FamilyName = Literal[AtRest, Moving, "all"] | str
@@ -251,7 +250,7 @@ class DAggerRunConfig(_ImitationConfig):
     """Dataset aggregation (DAgger): the learner drives, the expert takes over and provides the labels."""
 
     policy: Path | None = None
-    """Policy to use as the first learner instead of a new clone."""
+    """Policy whose network is the first learner's, instead of a new clone."""
     n_envs: int = 256
     """Number of parallel robots."""
     dagger: DAggerConfig = field(default_factory=DAggerConfig)
@@ -393,7 +392,7 @@ class SACConfig(_LearnerConfig):
 
 def _as_paths(value: Any) -> list[Path]:
     """Return one path, several or none as a list."""
-    return [Path(path) for path in ([value] if isinstance(value, (str, Path)) else value or ())]
+    return [Path(path) for path in ([value] if isinstance(value, (str, Path)) else value or ()) if path]
 
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
@@ -439,8 +438,9 @@ def read_config(run: Path) -> tuple[str, RunConfig]:
     try:
         stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         algorithm = "sac" if stored["algorithm"] == "tqc" else str(stored["algorithm"])
+        earlier = {"symmetric": False} if issubclass(ALGORITHMS[algorithm], _ImitationConfig) else {}
         return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
-            {name: value for name, value in stored.items() if name != "algorithm" or algorithm == "sac"}
+            {name: value for name, value in {**earlier, **stored}.items() if name != "algorithm" or algorithm == "sac"}
         )
     except ValidationError as error:
         first = error.errors()[0]

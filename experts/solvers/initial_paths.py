@@ -35,7 +35,7 @@ WINDINGS = (0, -1, 1)
 FIRST_BARRIER, NEGLIGIBLE = 0.1, 1e-12
 # Free horizon: first guess (s), largest number of times it is doubled or halved, then smallest factor and largest
 # number of steps, relative tolerance, and initial controls per horizon.
-FIRST_HORIZON, MAX_DOUBLINGS, HORIZON_STARTS = 1.0, 12, 4
+FIRST_HORIZON, MAX_DOUBLINGS, HORIZON_STARTS = 1.0, 11, 4
 MIN_HORIZON_FACTOR, MAX_HORIZON_STEPS, HORIZON_TOLERANCE = 0.5, 8, 0.05
 
 
@@ -86,8 +86,9 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
 
     The cost of the best path of a fixed time may have several local minima over this time, and paths of some times are
     not found. Powers of 2 are tried first: longer times until the time alone costs more than the best path, and shorter
-    ones until a path costs twice as much. The derivative of the cost by the time, which is the Hamiltonian, then gives
-    the time that minimises a cost of the form a / T + b T; the step to it is shortened until the cost decreases.
+    ones until a path costs twice as much or is not found. The derivative of the cost by the time, which is the
+    Hamiltonian, then gives the time that minimises a cost of the form a / T + b T; the step to it is shortened until
+    the cost decreases. Without any path, the result is the first guess.
     """
     found: dict[float, tuple[float, Trajectory]] = {}
 
@@ -101,13 +102,13 @@ def estimate_horizon(problem: OptimalControlProblem, seed: int = 0) -> float:
         return found[horizon][0]
 
     best = math.inf
-    for horizon in (FIRST_HORIZON * 2.0**k for k in range(MAX_DOUBLINGS)):
-        if problem.time_weight * horizon >= best:
+    for horizon in (FIRST_HORIZON * 2.0**k for k in range(MAX_DOUBLINGS + 1)):
+        if problem.time_weight * horizon >= best > 0.0:
             break
         best = min(best, lowest_cost(horizon))
-    for horizon in (FIRST_HORIZON * 2.0**-k for k in range(1, MAX_DOUBLINGS)):
+    for horizon in (FIRST_HORIZON * 2.0**-k for k in range(1, MAX_DOUBLINGS + 1)):
         cost = lowest_cost(horizon)
-        if math.isfinite(best) and cost > 2.0 * best:
+        if math.isfinite(best) and cost > 2.0 * abs(best):
             break
         best = min(best, cost)
     if not found:

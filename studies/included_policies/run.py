@@ -30,7 +30,7 @@ HERE = Path(__file__).parent
 INCLUDED = HERE.parents[1] / "training/policies/pretrained"  # the sources, which an editable installation links to
 HARD = {"clutter-hard": "clutter"}  # results of policies among hard obstacles, for which they were not trained
 NAMES = (*sorted(path.stem for path in (HERE / "configurations").glob("*.json")), *HARD)
-# Policies that were trained without the means over the symmetries of the robot, which they have since then.
+# Policies that were trained without the means over the symmetries of the robot; the means were added afterwards.
 AVERAGED = ("car-clutter", "polygons-lidar", "rooms-lidar", "slalom-lidar")
 SCENARIOS = 4000  # of each bank of fresh scenarios
 TABLES = {"included-policies": "docs/results.md"}  # with the files that contain them

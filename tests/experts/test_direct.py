@@ -113,9 +113,9 @@ def test_an_infeasible_problem_does_not_converge():
     assert not direct.converged or direct.violation > 0.5
 
 
-def test_the_derivatives_of_a_step_are_those_of_finite_differences():
-    """For the car, whose step is the most curved."""
-    fields = {**scenario_fields(), "robot": {"model": "car"}}
+@pytest.mark.parametrize("robot", ["car", "dynamic_car", "trailer"])
+def test_the_derivatives_of_a_step_are_those_of_finite_differences(robot):
+    fields = {**scenario_fields(), "robot": {"model": robot}}
     problem = OptimalControlProblem.from_scenario(Scenario.from_dict(fields))
     functions, data, rng = problem.compiled_dynamics, problem.arrays.data, np.random.default_rng(0)
     n, m, h = problem.system.n, problem.system.m, 0.2

@@ -1,5 +1,8 @@
 """Policies whose actions are means over the symmetries of the robot."""
 
+from contextlib import nullcontext
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch as th
@@ -8,7 +11,18 @@ from stable_baselines3 import PPO, SAC
 
 from leapnav.envs import NavigateEnv
 from leapnav.envs.settings import EnvironmentSettings
-from leapnav.training import BCConfig, CloningConfig, PPOConfig, load_policy, save_policy, train_bc, train_ppo
+from leapnav.experts import rollout
+from leapnav.training import (
+    BCConfig,
+    CloningConfig,
+    PPOConfig,
+    WarmStartConfig,
+    load_policy,
+    save_policy,
+    train_bc,
+    train_ppo,
+    warm_start,
+)
 from leapnav.training.policies.architecture import with_symmetries
 from leapnav.training.policies.navigation_policy import NavigationPolicy
 from leapnav.training.policies.network import make_policy, network
@@ -21,6 +35,7 @@ ENVIRONMENTS = {
     "geodesic": {"observation": "geodesic", "velocities": True},
     "differential_drive": {"robot": "differential_drive"},
     "car": {"robot": "car"},
+    "motor": {"actuation": "motor"},
     "dynamic_unicycle": {"robot": "dynamic_unicycle"},
     "free": {"horizon": "free", "previous_action": True},
 }
@@ -68,6 +83,7 @@ def test_what_is_not_symmetric():
         ({"lidar_fov": 4.0}, 1),
         ({"observation": "map"}, 0),
         ({"dict_observation": True}, 0),
+        ({"goal_conditioned": True}, 0),
     ):
         assert len(symmetries(EnvironmentSettings(**arguments), [robot])) == count
     limited = type(robot)(speed=(0.0, 1.0), turn_rate=(-1.0, 1.0))
@@ -110,7 +126,10 @@ def test_symmetries_are_added_to_a_policy():
         _, back = transformation(images, actions_of(plain, images))
         assert not th.allclose(back, expected, atol=1e-4)
     th.testing.assert_close(actions_of(symmetric, observations), actions_of(symmetric_policy(env), observations))
-    with pytest.raises(ValueError, match="policy: expected one of PPO or A2C, got SACPolicy"):
+    other = symmetries(replace(env.settings, lidar_beams=8), [env.source.robot])
+    with pytest.raises(ValueError, match=r"symmetries: expected those of observations of shape \(25,\), got \(17,\)"):
+        with_symmetries(plain, other)
+    with pytest.raises(ValueError, match="symmetries: expected none for a policy of kind 'sac'"):
         with_symmetries(SAC("MlpPolicy", env, policy_kwargs=network((16, 16)), device="cpu").policy, found)
 
 
@@ -131,4 +150,20 @@ def test_runs_of_imitation_are_symmetric_and_ppo_starts_from_them(tmp_path):
     trained, clone = load_policy(config.out), load_policy(start)
     observations = observations_of(environment())
     assert trained.symmetries == clone.symmetries
+    options |= {"actuation": "motor", "start": WarmStartConfig(critic=False)}
+    train_ppo(PPOConfig(out=tmp_path / "motor", **options, **settings), progress=False)
+    assert len(load_policy(tmp_path / "motor").symmetries) == 2
     th.testing.assert_close(actions_of(trained, observations), actions_of(clone, observations), atol=1e-4, rtol=1e-4)
+
+
+def test_a_warm_start_without_the_symmetries_of_the_policy_says_so(tmp_path):
+    rollout("open", 2, tmp_path, progress=False)
+    env = environment()
+    start = symmetric_policy(env)
+    for policy, options, expected in (
+        ("MlpPolicy", {}, pytest.warns(UserWarning, match="policy: its actions are means over symmetries")),
+        (NavigationPolicy, {"symmetries": start.symmetries}, nullcontext()),
+    ):
+        model = PPO(policy, env, policy_kwargs={**network((16, 16)), **options}, n_steps=8, batch_size=8, device="cpu")
+        with expected:
+            warm_start(model, tmp_path, WarmStartConfig(critic=False), policy=start, progress=False)

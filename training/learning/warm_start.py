@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -32,6 +33,7 @@ from leapnav.training.learning.cloning import (
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.samples import action_slopes
 from leapnav.training.policies.actors import as_observation, copy_actor, policy_of
+from leapnav.training.policies.navigation_policy import symmetries_of
 from leapnav.training.threads import limit_threads
 
 # Standard deviations (m, m, rad) of the random state offsets over which the slope of the cost-to-go is fitted: small
@@ -107,6 +109,12 @@ def warm_start(
     losses: list[EpochLoss] = []
     if policy is not None:
         copy_actor(policy, target)
+        if symmetries_of(policy) and not symmetries_of(target):
+            warnings.warn(
+                "policy: its actions are means over symmetries, those of the model are not; create the model with the "
+                "class NavigationPolicy and policy_kwargs={**network(), 'symmetries': policy.symmetries}",
+                stacklevel=3,  # around `limit_threads`
+            )
     elif config.actor:
         losses = behaviour_clone(target, samples, cloning, progress=progress)
     value_error = slope_error = math.nan

@@ -58,7 +58,7 @@ class Architecture:
 
         Raises:
             ModuleNotFoundError: a TQC policy needs the extra `contrib`.
-            ValueError: an attribute is unknown, or the spaces do not fit the extractor.
+            ValueError: an attribute is unknown, or the spaces do not fit the extractor or the symmetries.
 
         """
         check_choice("kind", self.kind, KINDS)
@@ -76,6 +76,8 @@ class Architecture:
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
         if self.symmetries:
+            if self.kind != "actor-critic":
+                raise ValueError(f"symmetries: expected none for a policy of kind {self.kind!r}")
             arguments["symmetries"] = self.symmetries
         kind = _policy_class(self.kind, own=self.effort_weights is not None or bool(self.symmetries))
         return kind(observation_space, action_space, lambda _: 3e-4, **arguments)
@@ -113,14 +115,12 @@ def with_symmetries(policy: BasePolicy, symmetries: tuple[Transformation, ...]) 
         symmetries: see `leapnav.training.policies.symmetries`.
 
     Raises:
-        ValueError: the policy is of another algorithm, or has an architecture that is not supported.
+        ValueError: the policy is of another algorithm, has an architecture that is not supported, or other
+            observations.
 
     """
-    architecture = Architecture.of(policy)
-    if architecture.kind != "actor-critic":
-        raise ValueError(f"policy: expected one of PPO or A2C, got {type(policy).__name__}")
-    assert isinstance(policy.observation_space, (spaces.Box, spaces.Dict))
-    symmetric = replace(architecture, symmetries=symmetries).make(policy.observation_space, policy.action_space)
+    observation_space: Any = policy.observation_space
+    symmetric = replace(Architecture.of(policy), symmetries=symmetries).make(observation_space, policy.action_space)
     symmetric.load_state_dict(policy.state_dict())
     symmetric.set_training_mode(False)
     return symmetric

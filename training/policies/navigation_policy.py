@@ -7,8 +7,7 @@ the last action, which the observation contains with `previous_action=True`. The
 to demonstrations, it would repeat the last action.
 
 The actions of a network that was fitted to a symmetric task are symmetric only approximately. The mean over all
-symmetries is symmetric, see `leapnav.training.policies.symmetries.SymmetricMean`. Without further training, it
-decreased the collisions of a policy with lidar alone from 4.8 to 3.6 % in 2,044 scenarios of clutter.
+symmetries is symmetric, see `leapnav.training.policies.symmetries.SymmetricMean`.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ class NavigationPolicy(ActorCriticPolicy):
             `leapnav.training.policies.symmetries`.
 
     Raises:
-        ValueError: symmetric actions with other bounds than -1 and 1.
+        ValueError: symmetric actions with other bounds than -1 and 1, or symmetries of other observations.
 
     """
 
@@ -121,6 +120,9 @@ class NavigationPolicy(ActorCriticPolicy):
         actions = cast(Box, self.action_space)
         if symmetries and not ((actions.low == -1).all() and (actions.high == 1).all()):
             raise ValueError(f"symmetries: expected none for actions with other bounds than -1 and 1, got {actions}")
+        shape, expected = self.observation_space.shape, [(len(one.observation),) for one in self.symmetries]
+        if any(shape != one for one in expected):
+            raise ValueError(f"symmetries: expected those of observations of shape {shape}, got {expected[0]}")
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {"effort_weights": self.effort_weights, "quiet": self.quiet, "symmetries": self.symmetries}

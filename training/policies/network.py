@@ -253,8 +253,8 @@ def make_policy(
         symmetries: transformations over which the mean action is averaged, see `leapnav.training.policies.symmetries`.
 
     Raises:
-        ValueError: the spaces are not those of the environment with a lidar, or the observations of a policy with
-            momentum do not contain the last action.
+        ValueError: the spaces are not those of the environment with a lidar, the observations of a policy with
+            momentum do not contain the last action, or the symmetries are those of other observations.
 
     """
     check_spaces(observation_space, action_space)

@@ -21,6 +21,8 @@ from leapnav.envs.simulation.observations import ObservationLayout
 # Signs of the first entries of the observation (see the docstring of the environment) under each symmetry.
 _MIRROR_SIGNS = th.tensor([1.0, -1, 1, -1, 1, 1, -1, 1, -1])
 _TIME_REVERSE_SIGNS = th.tensor([-1.0, -1, 1, 1, 1, -1, -1, 1, 1])
+# Those of the observed motion of a robot with motors: speed ahead, speed to the left, turn rate.
+_MIRROR_MOTION, _TIME_REVERSE_MOTION = (1, -1, -1), (-1, -1, 1)
 
 
 class Transformation(NamedTuple):
@@ -44,7 +46,10 @@ class Transformation(NamedTuple):
 
 
 def symmetries(settings: EnvironmentSettings, robots: Iterable[RobotModel]) -> tuple[Transformation, ...]:
-    """Return the transformations under which the task is the same for all robots, and the observation has them.
+    """Return the transformations that are symmetries of the task for all robots and that the observation allows.
+
+    There is none with `observation="map"`, whose rows have no order, nor for observations in a Dict. Time reversal
+    needs a lidar with an even number of beams around the full circle, or none.
 
     Args:
         settings: settings of the environment of the observations.
@@ -52,7 +57,7 @@ def symmetries(settings: EnvironmentSettings, robots: Iterable[RobotModel]) -> t
 
     """
     robots, found = list(robots), []
-    if settings.observation == "map" or settings.dict_observation:  # the rows of a map have no such symmetry
+    if settings.observation == "map" or settings.dict_observation or settings.goal_conditioned:
         return ()
     if _have(robots, settings.model.mirror):
         found.append(mirror(settings))
@@ -86,7 +91,8 @@ def mirror(settings: EnvironmentSettings) -> Transformation:
             return values.flip(1)
         return th.cat([values[:, :1], values[:, 1:].flip(1)], dim=1)
 
-    return _transformation(settings, _MIRROR_SIGNS, symmetry, reflected)
+    motion = _MIRROR_MOTION if settings.motors else symmetry.motion
+    return _transformation(settings, _MIRROR_SIGNS, motion, symmetry.controls, reflected)
 
 
 @cache
@@ -110,7 +116,8 @@ def time_reversal(settings: EnvironmentSettings) -> Transformation:
     def rotated(values: th.Tensor) -> th.Tensor:
         return values.roll(values.shape[1] // 2, dims=1)
 
-    return _transformation(settings, _TIME_REVERSE_SIGNS, symmetry, rotated)
+    motion = _TIME_REVERSE_MOTION if settings.motors else symmetry.motion
+    return _transformation(settings, _TIME_REVERSE_SIGNS, motion, symmetry.controls, rotated)
 
 
 def _require(settings: EnvironmentSettings, name: str, symmetry: Symmetry | None) -> Symmetry:
@@ -122,7 +129,8 @@ def _require(settings: EnvironmentSettings, name: str, symmetry: Symmetry | None
 def _transformation(
     settings: EnvironmentSettings,
     signs: th.Tensor,
-    symmetry: Symmetry,
+    motion: Sequence[float],
+    controls: tuple[tuple[float, ...], ...],
     moved: Callable[[th.Tensor], th.Tensor],
 ) -> Transformation:
     """Return the transformation with other signs of goal and motion and moved values of the beams."""
@@ -133,8 +141,8 @@ def _transformation(
 
     changes: dict[str, Callable[[th.Tensor], th.Tensor]] = {
         "goal": lambda values: values * signs[: values.shape[1]],
-        "motion": lambda values: values * th.tensor(symmetry.motion),
-        "action": lambda values: values @ th.tensor(symmetry.controls, dtype=values.dtype).T,
+        "motion": lambda values: values * th.tensor(motion),
+        "action": lambda values: values @ th.tensor(controls, dtype=values.dtype).T,
         "lidar": moved,
         "detours": moved,
         "distance": lambda values: values,
@@ -144,7 +152,7 @@ def _transformation(
     # The transformation of the numbers of the entries; the frames of a history are transformed like the current one.
     frames = th.arange(1.0, 1.0 + layout.size).reshape(-1, layout.frame)
     changed = th.cat([changes[name](frames[:, part]) for name, part in layout.parts.items()], dim=1)
-    return Transformation(tuple(changed.flatten().int().tolist()), symmetry.controls)
+    return Transformation(tuple(changed.flatten().int().tolist()), controls)
 
 
 class SymmetricMean:

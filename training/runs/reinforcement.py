@@ -34,7 +34,7 @@ from leapnav.training.policies.actors import actor_parameters, copy_actor, set_n
 from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, symmetries_of
 from leapnav.training.policies.network import network
-from leapnav.training.policies.symmetries import symmetries
+from leapnav.training.policies.symmetries import Transformation, symmetries
 from leapnav.training.runs.checks import check_config, check_demonstrations
 from leapnav.training.runs.imitation import mean_scores, observed_settings
 from leapnav.training.runs.run import Run
@@ -74,7 +74,6 @@ def train_ppo(
         raise TypeError(f"config: expected a PPOConfig, got {type(config).__name__}")
 
     def make(venv: VecEnv, dataset: Dataset | None, start: BasePolicy | None) -> BaseAlgorithm:
-        inner = unwrap(venv)[0]
         return PPO(
             NavigationPolicy,
             venv,
@@ -91,7 +90,7 @@ def train_ppo(
                 "log_std_init": math.log(config.std),
                 "quiet": config.quiet,
                 "effort_weights": config.effort_weights,
-                "symmetries": symmetries(inner.settings, [inner.source.robot]) if symmetries_of(start) else (),
+                "symmetries": _symmetries(start, venv) if config.start.actor else (),
             },
             seed=config.seed,
             device="cpu",
@@ -201,6 +200,15 @@ def _train(
     evaluations = run.evaluate(model.policy, model.num_timesteps, final=True)
     run.save_policy(model.policy)
     return evaluations
+
+
+def _symmetries(start: BasePolicy | None, venv: VecEnv) -> tuple[Transformation, ...]:
+    """Return the symmetries of the first policy, as those of the environment, which may have motors."""
+    found = symmetries_of(start)
+    if start is None or start.observation_space == venv.observation_space:
+        return found
+    inner = unwrap(venv)[0]
+    return symmetries(inner.settings, [inner.source.robot]) if found else ()
 
 
 def _resolve_warm_start(config: Config) -> tuple[list[Path], BasePolicy | None]:

@@ -113,7 +113,8 @@ class Run:
                 f"{self.folder}: a run of {str(stored.get('algorithm')).upper()}, not of {self.algorithm.upper()}; "
                 f"resume it by `leapnav train {stored.get('algorithm')}`"
             )
-        stored = {**LATER_SENSORS, **stored}
+        later = LATER_SENSORS | ({"symmetric": False} if "symmetric" in self._settings else {})
+        stored = {**later, **stored}
         missing = sorted(set(self._settings) - set(stored))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
