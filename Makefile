@@ -3,11 +3,12 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 SOURCES := $(sort $(shell find leapnav envs experts training -type f -not -path "*/__pycache__/*"))
 # The build backend only warns that the installation refers to this directory.
-INSTALL := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --constraint constraints.txt --config-settings editable_mode=strict --editable
+INSTALL := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --no-compile --constraint constraints.txt --config-settings editable_mode=strict --editable
 # One process per core; torch's threads would only compete with them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
-# Many tests start processes, which load faster with byte code.
+# Byte code is written when a module is imported first: that of all installed files takes most of a minute, and few of
+# them are imported. Many tests start processes, which load faster with it.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo compile test test-all lint types docs bench coverage clean
