@@ -103,9 +103,7 @@ def certify(
     # The time is free at the end, but no control changes it.
     has_free_end = arrays.free.sum() > (problem.clock >= 0)
     try:
-        if converged is not Status.SUCCESS:  # not an extremal: its segments may not even meet
-            conjugate_point = math.nan
-        elif has_free_end:
+        if has_free_end:
             conjugate_point = first_focal_time(extremal, arrays.free)
         else:
             conjugate_point = first_even_conjugate_time(extremal, out[:, -1].copy())

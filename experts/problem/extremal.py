@@ -68,8 +68,7 @@ class Certificate:
         hamiltonian_drift: largest minus smallest Hamiltonian. The Hamiltonian is constant along an extremal.
         conjugate_point: time (s) of a conjugate point before the horizon, at which dq(t)/dlambda(0) loses rank; with
             free final components, of a focal point. None if there is none: the extremal is a local minimum. NaN if the
-            solver did not converge, or if the sensitivities diverge, so that this cannot be decided; such an extremal
-            is not certified.
+            sensitivities diverge, so that this cannot be decided; such an extremal is not certified.
         clearance: smallest clearance (m) to an obstacle or a wall along the interpolated path; None without obstacles.
         time_curvature: with a free horizon, d2J/dT2 for extremals with the same ends, positive at a minimum over T;
             None with a fixed horizon.

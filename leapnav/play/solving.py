@@ -189,7 +189,6 @@ def _path(scenario: Scenario, optimum: Optimum, points: int = OPTIMUM_POINTS) ->
         "hamiltonian": np.interp(times, optimum.times, optimum.hamiltonian).tolist(),
         "clearances": np.round(_clearances(scenario, optimum.interpolate(times)), 6).tolist(),
         "residual": None if certificate is None else max(certificate.residual, certificate.defect),
-        "conjugate_point": None if certificate is None else certificate.conjugate_point,
     }
 
 

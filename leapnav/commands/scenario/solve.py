@@ -108,7 +108,7 @@ def _describe_clearance(clearance: float | None) -> str:
 def _describe_conjugate_point(time: float | None) -> str:
     if time is None:
         return "none"
-    return "unknown" if math.isnan(time) else f"{time:.3f} s"
+    return "unknown: the sensitivities diverge" if math.isnan(time) else f"{time:.3f} s"
 
 
 def _solve_by_all_methods(scenario: Scenario) -> dict[str, Extremal]:
