@@ -7,8 +7,8 @@ INSTALL := PYTHONWARNINGS=ignore $(BIN)/pip install --quiet --no-compile --const
 # One process per core; torch's threads would only compete with them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
-# Byte code is written when a module is imported first: that of all installed files takes most of a minute, and few of
-# them are imported. Many tests start processes, which load faster with it.
+# Byte code is written when a module is first imported: compiling all installed files takes most of a minute, and few
+# of them are imported. Many tests start processes, which load faster with byte code.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo compile test test-all lint types docs bench coverage clean

@@ -17,7 +17,7 @@ LATER_SENSORS = {"velocities": False, "lidar_fov": math.tau}  # those that older
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
 PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
 
-# The command line shows and completes literals; a test compares them with `FAMILIES`. Those of the user are text.
+# Literals, which the command line shows and completes; names of the user's own families and robots are other text.
 AtRest = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corridors"]
 Moving = Literal["crossing", "traffic", "crowd", "doors"]
 FamilyName = Literal[AtRest, Moving, "all"] | str

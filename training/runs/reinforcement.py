@@ -203,7 +203,7 @@ def _train(
 
 
 def _symmetries(start: BasePolicy | None, venv: VecEnv) -> tuple[Transformation, ...]:
-    """Return the symmetries of the first policy, as those of the environment, which may have motors."""
+    """Return the symmetries of the first policy; for other observations, as with motors, those of the environment."""
     found = symmetries_of(start)
     if start is None or start.observation_space == venv.observation_space:
         return found
