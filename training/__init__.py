@@ -3,15 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from leapnav.training.config import (
-    BCConfig,
-    CloningConfig,
-    DAggerConfig,
-    DAggerRunConfig,
-    PPOConfig,
-    SACConfig,
-    WarmStartConfig,
-)
+from leapnav.training.config import BCConfig, DAggerRunConfig, PPOConfig, SACConfig
+from leapnav.training.fit_settings import CloningConfig, DAggerConfig, WarmStartConfig
 
 if TYPE_CHECKING:
     from leapnav.training.environments.level_samplers import (

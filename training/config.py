@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self, cast, get_args
+from types import NoneType
+from typing import TYPE_CHECKING, Any, Literal, Self, cast, get_args
+
+from leapnav.training.fit_settings import CloningConfig, DAggerConfig, WarmStartConfig
+
+if TYPE_CHECKING:
+    from leapnav.envs.robots import RobotModel
 
 _FOLDER = files("leapnav.training")
 INHERITED = ("robot", "horizon", "observation", "lidar_beams", "previous_action")  # from the policy at the start
@@ -22,86 +28,14 @@ AtRest = Literal["open", "clutter", "polygons", "rooms", "slalom", "maze", "corr
 Moving = Literal["crossing", "traffic", "crowd", "doors"]
 FamilyName = Literal[AtRest, Moving, "all"] | str
 RobotName = Literal["unicycle", "differential_drive", "car", "dynamic_car", "dynamic_unicycle"] | str
+if TYPE_CHECKING:
+    RobotSetting = RobotName | Mapping[str, Any] | RobotModel
+else:  # the command line and stored configurations contain text
+    RobotSetting = RobotName
 HorizonName = Literal["fixed", "free"]
 ObstaclesName = Literal["cost", "hard"]
 ObservationName = Literal["lidar", "geodesic"]
 LevelsName = Literal["fresh", "uniform", "positive_value_loss", "max_mc", "learnability", "regret"]
-DEFAULT_EPOCHS = 12  # of a clone, if there are enough samples
-
-
-@dataclass(frozen=True)
-class CloningConfig:
-    """Settings of behaviour cloning."""
-
-    epochs: int | None = None
-    """Maximum number of passes over the samples; by default 12, and with few samples more: at least 2,500 gradient
-    steps."""
-    patience: int = 5
-    """Epochs without a lower validation loss before the fit stops; 0: no early stopping. The weights of the best epoch
-    are kept."""
-    batch_size: int | None = None
-    """Samples per gradient step; by default 2,048, and with few samples fewer, down to 64."""
-    learning_rate: float = 2e-3
-    """Peak learning rate (cosine decay to zero)."""
-    weight_decay: float = 1e-4
-    """AdamW weight decay."""
-    validation_share: float = 0.05
-    """Fraction of the obstacle courses held out for the validation loss."""
-    loss: Literal["action", "hamiltonian"] = "action"
-    """Loss of an action: "action": Huber loss of the error, each component in units of its spread; "hamiltonian": cost
-    of the error per second, H(q, lambda, u) - H(q, lambda, u*) with the expert's costate lambda."""
-    augment: bool = True
-    """Augmentation with mirrored and time-reversed samples, if the robot and the observation have these symmetries."""
-    seed: int = 0
-    """Random seed of the validation split, the order of the samples and the augmentation."""
-
-
-@dataclass(frozen=True)
-class DAggerConfig:
-    """Settings of dataset aggregation (DAgger)."""
-
-    rounds: int = 3
-    """Number of rounds: rollouts of the learner, takeovers by the expert, fit to all samples."""
-    max_failures: int = 200
-    """Failed episodes per round before relabelling; the expert takes over at most 12 times in each."""
-    max_episodes: int = 8_000
-    """Maximum number of episodes per round."""
-    successes: float = 1.0
-    """Successful episodes with one takeover each, per failed episode."""
-    lead: float = 3.0
-    """Time that the expert drives after a takeover (s)."""
-    epochs: int = 2
-    """Passes over all samples after each round except the last."""
-    last_epochs: int = 6
-    """Passes over all samples after the last round."""
-    learning_rate: float = 1e-3
-    """Peak learning rate of each round (cosine decay to zero)."""
-    seed: int = 0
-    """Random seed of the scenarios and the times of the takeovers."""
-
-
-@dataclass(frozen=True)
-class WarmStartConfig:
-    """Settings of a warm start from demonstrations. Each of its parts can be switched off."""
-
-    actor: bool = True
-    """Behaviour cloning of the actor."""
-    critic: bool = True
-    """Fit of the critic to the expert's cost-to-go."""
-    gradient: bool = True
-    """Fit of the critic's gradient to the costate."""
-    critic_epochs: int = 3
-    """Passes over the samples for the critic."""
-    critic_learning_rate: float = 3e-3
-    """Peak learning rate of the critic (cosine decay to zero)."""
-    critic_batch_size: int = 4096
-    """Samples per gradient step of the critic."""
-    gradient_weight: float = 0.3
-    """Weight of the error of the gradient (of Q functions also by the action) relative to that of the value."""
-    slopes: int = 200_000
-    """Number of samples at which the gradient is fitted."""
-    seed: int = 0
-    """Random seed of the order of the samples and the directions of the gradient."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,8 +46,9 @@ class RunConfig:
     """Run directory: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
     family: FamilyName = "clutter"
     """Family of the scenarios."""
-    robot: RobotName | None = None
-    """Model of the robot; by default that of the scenarios of a file, otherwise the unicycle."""
+    robot: RobotSetting | None = None
+    """Model of the robot, or JSON of one with other parameters; by default that of the scenarios of a file, otherwise
+    the unicycle."""
     horizon: HorizonName | None = None
     """Fixed horizon (default, unless a file has another), or free: the episode ends at the goal, and time costs."""
     obstacles: ObstaclesName | None = None
@@ -141,23 +76,45 @@ class RunConfig:
     evaluation_scenarios: int = 100
     """Scenarios per family of the training split in evaluations during the run; the last one plays the test split."""
 
+    def __post_init__(self) -> None:
+        """Replace a robot by the JSON text of its parameters, which the files of the run contain."""
+        if not isinstance(self.robot, (str, NoneType)):
+            from leapnav.envs.scenarios.scenario import check_robot
+
+            object.__setattr__(self, "robot", check_robot(self.robot).model_dump_json(exclude_none=True))
+
     @property
     def task(self) -> dict[str, str]:
-        """Model of the robot, horizon and obstacles, those that are not given as in `task_of`."""
+        """Robot, horizon and obstacles, those that are not given as in `task_of`.
+
+        The robot is the name of its model, or the JSON text of one with other parameters.
+        """
         from leapnav.envs.scenarios.families import task_of
 
         robot, horizon, obstacles = task_of(self.family, self.robot, self.horizon, self.obstacles)
-        return {"robot": self.robot or robot.model, "horizon": horizon, "obstacles": obstacles}
+        is_named = self.robot in (None, robot.model) or robot == type(robot)()
+        text = robot.model if is_named else robot.model_dump_json(exclude_none=True)
+        return {"robot": text, "horizon": horizon, "obstacles": obstacles}
 
     @property
-    def fresh_scenarios(self) -> dict[str, Any]:
-        """Arguments of the environment that, with `environment`, select new scenarios of the family."""
-        return {"family": self.family, "split": "fresh", "obstacles": self.task["obstacles"]}
+    def task_environment(self) -> dict[str, Any]:
+        """Arguments of an environment with the observation of `environment`, for scenarios of the task."""
+        robot = {} if self.robot is None else {"robot": self.task["robot"]}
+        return {**self.environment, **robot, "obstacles": self.task["obstacles"]}
+
+    @property
+    def fresh_environment(self) -> dict[str, Any]:
+        """Arguments of an environment with the observation of `environment` and new scenarios of the family."""
+        return {**self.task_environment, "family": self.family, "split": "fresh"}
 
     @property
     def environment(self) -> dict[str, Any]:
         """Arguments of the environment that determine the observation."""
-        task = {name: value for name, value in self.task.items() if value not in ("unicycle", "fixed", "cost", "hard")}
+        from leapnav.envs.scenarios.families import task_of
+
+        robot, horizon, _ = task_of(self.family, self.robot, self.horizon)
+        kinds = ("robot", robot.model, "unicycle"), ("horizon", horizon, "fixed")
+        task = {name: value for name, value, default in kinds if value != default}
         observation = {} if self.observation == "lidar" else {"observation": self.observation}
         earlier: dict[str, Any] = {"history": self.history} if self.history else {}
         earlier |= {} if self.effort_weights is None else {"previous_action": True}

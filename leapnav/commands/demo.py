@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from leapnav.training.config import CloningConfig
+from leapnav.training.fit_settings import CloningConfig
 
 RESULTS = (
     ("demonstrations", "training data, a Minari dataset"),

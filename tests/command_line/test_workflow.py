@@ -7,7 +7,7 @@ from helpers import FastClock, best_known, failing
 
 from leapnav.cli import main
 from leapnav.commands.demo import DemoSettings, run_demo
-from leapnav.training.config import CloningConfig
+from leapnav.training.fit_settings import CloningConfig
 
 
 @pytest.fixture

@@ -18,8 +18,9 @@ from leapnav.experts.data.datasets import dataset_id
 from leapnav.experts.data.demonstrations import load_demonstrations
 from leapnav.experts.data.rollouts import check_dataset, rollout
 from leapnav.training import Dataset, evaluate, load_policy, make_vec_env, save_policy
-from leapnav.training.config import CloningConfig, DAggerConfig, DAggerRunConfig, PPOConfig, SACConfig
+from leapnav.training.config import DAggerRunConfig, PPOConfig, SACConfig
 from leapnav.training.effort import effort_weights
+from leapnav.training.fit_settings import CloningConfig, DAggerConfig
 from leapnav.training.learning.cloning import behaviour_clone
 from leapnav.training.policies.baselines import GoToGoal
 from leapnav.training.policies.navigation_policy import add_momentum

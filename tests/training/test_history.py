@@ -30,8 +30,9 @@ from leapnav.training import (
     save_policy,
     warm_start,
 )
-from leapnav.training.config import DAggerRunConfig, WarmStartConfig
+from leapnav.training.config import DAggerRunConfig
 from leapnav.training.environments.playing import PlayedEpisode
+from leapnav.training.fit_settings import WarmStartConfig
 from leapnav.training.learning.driving import DrivenEpisode
 from leapnav.training.learning.takeovers import Labeller
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy

@@ -101,6 +101,37 @@ def test_a_robot_is_given_as_json_on_the_command_line(tmp_path, monkeypatch, cap
     assert "robot: not valid JSON" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("coarse_decisions")
+def test_a_robot_with_other_parameters_is_trained_and_evaluated(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("leapnav.training.runs.run.BANK_COUNT", 2)
+    config = BCConfig(out=tmp_path, family="open", robot={"model": "unicycle", "radius": 0.3})
+    text = WIDE.model_dump_json(exclude_none=True)
+    assert config.robot == BCConfig(out=tmp_path, robot=WIDE).robot == config.task["robot"] == text
+    assert BCConfig(out=tmp_path, robot=Unicycle()).task["robot"] == "unicycle"
+    once = ["--cloning.epochs", "1"]
+    assert (
+        main(["train", "bc", "--family", "open", "--robot", text, "--scenarios", "3", "--out", "clone", *SMALL, *once])
+        == 0
+    )
+    assert {one.scenario.robot for one in load_demonstrations("clone/demonstrations")} == {WIDE}
+    assert ScenarioBank("clone/test.bank").robot == ScenarioBank("clone/train.bank").robot == WIDE
+    few = ["--total-timesteps", "64", "--n-envs", "2", "--n-steps", "32"]
+    train = ["train", "ppo", "--family", "open", "--robot", text, "--warm-start", "clone", "--out", "ppo", *few]
+    assert main([*train, *SMALL, *once]) == 0
+    config = DAggerRunConfig(out=tmp_path / "dagger", family="open", robot=WIDE, demos=(tmp_path / "clone",))
+    assert NavigateEnv(**config.fresh_environment).source.robot == WIDE
+    capsys.readouterr()
+    assert main(["evaluate", "clone", "--workers", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 scenarios" in printed and "another robot" not in printed
+    assert main(["evaluate", "clone", "--workers", "1", "--robot", text]) == 0
+    assert main(["evaluate", "clone", "--robot", text.replace("0.3", "0.4")]) == 2
+    assert "robot: expected that of the policies, 'unicycle', got '{" in capsys.readouterr().err
+    assert main(["evaluate", "expert", "--robot", text]) == 2
+    assert "build a bank of its scenarios" in capsys.readouterr().err
+
+
 def test_banks_and_files_are_accepted_where_a_scenario_or_a_family_is(bank, tmp_path):
     stored, file = ScenarioBank(bank), tmp_path / "scenario.json"
     stored[0].to_json(file)
@@ -130,8 +161,10 @@ def test_demonstrations_of_another_robot_or_horizon_are_refused(bank, tmp_path):
         clone("open", "open", robot="car")
     with pytest.raises(ValueError, match="demos: expected a free horizon, got a fixed one"):
         clone("open", "open", horizon="free")
-    with pytest.raises(ValueError, match=r"robot: expected the name of a model, got .* build a bank"):
+    with pytest.raises(ValueError, match=r"demos: expected a robot with radius 0\.3, got 0\.25"):
         clone("open", "open", robot={"model": "unicycle", "radius": 0.3})
+    with pytest.raises(ValueError, match=r"robot\.radius: .* got -1"):
+        clone("open", "open", robot={"model": "unicycle", "radius": -1})
     assert not (tmp_path / "run").exists()
     with pytest.warns(UserWarning, match="dataset: demonstrations of open, here clutter"):
         clone("clutter", "open", cloning=CloningConfig(epochs=1))

@@ -61,6 +61,19 @@ def test_the_infos_of_all_steps_can_be_had():
     assert {name for name in infos[0] if name.startswith("reward_")} == parts
 
 
+def test_the_observations_are_those_of_a_policy_or_a_model():
+    venv = make_vec_env(n_envs=1, policy="clutter", family="open", dict_observation=True)
+    assert venv.observation_space["lidar"].shape == (64,)
+    assert "detours" in venv.observation_space.spaces  # of the geodesic observation
+    sensors = make_vec_env(n_envs=2, family="open", lidar_beams=16, history=(0.4,), actuation="motor")
+    other = make_vec_env(n_envs=3, policy=PPO("MlpPolicy", sensors, n_steps=4), split="fresh")
+    assert other.observation_space == sensors.observation_space
+    with pytest.raises(ValueError, match="policy: expected a model with one of leapnav's environments"):
+        make_vec_env(n_envs=1, policy=PPO("MlpPolicy", "CartPole-v1", n_steps=4))
+    with pytest.raises(FileNotFoundError, match="missing"):
+        make_vec_env(n_envs=1, policy="missing")
+
+
 def test_seeds_and_options_are_used_once():
     venv = make_vec_env(n_envs=2, env_kwargs={"family": "slalom", "split": "test"})
     venv.set_options([{"index": 3}, {"index": 5}])

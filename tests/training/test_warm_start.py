@@ -11,7 +11,7 @@ from leapnav.envs.simulation.observer import Observer
 from leapnav.experts import ExpertPolicy
 from leapnav.experts.data.rollouts import rollout
 from leapnav.training import CloningConfig, Dataset, behaviour_clone, make_vec_env, network, warm_start
-from leapnav.training.config import WarmStartConfig
+from leapnav.training.fit_settings import WarmStartConfig
 from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.policies.actors import mean_action
 from leapnav.training.policies.navigation_policy import NavigationPolicy

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnv,
@@ -17,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 
 from leapnav.envs.vector import AutoresetMode, NavigateVectorEnv, select_robot
+from leapnav.training.policies.files import policy_environment
 
 ENVIRONMENT = "leapnav/Navigate-v0"
 # Names in the vector environment of attributes that differ between robots, and of those of a single robot.
@@ -29,6 +32,7 @@ def make_vec_env(
     n_envs: int = 16,
     *,
     seed: int | None = None,
+    policy: str | Path | BaseAlgorithm | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     step_infos: bool = False,
     **arguments: Any,
@@ -39,22 +43,25 @@ def make_vec_env(
         env_id: "leapnav/Navigate-v0", or "leapnav/NavigateGoal-v0" for hindsight experience replay.
         n_envs: number of robots, stepped together in this process.
         seed: seed of the first episode of the first robot; robot i gets `seed + i`.
+        policy: name, directory, file or model whose observations the environment has, see `policy_environment`.
         env_kwargs: arguments of the environment as a dict, as in the function of Stable-Baselines3.
         step_infos: see `NavigateVecEnv`.
-        arguments: arguments of the environment.
+        arguments: arguments of the environment; they take precedence over those of the policy.
 
     Raises:
+        FileNotFoundError: there is no such policy.
         ValueError: an argument is invalid, or the environment is not one of leapnav's.
         gymnasium.error.Error: the environment does not exist.
 
     """
     if not str(gym.spec(env_id).vector_entry_point).startswith("leapnav."):
         raise ValueError(f"env_id: expected one of leapnav's environments, got {env_id!r}")
+    observed = {} if policy is None else policy_environment(policy)
     venv = gym.make_vec(
         env_id,
         num_envs=n_envs,
         vectorization_mode="vector_entry_point",
-        **{**(env_kwargs or {}), **arguments, "autoreset_mode": AutoresetMode.SAME_STEP},
+        **{**observed, **(env_kwargs or {}), **arguments, "autoreset_mode": AutoresetMode.SAME_STEP},
     )
     assert isinstance(venv, NavigateVectorEnv)  # its specification is that of leapnav
     wrapped = NavigateVecEnv(venv, step_infos=step_infos)

@@ -27,7 +27,7 @@ from leapnav.envs.utils.validation import (
     check_positive,
 )
 from leapnav.experts.data.demonstrations import Demonstration
-from leapnav.training.config import DEFAULT_EPOCHS, CloningConfig
+from leapnav.training.fit_settings import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.samples import Batch, Samples, split_courses
 from leapnav.training.policies.actors import actor_parameters, parts_of_dict, policy_of, set_noise, update_target

@@ -28,7 +28,7 @@ from leapnav.envs.utils.progress import advance, progress_bar, stop_early
 from leapnav.envs.utils.validation import check_at_least, check_choice, check_not_negative, check_positive
 from leapnav.envs.vector import NavigateVectorEnv
 from leapnav.experts.optimum import EFFORTS, Effort
-from leapnav.training.config import CloningConfig, DAggerConfig
+from leapnav.training.fit_settings import CloningConfig, DAggerConfig
 from leapnav.training.learning.cloning import behaviour_clone, check_observations
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.driving import DrivenEpisode, drive_episodes

@@ -22,7 +22,7 @@ from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_not_negative, check_positive
 from leapnav.experts.data.datasets import CONTROL_PERIOD
-from leapnav.training.config import CloningConfig, WarmStartConfig
+from leapnav.training.fit_settings import CloningConfig, WarmStartConfig
 from leapnav.training.learning.cloning import (
     EpochLoss,
     behaviour_clone,

@@ -167,21 +167,27 @@ def read_description(folder: str | Path) -> dict[str, Any]:
     return description
 
 
-def policy_environment(folder: str | Path) -> dict[str, Any]:
+def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
     """Return the arguments of `gym.make` for an environment with the observations that a policy was trained with.
 
     Those of a model saved by Stable-Baselines3 are derived from its observations, of a lidar, the state or the map.
 
     Args:
-        folder: see `load_policy`.
+        policy: see `folder` of `load_policy`; or a model of Stable-Baselines3 with one of leapnav's environments.
 
     Raises:
-        FileNotFoundError, ValueError: see `load_policy`.
+        FileNotFoundError: see `load_policy`.
+        ValueError: see `load_policy`; or the model has no environment of leapnav.
 
     """
-    if is_zip(folder):
-        return load_zip(folder)[1]
-    return _observed(read_description(folder))
+    if isinstance(policy, BaseAlgorithm):
+        found = environment_of(policy)
+        if not found:
+            raise ValueError(f"policy: expected a model with one of leapnav's environments, got {policy.get_env()!r}")
+        return found
+    if is_zip(policy):
+        return load_zip(policy)[1]
+    return _observed(read_description(policy))
 
 
 def environment_of(model: Any) -> dict[str, Any]:

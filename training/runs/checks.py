@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import partial
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import check_family, task_of
@@ -20,15 +20,8 @@ from leapnav.envs.utils.validation import (
     check_not_negative,
     check_positive,
 )
-from leapnav.training.config import (
-    CloningConfig,
-    DAggerConfig,
-    LevelsName,
-    PPOConfig,
-    RunConfig,
-    SACConfig,
-    WarmStartConfig,
-)
+from leapnav.training.config import LevelsName, PPOConfig, RunConfig, SACConfig
+from leapnav.training.fit_settings import CloningConfig, DAggerConfig, WarmStartConfig
 from leapnav.training.learning.cloning import check_cloning
 from leapnav.training.learning.dagger import check_dagger
 from leapnav.training.learning.dataset import Dataset
@@ -43,11 +36,7 @@ def check_config(config: RunConfig) -> None:
 
     """
     check_family(config.family)
-    if not isinstance(cast(object, config.robot), (str, type(None))):
-        raise ValueError(
-            f"robot: expected the name of a model, got {config.robot!r}; for a robot of your own build a bank of its "
-            "scenarios (`build_bank(robot=...)`), and give the file as family"
-        )
+    task_of(config.family, config.robot)
     if not config.hidden or min(config.hidden) < 1:
         raise ValueError(f"hidden: expected widths of at least 1, got {config.hidden!r}")
     check_integer("seed", config.seed, 0, 2**32 - 1)

@@ -121,7 +121,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
         policy,
         config.family,
         replace(config.dagger, seed=config.seed),
-        environment={**config.environment, "obstacles": config.task["obstacles"]},
+        environment=config.task_environment,
         robots=config.n_envs,
         cloning=replace(config.cloning, seed=config.seed),
         dataset=dataset,
@@ -171,7 +171,7 @@ def _demonstrations(run: Run, count: int, workers: int, progress: bool) -> Datas
 
 def make_env(config: RunConfig) -> NavigateEnv:
     """Return an environment with the observations of a run."""
-    return NavigateEnv(**config.fresh_scenarios, **config.environment)
+    return NavigateEnv(**config.fresh_environment)
 
 
 def observed_settings(config: RunConfig) -> EnvironmentSettings:

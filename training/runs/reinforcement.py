@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.families import task_of
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_choice
@@ -227,10 +228,10 @@ def _resolve_warm_start(config: Config) -> tuple[list[Path], BasePolicy | None]:
 
 def _load_start(path: Path, config: Config) -> BasePolicy:
     """Load the policy to start from: one of the same observations, or of a robot without motors."""
-    arguments = config.environment
+    arguments = config.fresh_environment
     if policy_environment(path).get("actuation", "velocity") == "velocity":
         arguments = {name: value for name, value in arguments.items() if name != "actuation"}
-    return load_policy(path, NavigateEnv(**config.fresh_scenarios, **arguments))
+    return load_policy(path, NavigateEnv(**arguments))
 
 
 def make_training_env(config: Config) -> VecEnv:
@@ -241,12 +242,11 @@ def make_training_env(config: Config) -> VecEnv:
         task = {"control_period": config.control_period, "collision_penalty": penalty, "miss_penalty": penalty}
     return make_vec_env(
         n_envs=config.n_envs,
-        **_scenarios(config),
+        **{**config.environment, **_scenarios(config)},
         reward=config.reward,
         discount=config.discount,
         graded_miss=config.graded_miss,
         reward_scale=config.reward_scale,
-        **config.environment,
         **task,
     )
 
@@ -254,13 +254,15 @@ def make_training_env(config: Config) -> VecEnv:
 def _scenarios(config: Config) -> dict[str, Any]:
     """Return the arguments of the training environment that choose the scenarios."""
     if not isinstance(config, PPOConfig) or config.levels == "fresh":
-        return config.fresh_scenarios
+        return config.fresh_environment
     if config.level_bank is not None:
         bank = ScenarioBank(config.level_bank)
-        kinds = ("robot", bank.robot.model), ("horizon", bank.horizon), ("obstacles", bank.obstacles)
-        for name, found in kinds:
-            if found != config.task[name]:
-                raise ValueError(f"level_bank: {name}: expected {config.task[name]!r}, got {found!r}")
+        robot, horizon, obstacles = task_of(config.family, config.robot, config.horizon, config.obstacles)
+        for difference in bank.robot.differences(robot)[:1]:
+            raise ValueError(f"level_bank: another robot: {difference}")
+        for name, expected, found in (("horizon", horizon, bank.horizon), ("obstacles", obstacles, bank.obstacles)):
+            if found != expected:
+                raise ValueError(f"level_bank: {name}: expected {expected!r}, got {found!r}")
     else:
         bank = ScenarioBank.shipped(config.family, "train", **config.task)
     sampler = UniformSampler(bank) if config.levels == "uniform" else PrioritizedSampler(bank, config.levels)

@@ -11,6 +11,7 @@ import numpy as np
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of, is_built_in
+from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.training.config import PPOConfig, RunConfig, read_config
 from leapnav.training.scoring.adapters import PolicyOrFactory
 from leapnav.training.scoring.evaluation import evaluate
@@ -246,7 +247,7 @@ def default_banks(
         specs: the policies.
         family: a family, or "all"; None: those for which the policies were trained, or "clutter" without any.
         split: "train" or "test"; training runs have a test bank only.
-        robot, horizon: see `included_banks`.
+        robot, horizon: see `included_banks`; the robot can be JSON text for a bank of a run.
         obstacles: "cost" or "hard"; None: those for which the policies were trained, or "cost" without any.
 
     Raises:
@@ -270,13 +271,15 @@ def default_banks(
             own[bank_identity(bank)] = bank
             continue
         for kind in sorted(kinds):
-            found = [
+            banks = (
                 ScenarioBank(path)
                 for folder, config in configs.items()
                 if config.task["obstacles"] == kind and split == "test"
                 if name not in ScenarioBank.shipped_families(**config.task)
                 if (path := own_bank(config, folder, name)).exists()
-            ]
+            )
+            # As in `task_of`: the name of the model selects the robot of the bank.
+            found = [bank for bank in banks if robot in (None, bank.robot.model) or check_robot(robot) == bank.robot]
             own |= {bank_identity(bank): bank for bank in found}
             if not found:
                 included += included_banks(specs, [name], split, robot, horizon, obstacles=kind)
