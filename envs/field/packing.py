@@ -87,9 +87,8 @@ def pack_field(
         for part in shape.parts():
             vertices, rounding = part.rounded_polygon()
             # A capsule of length zero is a disc.
-            parts.append(
-                FieldPart(vertices[:1] if (vertices == vertices[0]).all() else vertices, rounding, index, knots)
-            )
+            is_disc = len(vertices) == 1 or bool((vertices == vertices[0]).all())
+            parts.append(FieldPart(vertices[:1] if is_disc else vertices, rounding, index, knots))
     return _pack(parts, arena, (weight, scale, *sizes), clock, grid=grid)
 
 
@@ -108,8 +107,12 @@ def _pack(
     edges = [edge_rows(part.vertices) if len(part.vertices) > 1 else _NO_EDGES for part in ordered]
     rows, first, first_knot = [], 0, 0
     for part, lines in zip(ordered, edges, strict=True):
-        x, y = centre = part.vertices.mean(axis=0)
-        rim = float(np.hypot(*(part.vertices - centre).T).max()) + part.rounding
+        rim = part.rounding
+        if len(lines):
+            x, y = centre = part.vertices.mean(axis=0)
+            rim += float(np.hypot(*(part.vertices - centre).T).max())
+        else:
+            x, y = part.vertices[0].tolist()
         rows.append((x, y, rim, part.rounding, first, len(lines), part.obstacle, first_knot, len(part.knots)))
         first, first_knot = first + len(lines), first_knot + len(part.knots)
     header["parts"], header["edges"], header["moving"], header["knots"] = len(rows), first, len(moving), first_knot

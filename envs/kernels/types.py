@@ -18,6 +18,7 @@ FLAGS = types.Array(boolean, 1, "C")
 INTEGERS = int64[::1]
 INDICES = int32[::1]
 LINKS = int32[:, ::1]
+PLACES = int64[:, ::1]
 SIGNS = int8[:, ::1]
 NOTHING = types.none
 

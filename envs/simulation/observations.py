@@ -9,15 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from numba import float32, from_dtype, types
+from numba import float32, from_dtype
 
 from leapnav.envs.field.layout import header_of
 from leapnav.envs.geodesics import MAX_DETOUR, geodesic_detours, geodesic_distance
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
+from leapnav.envs.kernels.internals import places_of, record_at
+from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, PLACES, VECTOR
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.sensing import beam_velocities, map_surroundings, scan
-from leapnav.envs.simulation.state import PACKED, Simulation, field_of, row_of
+from leapnav.envs.simulation.state import SIMULATION, field_of, row_of
 from leapnav.envs.simulation.stepping import wrapped
 from leapnav.envs.utils.records import MAX_MAGNITUDE
 
@@ -273,7 +274,7 @@ class ObservationLayout:
             frames=np.zeros((count, 1 + lags.max(initial=-1), self.frame), np.float32),
             lags=lags,
         )
-        self._packed_buffers = tuple(self._buffers)
+        self._places = places_of(self._buffers, BUFFERS)
         self._slices: dict[str, slice] | None = self.parts if settings.dict_observation else None
         if settings.goal_conditioned:  # the other parts form one box, as goal-conditioned learners expect
             goals = {name: self.parts[name] for name in ("achieved_goal", "desired_goal")}
@@ -306,24 +307,28 @@ class ObservationLayout:
         scan(x, y, heading, time, field, view, buffers.beams, buffers.scratch)
         return buffers.scratch[2, : self._settings.lidar_beams].copy()
 
-    def fill(self, robots: np.ndarray, packed: tuple[np.ndarray, ...], out: np.ndarray) -> None:
-        """Write the flat observations of robots, given by index, to their rows of `out`."""
-        observe_robots(robots, packed, self._packed_buffers, out)
+    def fill(self, robots: np.ndarray, places: np.ndarray, out: np.ndarray) -> None:
+        """Write the flat observations of robots, given by index, to their rows of `out`, see `observe_robots`."""
+        observe_robots(robots, places, self._places, out)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._places = places_of(self._buffers, BUFFERS)
 
 
-@kernel(NOTHING(INTEGERS, PACKED, types.Tuple(BUFFERS.types), float32[:, ::1]))
-def observe_robots(robots, packed, packed_buffers, out):
+@kernel(NOTHING(INTEGERS, PLACES, PLACES, float32[:, ::1]))
+def observe_robots(robots, places, buffer_places, out):
     """Compute the flat observations of robots, see `NavigateEnv` and `NavigateGoalEnv`.
 
     Args:
         robots: indices of the robots.
-        packed: the episodes. The noise is used only if the settings have sensing noise.
-        packed_buffers: see `ObservationBuffers`.
+        places: of the episodes, see `places_of`. The noise is used only if the settings have sensing noise.
+        buffer_places: of the `ObservationBuffers`.
         out (count, size): the rows of the robots are overwritten; float32. A robot with a history must be observed at
             each step of its episode.
 
     """
-    sim, buffers = Simulation(*packed), ObservationBuffers(*packed_buffers)
+    sim, buffers = record_at(places, SIMULATION), record_at(buffer_places, BUFFERS)
     settings, at = sim.settings[0], buffers.offsets[0]
     beams, scratch, row, bounds = buffers.beams, buffers.scratch, buffers.row, buffers.bounds
     deviation, n_beams = settings.disturbance.sensing, beams.shape[1]

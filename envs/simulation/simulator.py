@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.field.rectangle import OUTLINE_ENTRIES
 from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
-from leapnav.envs.kernels.internals import FunctionPointer
+from leapnav.envs.kernels.internals import FunctionPointer, places_of
 from leapnav.envs.kernels.types import constant
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
@@ -26,7 +26,9 @@ from leapnav.envs.simulation.paths import ADVANCE_FUNCTION, STATE_COST_FUNCTION,
 from leapnav.envs.simulation.sensing import check_map
 from leapnav.envs.simulation.state import (
     EPISODE,
+    EPISODE_FORMAT,
     N_GUIDE_POINTS,
+    SIMULATION,
     Episode,
     FieldStore,
     Simulation,
@@ -91,8 +93,7 @@ class BatchSimulator:
 
     def _connect(self) -> None:
         """Prepare the arguments of the kernels."""
-        # A plain tuple, which Numba receives in less time than a named one.
-        self._packed: tuple[np.ndarray, ...] = tuple(self._simulation)
+        self._places = places_of(self._simulation, SIMULATION)
         model = self.settings.model
         advance, cost = (coast, None) if self.settings.motors else (model.advance, model.state_cost)
         self._pointers = (
@@ -104,11 +105,11 @@ class BatchSimulator:
     def _replace(self, **arrays: np.ndarray) -> None:
         """Replace arrays of the simulation."""
         self._simulation = self._simulation._replace(**arrays)
-        self._packed = tuple(self._simulation)
+        self._places = places_of(self._simulation, SIMULATION)
 
     def episode(self, i: int) -> Episode:
         """Return the episode of a robot."""
-        return Episode._make(self.episodes[i].item())
+        return Episode._make(EPISODE_FORMAT.unpack_from(cast(Any, self.episodes), i * EPISODE.itemsize))
 
     def reset(
         self,
@@ -151,7 +152,7 @@ class BatchSimulator:
             self._masses[i] = tuple(obstacle.mass for obstacle in scenario.obstacles)
         if self._geodesic:
             self._store_maps(indices)
-        stepping.start_episodes(indices, self._packed)
+        stepping.start_episodes(indices, self._places)
         if self.settings.disturbed:
             for i, generator in zip(indices.tolist(), generators, strict=True):
                 self._generators[i] = generator
@@ -239,24 +240,29 @@ class BatchSimulator:
         """
         active = self._all_active if active is None else active
         if self._bodies is None:
-            invalid = stepping.drive(actions, active, self._packed, self._addresses)
+            invalid = stepping.drive(actions, active, self._places, self._addresses)
         else:
-            invalid = stepping.begin_periods(actions, active, self._packed)
+            invalid = stepping.begin_periods(actions, active, self._places)
         if invalid >= 0:
             robot = "" if len(self.states) == 1 else f" for robot {invalid}"
             expected = in_words(actions.shape[1])
             raise ValueError(f"action: expected {expected} finite numbers, got {actions[invalid].tolist()}{robot}")
         if self.settings.previous_action:
             np.copyto(self.layout.actions, np.clip(actions, -1.0, 1.0), where=active[:, None])
+        incomplete: np.ndarray | None = None
         if self._bodies is not None:
+            incomplete = active
             for substep in range(self._substeps + 1):
-                stepping.push_bodies(self._bodies.rows, self._packed, self._addresses, substep, self._substeps)
+                stepping.push_bodies(self._bodies.rows, self._places, self._addresses, substep, self._substeps)
                 if substep < self._substeps:
                     self._bodies.advance()
         if not self.settings.terminate_on_collision:
-            for i in np.flatnonzero(self.episodes["remaining"] > 0).tolist():
+            in_contact = self.episodes["remaining"] > 0
+            for i in np.flatnonzero(in_contact).tolist():
                 self._drive_in_contact(i)
-        stepping.end_periods(active, self._packed)
+            incomplete = in_contact if incomplete is None else incomplete
+        if incomplete is not None:
+            stepping.end_periods(incomplete, self._places)
         if self.settings.disturbed:
             # The observation at the end of a period uses the noise row of the next period.
             for i in np.flatnonzero(active & (self.episodes["steps"] % NOISE_ROWS == 0)).tolist():
@@ -329,7 +335,7 @@ class BatchSimulator:
 
     def observe(self, out: np.ndarray, robots: np.ndarray | None = None) -> None:
         """Write flat observations to `out` (count, size), float32: of all robots, or of those given by index."""
-        self.layout.fill(self._all_robots if robots is None else robots, self._packed, out)
+        self.layout.fill(self._all_robots if robots is None else robots, self._places, out)
 
     def at_goal(self, i: int) -> bool:
         """Return whether the pose of a robot equals its goal, within the tolerances."""
@@ -341,7 +347,7 @@ class BatchSimulator:
 
     def __getstate__(self) -> dict[str, Any]:
         # Contact worlds have no memory between periods, so they can be created again.
-        shared = ("_simulation", "_packed", "_pointers", "_addresses", "episodes", "states", "_noise")
+        shared = ("_simulation", "_places", "_pointers", "_addresses", "episodes", "states", "_noise")
         arrays = self._simulation._replace(fields=np.zeros(0))
         return {**{k: v for k, v in self.__dict__.items() if k not in shared}, "_contacts": {}, "_arrays": arrays}
 
@@ -357,9 +363,9 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     """Return the kernels of a step, so that those not in the cache are compiled together."""
     model = settings.model
     kernels = [clearances, footprint_clearance, footprint_clearances]  # also of the check of a scenario
-    kernels += [stepping.start_episodes, stepping.end_periods, observe_robots]
+    kernels += [stepping.start_episodes, observe_robots]
     if settings.motors:
-        kernels += [stepping.begin_periods, stepping.push_bodies, coast, no_state_cost]
+        kernels += [stepping.begin_periods, stepping.push_bodies, stepping.end_periods, coast, no_state_cost]
     else:
         kernels += [stepping.drive, model.advance, model.state_cost or no_state_cost]
     if settings.shaped:  # the optima of banks, which guide the robots, are checked
@@ -367,5 +373,5 @@ def _kernels(settings: EnvironmentSettings) -> tuple[Any, ...]:
     if settings.observation == "geodesic":
         kernels.append(solve_eikonal)
     if not settings.terminate_on_collision:
-        kernels += [resolve_overlap, footprint_value, stepping.effort, stepping.wheel_forces]
+        kernels += [resolve_overlap, footprint_value, stepping.effort, stepping.wheel_forces, stepping.end_periods]
     return tuple(kernels)

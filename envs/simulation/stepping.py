@@ -1,6 +1,6 @@
 """One control period of many robots (kernels): motion, running cost, reward, and end of the episode.
 
-The kernels take all episodes as a plain tuple with the fields of `Simulation`, and read and write its arrays.
+The kernels take the places of the arrays of `Simulation`, and read and write these arrays.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from numba import boolean, float64, int64, types
 
 from leapnav.envs.field.clearance import footprint_clearance
 from leapnav.envs.kernels import kernel
-from leapnav.envs.kernels.internals import matrix_of
-from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, VECTOR
+from leapnav.envs.kernels.internals import matrix_of, record_at
+from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, PLACES, VECTOR
 from leapnav.envs.settings import MOTOR_TYPE
 from leapnav.envs.simulation.paths import ADDRESSES, MOTION, Path, drive_path, motion_at
-from leapnav.envs.simulation.state import PACKED, SIMULATION, Simulation, field_of, row_of
+from leapnav.envs.simulation.state import SIMULATION, field_of, row_of
 
 GRAVITY = 9.81  # m/s^2
 # Of a graded miss: fraction of the penalty that any miss costs, without which a success would return hardly more than a
@@ -77,10 +77,10 @@ def measure_miss(i, sim):
     episode.heading_error = 0.0 if math.isnan(goal[2]) else abs(wrapped(state[2] - goal[2]))
 
 
-@kernel(NOTHING(INTEGERS, PACKED))
-def start_episodes(robots, packed):
+@kernel(NOTHING(INTEGERS, PLACES))
+def start_episodes(robots, places):
     """Start the episodes of robots, given by index, whose states and tasks are set."""
-    sim = Simulation(*packed)
+    sim = record_at(places, SIMULATION)
     settings = sim.settings[0]
     for i in robots:
         episode, state = sim.episodes[i], row_of(sim.states, i)
@@ -145,10 +145,10 @@ def _begin_periods(actions, active, sim):
     return -1
 
 
-@kernel(int64(MATRIX, FLAGS, PACKED))
-def begin_periods(actions, active, packed):
+@kernel(int64(MATRIX, FLAGS, PLACES))
+def begin_periods(actions, active, places):
     """Begin a period of robots with motors, see `_begin_periods`."""
-    return _begin_periods(actions, active, Simulation(*packed))
+    return _begin_periods(actions, active, record_at(places, SIMULATION))
 
 
 @kernel(float64(SIMULATION, int64, MOTION, VECTOR, float64, float64, MATRIX), forceinline=True)
@@ -181,31 +181,91 @@ def _follow(sim, i, motion, u, time, duration, scratch):
     return fraction
 
 
-@kernel(int64(MATRIX, FLAGS, PACKED, ADDRESSES))
-def drive(actions, active, packed, addresses):
+@kernel(boolean(int64, SIMULATION))
+def at_goal(i, sim):
+    """Return whether the state of robot i equals its goal, within the tolerances."""
+    state, goal, settings = row_of(sim.states, i), row_of(sim.goals, i), sim.settings[0]
+    if math.hypot(state[0] - goal[0], state[1] - goal[1]) > settings.position_tolerance:
+        return False
+    for k in range(3, len(goal)):
+        difference = state[k] - goal[k]
+        if settings.heading_states >> k & 1:
+            difference = wrapped(difference)
+        if not math.isnan(goal[k]) and abs(difference) > settings.motion_tolerance:
+            return False
+    return math.isnan(goal[2]) or abs(wrapped(state[2] - goal[2])) <= settings.heading_tolerance
+
+
+@kernel(NOTHING(int64, SIMULATION), forceinline=True)
+def _end_period(i, sim):
+    """Complete a period of robot i: update time, cost and reward, and determine whether the episode has ended."""
+    episode, settings = sim.episodes[i], sim.settings[0]
+    episode.steps += 1
+    episode.time = min(episode.steps * settings.control_period, episode.horizon)
+    if settings.free_horizon:
+        episode.time_cost = episode.time_weight * episode.duration
+    episode.cost += episode.effort + episode.proximity + episode.time_cost
+    if episode.in_contact and not episode.collided:
+        episode.collision = settings.collision_penalty
+        episode.collided = True
+    last = episode.steps >= episode.last_step
+    reached = (settings.free_horizon or last) and at_goal(i, sim)
+    episode.success = reached and not episode.collided
+    ended = (reached if settings.free_horizon else last) or (episode.collided and settings.terminate_on_collision)
+    episode.terminated = ended
+    episode.truncated = settings.free_horizon and last and not ended
+    measure_miss(i, sim)
+    if ended and not reached:
+        away = episode.goal_distance + episode.heading_error
+        graded = min(1.0, MIN_MISS_FRACTION + MISS_FRACTION_SLOPE * away)
+        episode.miss = settings.miss_penalty * (graded if settings.graded_miss else 1.0)
+    episode.reward = -episode.effort - episode.proximity - episode.collision - episode.miss - episode.time_cost
+    if settings.shaped:
+        after = 0.0 if ended else potential(i, sim)
+        episode.shaping = settings.discount * after - episode.potential
+        episode.potential = after
+        episode.reward += episode.shaping
+    episode.reward *= settings.reward_scale
+
+
+@kernel(NOTHING(FLAGS, PLACES))
+def end_periods(active, places):
+    """Complete a period of robots with motors or in contact, see `_end_period`."""
+    sim = record_at(places, SIMULATION)
+    for i in range(len(active)):
+        if active[i]:
+            _end_period(i, sim)
+
+
+@kernel(int64(MATRIX, FLAGS, PLACES, ADDRESSES))
+def drive(actions, active, places, addresses):
     """Drive robots without motors for a period, up to the first contact, and add the running cost.
+
+    The period is completed, see `_end_period`, except that of robots that continue in contact.
 
     Args:
         actions (count, m): from -1 to 1, the lowest to the highest controls.
         active (count,): the robots that drive.
-        packed: the episodes.
+        places: of the episodes, see `places_of`.
         addresses: see `motion_at`.
 
     Returns:
         -1, or the index of the first active robot whose action is not finite; nothing is changed then.
 
     """
-    sim = Simulation(*packed)
+    sim = record_at(places, SIMULATION)
     invalid = _begin_periods(actions, active, sim)
     if invalid >= 0:
         return invalid
-    scratch, motion = np.empty((7, sim.states.shape[1] + 1)), motion_at(addresses)
+    scratch, motion, settings = np.empty((7, sim.states.shape[1] + 1)), motion_at(addresses), sim.settings[0]
     for i in range(len(active)):
         episode, controls = sim.episodes[i], row_of(sim.controls, i)
         if episode.duration > 0.0:
             fraction = _follow(sim, i, motion, controls, episode.time, episode.duration, scratch)
             episode.effort += effort(row_of(sim.weights, i), controls) * episode.duration * fraction
             episode.remaining = episode.duration * (1.0 - fraction)
+        if active[i] and (episode.remaining == 0.0 or settings.terminate_on_collision):
+            _end_period(i, sim)
     return -1
 
 
@@ -250,20 +310,20 @@ def _read_bodies(bodies, sim, substeps):
             episode.vx, episode.vy, episode.spin = bodies[i, 3] / step, bodies[i, 4] / step, bodies[i, 5] / step
 
 
-@kernel(NOTHING(MATRIX, PACKED, ADDRESSES, int64, int64))
-def push_bodies(bodies, packed, addresses, substep, substeps):
+@kernel(NOTHING(MATRIX, PLACES, ADDRESSES, int64, int64))
+def push_bodies(bodies, places, addresses, substep, substeps):
     """Read the bodies of robots with motors after the last substep, and set their velocities and forces for the next.
 
     Contacts are searched along the motion of the next substep, and the running cost is added.
 
     Args:
         bodies (count, 9): see `MotorBodies`.
-        packed: the episodes.
+        places: of the episodes, see `places_of`.
         addresses: see `motion_at`; of `coast`.
         substep, substeps: number of the next substep, and of all in a period; after the last one both are equal.
 
     """
-    sim, motion = Simulation(*packed), motion_at(addresses)
+    sim, motion = record_at(places, SIMULATION), motion_at(addresses)
     if substep > 0:
         _read_bodies(bodies, sim, substeps)
     if substep == substeps:
@@ -288,55 +348,3 @@ def push_bodies(bodies, packed, addresses, substep, substeps):
             continue
         force = wheel_forces(velocity, body[2], row_of(sim.controls, i), step, settings.motor)
         body[6], body[7], body[8] = force[0] * step * step, force[1] * step * step, force[2] * step * step
-
-
-@kernel(boolean(int64, SIMULATION))
-def at_goal(i, sim):
-    """Return whether the state of robot i equals its goal, within the tolerances."""
-    state, goal, settings = row_of(sim.states, i), row_of(sim.goals, i), sim.settings[0]
-    if math.hypot(state[0] - goal[0], state[1] - goal[1]) > settings.position_tolerance:
-        return False
-    for k in range(3, len(goal)):
-        difference = state[k] - goal[k]
-        if settings.heading_states >> k & 1:
-            difference = wrapped(difference)
-        if not math.isnan(goal[k]) and abs(difference) > settings.motion_tolerance:
-            return False
-    return math.isnan(goal[2]) or abs(wrapped(state[2] - goal[2])) <= settings.heading_tolerance
-
-
-@kernel(NOTHING(FLAGS, PACKED))
-def end_periods(active, packed):
-    """Complete a period: update time, cost and reward, and determine whether the episode has ended."""
-    sim = Simulation(*packed)
-    settings = sim.settings[0]
-    for i in range(len(active)):
-        if not active[i]:
-            continue
-        episode = sim.episodes[i]
-        episode.steps += 1
-        episode.time = min(episode.steps * settings.control_period, episode.horizon)
-        if settings.free_horizon:
-            episode.time_cost = episode.time_weight * episode.duration
-        episode.cost += episode.effort + episode.proximity + episode.time_cost
-        if episode.in_contact and not episode.collided:
-            episode.collision = settings.collision_penalty
-            episode.collided = True
-        last = episode.steps >= episode.last_step
-        reached = (settings.free_horizon or last) and at_goal(i, sim)
-        episode.success = reached and not episode.collided
-        ended = (reached if settings.free_horizon else last) or (episode.collided and settings.terminate_on_collision)
-        episode.terminated = ended
-        episode.truncated = settings.free_horizon and last and not ended
-        measure_miss(i, sim)
-        if ended and not reached:
-            away = episode.goal_distance + episode.heading_error
-            graded = min(1.0, MIN_MISS_FRACTION + MISS_FRACTION_SLOPE * away)
-            episode.miss = settings.miss_penalty * (graded if settings.graded_miss else 1.0)
-        episode.reward = -episode.effort - episode.proximity - episode.collision - episode.miss - episode.time_cost
-        if settings.shaped:
-            after = 0.0 if ended else potential(i, sim)
-            episode.shaping = settings.discount * after - episode.potential
-            episode.potential = after
-            episode.reward += episode.shaping
-        episode.reward *= settings.reward_scale
