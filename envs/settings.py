@@ -37,7 +37,7 @@ SENSORS = (
 )
 FULL_CIRCLE = 2 * math.pi  # rad
 MIN_FOV, FOV_ROUNDING = 1e-3, 1e-6  # rad, smallest field of view, and rounding of a given full circle
-MIN_PERIOD = 1e-4  # s
+MIN_PERIOD, CONTROL_PERIOD = 1e-4, 0.05  # s, the shortest and the default control period
 MAX_COUNT = 10_000  # beams, obstacles in the map, vertices of each, or control periods of the history
 
 
@@ -119,7 +119,7 @@ class EnvironmentSettings:
     disturbance: Disturbance = UNDISTURBED
     motor: Motor = Motor()
     dict_observation: bool = False
-    control_period: float = 0.05
+    control_period: float = CONTROL_PERIOD
     position_tolerance: float = 0.1
     heading_tolerance: float = 0.1
     motion_tolerance: float = 0.1
@@ -284,7 +284,8 @@ class EnvironmentSettings:
         }
         further = [("velocities of obstacles", self.velocities), ("last action", self.previous_action)]
         ages = [f"observations of {', '.join(f'{age:g}' for age in self.history)} s before"] if self.history else []
-        return ", ".join([words[self.observation], *(text for text, given in further if given), *ages])
+        period = [] if self.control_period == CONTROL_PERIOD else [f"every {self.control_period:g} s"]
+        return ", ".join([words[self.observation], *(text for text, given in further if given), *ages, *period])
 
     @property
     def free_horizon(self) -> bool:

@@ -67,21 +67,11 @@ def action_scale(env: Any) -> tuple[np.ndarray, np.ndarray]:
         ValueError: an action wrapper is neither Gymnasium's `RescaleAction` nor `ClipAction`.
 
     """
-    while hasattr(env, "venv"):
-        env = env.venv
-    layers: list[Any] = []
-    while True:
-        if isinstance(env, gym.ActionWrapper | gym.vector.VectorActionWrapper):
-            layers.append(env)
-        if isinstance(env, gym.Wrapper | gym.vector.VectorWrapper):
-            env = env.env
-        elif getattr(env, "envs", None):  # those of a vector environment are wrapped in the same way
-            env = env.envs[0]
-        else:
-            break
-    space = _single_action_space(env)
+    *wrappers, inner = _layers(env)
+    space = _single_action_space(inner)
     factor, offset = np.ones(space.shape), np.zeros(space.shape)
-    for layer in reversed(layers):
+    kinds = gym.ActionWrapper | gym.vector.VectorActionWrapper
+    for layer in reversed([wrapper for wrapper in wrappers if isinstance(wrapper, kinds)]):
         name = type(layer).__name__
         if name == "RescaleAction":
             inside, outside = _single_action_space(layer.env), _single_action_space(layer)
@@ -90,6 +80,27 @@ def action_scale(env: Any) -> tuple[np.ndarray, np.ndarray]:
         elif name != "ClipAction":
             raise ValueError(f"env: expected no action wrapper but RescaleAction and ClipAction, got {name}")
     return factor, offset
+
+
+def observation_wrappers(env: Any) -> list[str]:
+    """Return the names of the wrappers of Gymnasium that change the observations of leapnav's environment."""
+    kinds = gym.ObservationWrapper | gym.vector.VectorObservationWrapper
+    return [type(layer).__name__ for layer in _layers(env) if isinstance(layer, kinds)]
+
+
+def _layers(env: Any) -> list[Any]:
+    """Return the wrappers of Gymnasium around an environment, from the outermost, and the environment."""
+    while hasattr(env, "venv"):
+        env = env.venv
+    layers: list[Any] = []
+    while True:
+        if isinstance(env, gym.Wrapper | gym.vector.VectorWrapper):
+            layers.append(env)
+            env = env.env
+        elif getattr(env, "envs", None):  # those of a vector environment are wrapped in the same way
+            env = env.envs[0]
+        else:
+            return [*layers, env]
 
 
 def _single_action_space(env: Any) -> Any:

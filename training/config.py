@@ -45,7 +45,7 @@ class RunConfig:
     out: Path
     """Run directory: configuration, policy, checkpoints, TensorBoard logs, evaluations."""
     family: FamilyName = "clutter"
-    """Family of the scenarios."""
+    """Family of the scenarios: built in, module:function, or a file (.bank, .json)."""
     robot: RobotSetting | None = None
     """Model of the robot, or JSON of one with other parameters; by default that of the scenarios of a file, otherwise
     the unicycle."""

@@ -21,11 +21,12 @@ from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.bank import ScenarioBank, collection_name
 from leapnav.envs.scenarios.families import ALL, ALL_FAMILIES, MAX_HORIZON
 from leapnav.envs.scenarios.scenario import TIME_LIMIT_FACTOR, Scenario
+from leapnav.envs.settings import CONTROL_PERIOD
 from leapnav.envs.utils.files import digest
 
 ENVIRONMENT = "leapnav/Navigate-v0"
 CHECKSUM = "leapnav_sha256"  # key of the metadata: checksum of the data file
-CONTROL_PERIOD = 0.05  # s, the default of the environment; datasets use it
+WORK = ".rollout"  # directory of an unfinished rollout
 # Step limit of a dataset's environment. No episode reaches it, but d3rlpy requires a limit.
 MAX_STEPS = {
     "fixed": ceil(MAX_HORIZON / CONTROL_PERIOD) + 1,
@@ -184,10 +185,12 @@ def open_dataset(folder: str | os.PathLike[str]) -> minari.MinariDataset:
     """Open the only Minari dataset below a directory.
 
     Raises:
-        FileNotFoundError: there is no dataset, or more than one.
+        FileNotFoundError: there is no dataset, an unfinished one, or more than one.
         ValueError: the dataset was not written by `rollout`, or has changed since.
 
     """
+    if (Path(folder) / WORK).exists():
+        raise FileNotFoundError(f"{os.fspath(folder)}: an unfinished rollout; repeat its command to finish it")
     found = sorted(path.parent for path in Path(folder).glob("**/data/metadata.json"))
     if len(found) != 1:
         raise FileNotFoundError(f"{os.fspath(folder)}: expected one Minari dataset, found {len(found)}")

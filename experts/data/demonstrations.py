@@ -19,9 +19,10 @@ from leapnav.envs.kernels.types import constant
 from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import CONTROL_PERIOD
 from leapnav.experts.acting.feedback import Feedback
 from leapnav.experts.acting.policy import plan_actions
-from leapnav.experts.data.datasets import CONTROL_PERIOD, Task, dataset_id, open_dataset, write_episodes
+from leapnav.experts.data.datasets import Task, dataset_id, open_dataset, write_episodes
 from leapnav.experts.hard_limits import without_barrier
 from leapnav.experts.problem.extremal import Extremal
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory

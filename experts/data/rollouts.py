@@ -26,7 +26,7 @@ from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.progress import advance, progress_bar
 from leapnav.envs.utils.validation import check_at_least
-from leapnav.experts.data.datasets import open_dataset
+from leapnav.experts.data.datasets import WORK, open_dataset
 from leapnav.experts.data.demonstrations import (
     Demonstration,
     demonstrate,
@@ -44,7 +44,6 @@ from leapnav.experts.problem.extremal import Extremal
 VERSION = 1  # format of the shards
 MIN_SEED = 2  # seeds 0 and 1 give the first scenarios of the included training and test banks
 SHARD_SIZE = 16  # scenarios per shard
-WORK = ".rollout"  # directory of an unfinished rollout
 FORCE = ", or use force=True (--force)"
 DONE = WORK + DISCARDED  # the same directory while it is removed
 RECORD = "rollout.json"  # arguments and summary of a finished rollout, beside its dataset

@@ -40,7 +40,7 @@ class Build(FamilyTaskOptions, ParallelOptions):
     licence: str = ""
     """Licence of the files, for the data card."""
     family: Family = "clutter"
-    """Family of the scenarios."""
+    """Family of the scenarios: built in, module:function, or a file (.bank, .json)."""
     count: int = 1000
     """Number of scenarios in the bank."""
     seed: int = 0
@@ -302,6 +302,9 @@ def _print_summary(bank: ScenarioBank) -> None:
     kind += "" if bank.obstacles == "cost" else ", hard obstacles"
     source = f"seed {bank.seed}" if bank.given is None else "given"
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, {source}, leapnav {bank.software}")
+    robots = {scenario.robot.model_dump_json(exclude_none=True) for scenario in bank}
+    others = "" if len(robots) == 1 else f" and {len(robots) - 1} others"
+    print(f"  robot              {bank.robot.model_dump_json(exclude_none=True)}{others}")
     print("  checksums, optima  verified")
     print(f"  {'sampled' if bank.given is None else 'given  '}            {bank.drawn}")
     for reason, count in bank.rejected.items():

@@ -26,7 +26,7 @@ class Rollout(FamilyTaskOptions, ParallelOptions):
     out: Path
     """Output directory of the dataset."""
     family: FamilyOrAll = "clutter"
-    """Family of the scenarios."""
+    """Family of the scenarios: built in, module:function, or a file (.bank, .json)."""
     count: int = 100
     """Number of scenarios."""
     seed: int = 1000

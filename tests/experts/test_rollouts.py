@@ -146,6 +146,8 @@ def unfinished(folder, monkeypatch, **changes):
 
 def test_a_damaged_shard_is_refused_by_name(tmp_path, monkeypatch):
     first, second = unfinished(tmp_path / "out", monkeypatch)
+    with pytest.raises(FileNotFoundError, match="out: an unfinished rollout; repeat its command"):
+        open_dataset(tmp_path / "out")
     content = bytearray(second.read_bytes())
     content[len(content) // 2] ^= 0xFF
     second.write_bytes(content)

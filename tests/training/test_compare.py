@@ -1,7 +1,9 @@
 """Comparison of one's own methods with the optimum and with other policies."""
 
 import math
+from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import SMALL
@@ -21,6 +23,7 @@ from leapnav.training import (
     plot_episodes,
     plot_scores,
     print_scores,
+    save_policy,
     write_report,
 )
 from leapnav.training.scoring.reports import training_notes
@@ -30,6 +33,28 @@ def towards_the_goal(observation):
     """A policy as a plain function: turn towards the goal and drive at the speed that is needed."""
     ahead, left, needed = observation[0], observation[1], observation[7]
     return np.clip([0.5 * needed * math.copysign(1, ahead), math.atan2(left, abs(ahead))], -1, 1)
+
+
+def test_a_model_observes_what_its_environment_contains(tmp_path):
+    env = gym.make("leapnav/Navigate-v0", family="open", observation="state", control_period=0.4)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0)
+    alone = evaluate(model, "open", count=2, progress=False)
+    assert alone.settings.sensors == "goal and motion, every 0.4 s"
+    (compared,) = compare({"model": model}, "open", count=2, progress=False).runs["model"]
+    save_policy(model, tmp_path / "policy")
+    saved = evaluate(tmp_path / "policy", "open", count=2, progress=False)
+    assert [e.cost for e in alone] == [e.cost for e in compared] == [e.cost for e in saved]
+    # Given arguments take precedence; those of the whole comparison only where nothing is known of a policy.
+    changed = evaluate(model, "open", count=2, progress=False, environment={"control_period": 0.2})
+    assert changed.settings == replace(alone.settings, control_period=0.2)
+    settings = {"control_period": 0.1, "observation": "map"}
+    policies = {"model": (model, {"control_period": 0.2}), "own": model, "other": towards_the_goal, "name": "open"}
+    runs = compare(policies, "open", count=1, environment=settings, progress=False).runs
+    found = [(runs[name][0].settings.observation, runs[name][0].settings.control_period) for name in policies]
+    assert found == [("state", 0.2), ("state", 0.4), ("map", 0.1), ("lidar", 0.1)]
+    wrapped = gym.wrappers.TransformObservation(env, lambda observation: 0 * observation, None)
+    with pytest.warns(UserWarning, match="observations are those without the wrappers TransformObservation"):
+        evaluate(PPO("MlpPolicy", wrapped, n_steps=8, batch_size=8), "open", count=1, progress=False)
 
 
 @pytest.mark.usefixtures("coarse_decisions")

@@ -23,6 +23,7 @@ from leapnav.training import (
     compare,
     evaluate,
     load_policy,
+    make_policy,
     make_vec_env,
     network,
     save_policy,
@@ -30,6 +31,9 @@ from leapnav.training import (
     train_dagger,
     warm_start,
 )
+from leapnav.training.policies.files import read_description, trained_robot
+from leapnav.training.runs.checks import warn_of_family
+from leapnav.training.runs.run import Run
 
 WIDE = Unicycle(radius=0.3)
 SMALL = ["--hidden", "16", "16", "--lidar-beams", "8", "--evaluation-scenarios", "2", "--observation", "lidar"]
@@ -124,12 +128,37 @@ def test_a_robot_with_other_parameters_is_trained_and_evaluated(tmp_path, monkey
     capsys.readouterr()
     assert main(["evaluate", "clone", "--workers", "1"]) == 0
     printed = capsys.readouterr().out
-    assert "2 scenarios" in printed and "another robot" not in printed
+    assert f"Scenarios: {tmp_path / 'clone' / 'test.bank'}" in printed and "another robot" not in printed
+    assert main(["evaluate", "clone", "--workers", "1", "--count", "1", "--robot", "unicycle"]) == 0
+    printed = capsys.readouterr().out
+    assert "Scenarios: open-test.bank" in printed and "another robot: radius 0.3, here 0.25" in printed
+    with pytest.warns(UserWarning, match="clone: trained with another robot: radius 0.3, here 0.25"):
+        evaluate("clone", "open", count=1, progress=False)
+    assert main(["bank", "show", "clone/test.bank"]) == 0
+    assert text in capsys.readouterr().out
     assert main(["evaluate", "clone", "--workers", "1", "--robot", text]) == 0
     assert main(["evaluate", "clone", "--robot", text.replace("0.3", "0.4")]) == 2
-    assert "robot: expected that of the policies, 'unicycle', got '{" in capsys.readouterr().err
+    assert "build a bank of its scenarios" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match="policy: clone was trained in open, the run is in slalom"):
+        warn_of_family("policy", Path("clone"), DAggerRunConfig(out=tmp_path, family="slalom"))
     assert main(["evaluate", "expert", "--robot", text]) == 2
     assert "build a bank of its scenarios" in capsys.readouterr().err
+
+
+def of_any_radius(rng):
+    """Sample a whole scenario with a robot of its own."""
+    robot = Unicycle(radius=float(rng.uniform(0.2, 0.3)))
+    return sample_scenario("open", int(rng.integers(1000)), robot)
+
+
+def test_no_robot_is_named_as_that_of_the_training_if_each_scenario_has_another(tmp_path):
+    for family, robot in (("open", Unicycle()), (f"{__name__}:of_any_radius", None)):
+        run = Run("bc", BCConfig(out=tmp_path / (robot or "any").__class__.__name__, family=family, hidden=(4,)))
+        env = NavigateEnv(**run.config.fresh_environment)
+        run.save_policy(make_policy(env.observation_space, env.action_space, hidden=(4,)))
+        assert trained_robot(read_description(run.folder)) == robot
+        with pytest.raises(FileExistsError, match="the directory of a training run"):
+            save_policy(load_policy(run.folder), run.folder)
 
 
 def test_banks_and_files_are_accepted_where_a_scenario_or_a_family_is(bank, tmp_path):

@@ -21,12 +21,12 @@ from leapnav.envs.scenarios.cost import Cost
 from leapnav.envs.scenarios.families import is_built_in
 from leapnav.envs.scenarios.scenario import Scenario, check_robot
 from leapnav.envs.scenarios.sources import ScenarioSource
-from leapnav.envs.settings import SENSORS, EnvironmentSettings
+from leapnav.envs.settings import CONTROL_PERIOD, SENSORS, EnvironmentSettings
 from leapnav.envs.simulation.observations import TIME_LEFT
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.unwrapping import unwrap
 from leapnav.envs.utils.files import atomic_path
-from leapnav.experts.data.datasets import CONTROL_PERIOD, ENVIRONMENT, open_dataset
+from leapnav.experts.data.datasets import ENVIRONMENT, open_dataset
 from leapnav.experts.data.demonstrations import Demonstration
 from leapnav.training.policies.symmetries import Transformation, symmetries
 

@@ -17,11 +17,11 @@ from torch import nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from leapnav.envs.scenarios.scenario import Scenario
+from leapnav.envs.settings import CONTROL_PERIOD
 from leapnav.envs.simulation.observations import ObservationLayout
 from leapnav.envs.simulation.observer import Observer
 from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_not_negative, check_positive
-from leapnav.experts.data.datasets import CONTROL_PERIOD
 from leapnav.training.fit_settings import CloningConfig, WarmStartConfig
 from leapnav.training.learning.cloning import (
     EpochLoss,

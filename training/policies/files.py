@@ -22,8 +22,8 @@ from leapnav.envs.navigation import NavigateEnv
 from leapnav.envs.robots.base import RobotModel, robot_class
 from leapnav.envs.scenarios.families import ALL, FAMILIES
 from leapnav.envs.scenarios.scenario import check_robot
-from leapnav.envs.settings import SENSORS, EnvironmentSettings
-from leapnav.envs.unwrapping import unwrap
+from leapnav.envs.settings import CONTROL_PERIOD, SENSORS, EnvironmentSettings
+from leapnav.envs.unwrapping import observation_wrappers, unwrap
 from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
 from leapnav.envs.utils.validation import suggestion
@@ -56,18 +56,33 @@ def save_policy(
         model: a Stable-Baselines3 algorithm (PPO, A2C, SAC, TD3, DDPG or TQC) with an "MlpPolicy", with the default
             network or that of `leapnav.training.network`, or with a "MultiInputPolicy" for `dict_observation=True`; or
             its policy.
-        folder: the directory; created if it does not exist.
+        folder: the directory; created if it does not exist. A policy in it is replaced.
         environment: the arguments of `gym.make` for which the policy was trained, except the family; None: those of
             the model's environment, if it has one.
         training: description of the training, as JSON.
         half: save only the actor, in half precision: about 1/5 of the size; the actions change by about 1e-3.
 
     Raises:
+        FileExistsError: the directory is that of a training run.
         TypeError: the model is not a Stable-Baselines3 algorithm or policy with an actor.
         ValueError: the policy has another network, an argument of the environment is invalid, or the environment has
             other observations than the policy.
 
     """
+    if (Path(folder) / "config.json").exists():
+        raise FileExistsError(f"{folder}: the directory of a training run; choose another directory")
+    write_policy(model, folder, environment, training=training, half=half)
+
+
+def write_policy(
+    model: BaseAlgorithm | BasePolicy,
+    folder: str | Path,
+    environment: Mapping[str, Any] | None,
+    *,
+    training: Mapping[str, Any] | None,
+    half: bool = False,
+) -> None:
+    """Save a policy as `save_policy` does, also in the directory of its run."""
     policy, folder = policy_of(model), Path(folder)
     architecture = Architecture.of(policy)
     assert isinstance(policy.action_space, spaces.Box)  # checked above
@@ -170,7 +185,9 @@ def read_description(folder: str | Path) -> dict[str, Any]:
 def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
     """Return the arguments of `gym.make` for an environment with the observations that a policy was trained with.
 
-    Those of a model saved by Stable-Baselines3 are derived from its observations, of a lidar, the state or the map.
+    Those of a model saved by Stable-Baselines3 are derived from its observations, of a lidar, the state or the map. The
+    robot is the name of its model; its parameters are those of the scenarios. The control period is contained if it is
+    not the default.
 
     Args:
         policy: see `folder` of `load_policy`; or a model of Stable-Baselines3 with one of leapnav's environments.
@@ -187,20 +204,30 @@ def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
         return found
     if is_zip(policy):
         return load_zip(policy)[1]
-    return _observed(read_description(policy))
+    description = read_description(policy)
+    return {**_observed(description), **_period(description["environment"])}
 
 
 def environment_of(model: Any) -> dict[str, Any]:
-    """Return the arguments of `gym.make` that determine the observations of a model's environment.
+    """Return the arguments of `gym.make` that determine the observations and the period of a model's environment.
 
-    They are empty if the model has no environment, or not one of leapnav.
+    They are empty if the model has no environment, or not one of leapnav. Wrappers that change the observations are not
+    applied; a warning contains their names.
     """
     venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
     try:
         settings = unwrap(venv)[0].settings
     except TypeError:
         return {}
-    return {name: getattr(settings, name) for name in OBSERVED}
+    if names := observation_wrappers(venv):
+        warnings.warn(f"env: observations are those without the wrappers {', '.join(names)}", stacklevel=3)
+    return {**{name: getattr(settings, name) for name in OBSERVED}, **_period(_as_dict(settings))}
+
+
+def _period(environment: Mapping[str, Any]) -> dict[str, float]:
+    """Return the control period among the settings of an environment, unless it is the default."""
+    period = environment.get("control_period", CONTROL_PERIOD)
+    return {} if period == CONTROL_PERIOD else {"control_period": period}
 
 
 def _observed(description: Mapping[str, Any]) -> dict[str, Any]:

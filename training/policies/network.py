@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from leapnav.envs.settings import CONTROL_PERIOD
 from leapnav.envs.simulation.observations import FREE_GOAL_ENTRIES, TIME_LEFT, frame_size, parts_of
 from leapnav.experts.data.datasets import ENVIRONMENT
 from leapnav.training.policies.navigation_policy import NavigationPolicy
@@ -18,7 +19,6 @@ from leapnav.training.policies.symmetries import Transformation
 
 HIDDEN = (256, 256, 256)  # default widths of the hidden layers
 ROBOT_RADIUS = 0.25  # radius of the robots in all families (m); a range minus this is the clearance along a beam
-CONTROL_PERIOD = 0.05  # default of the environment (s)
 
 
 class NavigationFeatures(BaseFeaturesExtractor):

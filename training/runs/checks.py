@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, get_args
 
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import check_family, task_of
+from leapnav.envs.scenarios.families import check_family, families_of, is_built_in, task_of
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.utils.validation import (
@@ -26,6 +28,7 @@ from leapnav.training.learning.cloning import check_cloning
 from leapnav.training.learning.dagger import check_dagger
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.warm_start import check_warm_start
+from leapnav.training.policies.files import read_description
 
 
 def check_config(config: RunConfig) -> None:
@@ -78,6 +81,13 @@ def check_demonstrations(config: RunConfig, dataset: Dataset) -> None:
             raise ValueError(f"demos: expected a robot with {name} {expected.get(name)!r}, got {found[name]!r}")
         if scenario.horizon_kind != horizon:
             raise ValueError(f"demos: expected a {horizon} horizon, got a {scenario.horizon_kind} one")
+
+
+def warn_of_family(name: str, path: Path, config: RunConfig) -> None:
+    """Warn if the policy with which a run starts was trained in another family, of which the results may be worse."""
+    family = read_description(path)["training"].get("family")
+    if is_built_in(family) and family not in families_of(config.family):
+        warnings.warn(f"{name}: {path} was trained in {family}, the run is in {config.family}", stacklevel=3)
 
 
 def _kind(text: str) -> tuple[str, bool]:

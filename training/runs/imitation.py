@@ -24,7 +24,7 @@ from leapnav.training.policies.actors import copy_actor
 from leapnav.training.policies.files import load_policy
 from leapnav.training.policies.network import make_policy
 from leapnav.training.policies.symmetries import symmetries
-from leapnav.training.runs.checks import check_config, check_demonstrations
+from leapnav.training.runs.checks import check_config, check_demonstrations, warn_of_family
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
 from leapnav.training.threads import limit_threads
@@ -113,6 +113,7 @@ def train_dagger(config: DAggerRunConfig, *, workers: int = 1, progress: bool = 
         check_demonstrations(config, dataset)
     policy = _new_policy(config)
     if config.policy is not None:
+        warn_of_family("policy", config.policy, config)
         copy_actor(load_policy(config.policy, make_env(config)), policy)
     run = Run("dagger", config)
     dataset = dataset or _demonstrations(run, config.scenarios, workers, progress)

@@ -36,7 +36,7 @@ from leapnav.training.policies.files import load_policy, policy_environment, pol
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, symmetries_of
 from leapnav.training.policies.network import network
 from leapnav.training.policies.symmetries import Transformation, symmetries
-from leapnav.training.runs.checks import check_config, check_demonstrations
+from leapnav.training.runs.checks import check_config, check_demonstrations, warn_of_family
 from leapnav.training.runs.imitation import mean_scores, observed_settings
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
@@ -228,6 +228,7 @@ def _resolve_warm_start(config: Config) -> tuple[list[Path], BasePolicy | None]:
 
 def _load_start(path: Path, config: Config) -> BasePolicy:
     """Load the policy to start from: one of the same observations, or of a robot without motors."""
+    warn_of_family("warm_start", path, config)
     arguments = config.fresh_environment
     if policy_environment(path).get("actuation", "velocity") == "velocity":
         arguments = {name: value for name, value in arguments.items() if name != "actuation"}

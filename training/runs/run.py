@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,12 @@ from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
 from leapnav.envs.scenarios.bank import ScenarioBank
-from leapnav.envs.scenarios.families import BANK_ENDING, families_of, task_of
+from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, families_of, sample_scenario, task_of
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
 from leapnav.training.config import LATER_SENSORS, RunConfig
-from leapnav.training.policies.files import save_policy
+from leapnav.training.policies.files import write_policy
 from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.adapters import PolicyOrFactory
 from leapnav.training.scoring.comparison import own_bank
@@ -182,10 +183,17 @@ class Run:
         """Save the policy with the settings of the run, by which runs that differ only in their seed are grouped."""
         excluded = (*FREE_SETTINGS, "evaluation_scenarios")  # no influence on the policy
         training = {name: value for name, value in self._settings.items() if name not in excluded}
+        training["robot"] = self._robot
+        write_policy(model, self.folder, self.config.environment, training=training)
+
+    @cached_property
+    def _robot(self) -> dict[str, Any] | None:
+        """The robot of the training; None if the scenarios have different ones."""
         config = self.config
         robot, *_ = task_of(config.family, config.robot, config.horizon, config.obstacles)
-        training["robot"] = robot.model_dump(mode="json")
-        save_policy(model, self.folder, self.config.environment, training=training)
+        is_own = config.family not in (*FAMILIES, ALL)
+        first = [sample_scenario(config.family, seed, **config.task).robot for seed in range(8 if is_own else 0)]
+        return robot.model_dump(mode="json") if all(one == robot for one in first) else None
 
     def save_checkpoint(self, write: Callable[[Path], None], progress: Mapping[str, Any]) -> None:
         """Replace the checkpoint; if the process is killed meanwhile, the old one or the new one can be loaded.

@@ -14,7 +14,7 @@ from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_fa
 from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.training.config import PPOConfig, RunConfig, read_config
 from leapnav.training.scoring.adapters import PolicyOrFactory
-from leapnav.training.scoring.evaluation import evaluate
+from leapnav.training.scoring.evaluation import evaluate, known_environment
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
 from leapnav.training.scoring.results import Evaluation, bank_identity
 from leapnav.training.scoring.scores import Score, score
@@ -163,7 +163,8 @@ def compare(
         bank: a bank, its file (`.bank`), several banks, the name of a family for its test split, or "all" for those of
             all families, with the kinds of obstacles for which the policies were trained.
         count: number of scenarios of each bank, from the first; None: all.
-        environment: arguments of the environment, such as `observation`, for the policies without their own.
+        environment: arguments of the environment, such as `control_period`. Those that determine the observations of
+            a policy, as far as they are known (see `evaluate`), and those in its tuple take precedence.
         seed: random seed of the bootstrap intervals, the disturbances and the random policy.
         workers, dask: see `evaluate`.
         progress: show progress bars.
@@ -201,8 +202,10 @@ def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | No
             )
         given, own = given
     if isinstance(given, (str, Path)):
-        return replace(load_policy_spec(str(given), seed=seed, environment=own), name=name, label=label)
-    return PolicySpec(name, label, None, given, (environment or {}) if own is None else own)
+        spec = replace(load_policy_spec(str(given), seed=seed, environment=own), name=name, label=label)
+    else:
+        spec = PolicySpec(name, label, None, given, known_environment(given))
+    return replace(spec, environment={**(environment or {}), **spec.environment, **(own or {})})
 
 
 def included_banks(
@@ -228,9 +231,10 @@ def included_banks(
         ValueError: there is no such bank, or the policies have different robots or horizons.
 
     """
-    model = _common("robot", [spec.robot for spec in specs], robot) or "unicycle"
+    model = None if robot is None else check_robot(robot).model
+    model = _common("robot", [spec.robot for spec in specs], model) or "unicycle"
     kind = _common("horizon", [spec.horizon for spec in specs], horizon) or "fixed"
-    return [ScenarioBank.shipped(family, split, model, kind, obstacles) for family in families]
+    return [ScenarioBank.shipped(family, split, robot or model, kind, obstacles) for family in families]
 
 
 def default_banks(
@@ -271,19 +275,24 @@ def default_banks(
             own[bank_identity(bank)] = bank
             continue
         for kind in sorted(kinds):
-            banks = (
-                ScenarioBank(path)
+            found = [
+                bank
                 for folder, config in configs.items()
                 if config.task["obstacles"] == kind and split == "test"
                 if name not in ScenarioBank.shipped_families(**config.task)
                 if (path := own_bank(config, folder, name)).exists()
-            )
-            # As in `task_of`: the name of the model selects the robot of the bank.
-            found = [bank for bank in banks if robot in (None, bank.robot.model) or check_robot(robot) == bank.robot]
+                if _has_robot(bank := ScenarioBank(path), robot, config)
+            ]
             own |= {bank_identity(bank): bank for bank in found}
             if not found:
                 included += included_banks(specs, [name], split, robot, horizon, obstacles=kind)
     return [*included, *own.values()]
+
+
+def _has_robot(bank: ScenarioBank, robot: str | None, config: RunConfig) -> bool:
+    """Return whether the bank of a run has a robot, which its family may determine, see `task_of`."""
+    is_named = config.robot is None and robot == bank.robot.model
+    return robot is None or is_named or check_robot(robot) == bank.robot
 
 
 def own_bank(config: RunConfig, folder: Path, family: str, split: str = "test") -> Path:

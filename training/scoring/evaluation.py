@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -79,8 +80,9 @@ def evaluate(
             obstacles of `environment`; by default the obstacles are those of the training of a policy that is given by
             its name.
         count: number of scenarios, from the first of the bank; None: all.
-        environment: arguments of the environment, such as `observation`; None: those that determine the observations of
-            the model's environment, or of the training of a policy that is given by its name, if they are known.
+        environment: arguments of the environment, such as `control_period`. They take precedence over those that
+            determine the observations of the model's environment, or of the training of a policy that is given by its
+            name, as far as these are known.
         seed: random seed of the disturbances.
         timed: measure the computation time of an action; otherwise `milliseconds` is NaN.
         workers: number of processes that search the optima for the poses reached, which takes most of the time; the
@@ -98,12 +100,12 @@ def evaluate(
 
     """
     check_at_least("workers", workers, 1)
-    obstacles: str | None = None
+    obstacles, trained, name = None, None, policy
     if isinstance(policy, (str, Path)):
         spec = load_policy_spec(str(policy), seed=seed)
-        policy, environment = spec.policy, spec.environment if environment is None else environment
-        obstacles = spec.obstacles
-    environment = _environment_of(policy) if environment is None else environment
+        policy, environment = spec.policy, {**spec.environment, **(environment or {})}
+        obstacles, trained = spec.obstacles, spec.trained_robot
+    environment = {**known_environment(policy), **(environment or {})}
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(
             "policy: expected a name, an object with `predict`, a function of an observation, or a PolicyFactory, got "
@@ -113,6 +115,9 @@ def evaluate(
         if not isinstance(bank, str):
             raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
         bank = _named_bank(bank, {"obstacles": obstacles, **environment})
+    differences = [] if trained is None else trained.differences(bank.robot)
+    if differences:
+        warnings.warn(f"{name}: trained with another robot: {'; '.join(differences)}", stacklevel=3)
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
     arguments = {name: value for name, value in environment.items() if name != "obstacles"}
@@ -134,7 +139,7 @@ def evaluate(
     return Evaluation(tuple(episodes), milliseconds, EnvironmentSettings(**{**arguments, **task}))
 
 
-def _environment_of(policy: Any) -> dict[str, Any]:
+def known_environment(policy: Any) -> dict[str, Any]:
     """Return the arguments of the environment that determine the observations of a policy, as far as it knows them."""
     found = environment_of(policy)
     if not found and isinstance(getattr(policy, "observation_space", None), gym.spaces.Dict):

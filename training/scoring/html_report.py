@@ -181,13 +181,16 @@ def _learning_curves(rows: dict[str, list[_RunRecord]], families: Sequence[str])
             axes.grid(alpha=0.3)
         handles = panels[1].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-        text = f"Scores on the training split ({', '.join(families)}) against {caption}{note}. Stars: test split."
+        text = (
+            f"Scores during the training ({', '.join(families)}) against {caption}{note}. Stars: the last evaluation, "
+            "of the test split unless the family is a bank."
+        )
         curves.append({"svg": _as_svg(figure), "caption": text})
     return curves
 
 
 def _draw_curve(axes: Axes, records: Sequence[_RunRecord], axis: str, measure: str, color: str, label: str) -> None:
-    """Draw the mean over the seeds on the training split, with their range, and the results on the test split."""
+    """Draw the mean over the seeds during the training, with their range, and the results of the last evaluation."""
     scale = 1 / 60 if axis == "seconds" else 1.0
     curves, ends = [], []
     for record in records:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import leapnav
-from leapnav.envs.scenarios.bank import ScenarioBank
+from leapnav.envs.scenarios.bank import BANK_DIRECTORY, ScenarioBank
 from leapnav.envs.utils.colors import CURVES, FAILURE, OPTIMUM, POLICY
 from leapnav.envs.utils.files import write_text
 from leapnav.envs.utils.json_utils import encode, plain
@@ -68,6 +68,8 @@ def print_scores(comparison: Comparison) -> None:
             (row_name(row), *(runs_cell(getattr(row, name), *form) for _, name, *form in columns)) for row in scores
         ]
         print_table(("policy", *(title for title, *_ in columns)), rows, title=RUNS_TITLE)
+    files = [bank.path.name if bank.path.parent == BANK_DIRECTORY else str(bank.path) for bank in comparison.banks]
+    print(f"Scenarios: {', '.join(files)}")
     observed = [f"{sensors} ({', '.join(names)})" for sensors, names in sensors_of(comparison).items()]
     print(f"Observed: {'; '.join(observed)}")
     for note in training_notes(comparison):
