@@ -302,6 +302,8 @@ def test_extremes_are_the_best_the_median_and_the_worst():
     assert [e.cost for e in rows["median"]] == pytest.approx([1.3, 1.4])
     assert [e.collision for e in rows["worst"]] == [True, False]
     assert list(extremes([episode(False, True)], 2)) == ["worst"]
+    few = extremes([episode(cost=1 + k / 10) for k in range(3)], 2)  # each episode once
+    assert {group: [e.cost for e in chosen] for group, chosen in few.items()} == {"best": [1.0, 1.1], "worst": [1.2]}
 
 
 def test_policies_by_name_drive_single_and_vector_environments(policies):

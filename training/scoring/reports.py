@@ -289,7 +289,7 @@ def plot_episodes(
 
 
 def extremes(episodes: Sequence[Episode], count: int) -> dict[str, list[Episode]]:
-    """Select the best, median and worst episodes, without empty groups.
+    """Select the best, median and worst episodes, each once, without empty groups.
 
     Best and median refer to the regret of the successful episodes. The worst are unsuccessful episodes, collisions
     first, followed by the successful episodes with the highest regret.
@@ -301,10 +301,11 @@ def extremes(episodes: Sequence[Episode], count: int) -> dict[str, list[Episode]
     """
     successes = sorted((e for e in episodes if e.success), key=_regret_or_infinity)
     failures = sorted((e for e in episodes if not e.success), key=lambda e: not e.collision)
-    middle = max(0, len(successes) // 2 - count // 2)
-    worst = failures[:count] + successes[::-1][: max(0, count - len(failures))]
-    median = successes[middle : middle + count] if len(successes) > count else []  # otherwise those of the first row
-    rows = {"best": successes[:count], "median": median, "worst": worst}
+    best, others = successes[:count], successes[count:]
+    n_left = len(others) - min(len(others), max(0, count - len(failures)))
+    worst = failures[:count] + others[n_left:][::-1]
+    middle = min(max(0, len(successes) // 2 - count // 2 - count), max(0, n_left - count))
+    rows = {"best": best, "median": others[:n_left][middle : middle + count], "worst": worst}
     return {title: chosen for title, chosen in rows.items() if chosen}
 
 
