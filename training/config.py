@@ -6,10 +6,10 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 from pathlib import Path
-from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self, cast, get_args
 
 from leapnav.training.fit_settings import CloningConfig, DAggerConfig, WarmStartConfig
@@ -78,9 +78,12 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Replace a robot by the JSON text of its parameters, which the files of the run contain."""
-        if not isinstance(self.robot, (str, NoneType)):
-            from leapnav.envs.scenarios.scenario import check_robot
+        is_text = isinstance(self.robot, str) and self.robot.lstrip().startswith("{")
+        if self.robot is None or (isinstance(self.robot, str) and not is_text):
+            return
+        from leapnav.envs.scenarios.scenario import check_robot
 
+        with suppress(ValueError) if is_text else nullcontext():  # `check_config` reports an invalid text
             object.__setattr__(self, "robot", check_robot(self.robot).model_dump_json(exclude_none=True))
 
     @property
@@ -92,7 +95,9 @@ class RunConfig:
         from leapnav.envs.scenarios.families import task_of
 
         robot, horizon, obstacles = task_of(self.family, self.robot, self.horizon, self.obstacles)
-        is_named = self.robot in (None, robot.model) or robot == type(robot)()
+        is_named = False
+        with suppress(ValueError):  # the model has parameters without a default
+            is_named = task_of(self.family, robot.model)[0] == robot
         text = robot.model if is_named else robot.model_dump_json(exclude_none=True)
         return {"robot": text, "horizon": horizon, "obstacles": obstacles}
 

@@ -37,6 +37,7 @@ __all__ = [
     "records_of",
     "scratch_buffer",
     "vector_at",
+    "writable",
 ]
 
 
@@ -64,13 +65,26 @@ class FunctionPointer:
 
 
 def places_of(record: Sequence[np.ndarray], declared: Any) -> np.ndarray:
-    """Return the addresses and the shapes (k, 4), int64, of the arrays of a record, which the caller keeps alive."""
+    """Return the addresses and the shapes (k, 4), int64, of the arrays of a record.
+
+    The caller keeps the arrays alive, and replaces none while a kernel runs in another thread.
+
+    Raises:
+        TypeError: an array is not of its declared type, not in C order, or read-only.
+
+    """
     places = np.zeros((len(record), 4), np.int64)
     for place, array, member in zip(places, record, declared.types, strict=True):
         found: Any = typeof(array)
-        assert (found.dtype, found.ndim, found.layout) == (member.dtype, member.ndim, "C"), (found, member)
+        if (found.dtype, found.ndim, found.layout) != (member.dtype, member.ndim, "C") or not array.flags.writeable:
+            raise TypeError(f"expected a writable {member}, got {found}")
         place[: 1 + array.ndim] = array.ctypes.data, *array.shape
     return places
+
+
+def writable(record: Any) -> Any:
+    """Return a record with copies of its read-only arrays, as those of another process may be."""
+    return record._make(array if array.flags.writeable else np.array(array) for array in record)
 
 
 def _view(context: Any, builder: Any, array: Any, data: Any, shape: list[Any]) -> Any:

@@ -14,7 +14,7 @@ from numba import float32, from_dtype
 from leapnav.envs.field.layout import header_of
 from leapnav.envs.geodesics import MAX_DETOUR, geodesic_detours, geodesic_distance
 from leapnav.envs.kernels import kernel, record_type
-from leapnav.envs.kernels.internals import places_of, record_at
+from leapnav.envs.kernels.internals import places_of, record_at, writable
 from leapnav.envs.kernels.types import FLAGS, INTEGERS, MATRIX, NOTHING, PLACES, VECTOR
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.sensing import beam_velocities, map_surroundings, scan
@@ -313,7 +313,8 @@ class ObservationLayout:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._places = places_of(self._buffers, BUFFERS)
+        self._buffers = writable(self._buffers)
+        self.actions, self._places = self._buffers.actions, places_of(self._buffers, BUFFERS)
 
 
 @kernel(NOTHING(INTEGERS, PLACES, PLACES, float32[:, ::1]))

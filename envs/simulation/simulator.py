@@ -13,7 +13,7 @@ from leapnav.envs.field.proximity import footprint_value
 from leapnav.envs.field.rectangle import OUTLINE_ENTRIES
 from leapnav.envs.geodesics import geodesic_map, solve_eikonal
 from leapnav.envs.kernels import prepare
-from leapnav.envs.kernels.internals import FunctionPointer, places_of
+from leapnav.envs.kernels.internals import FunctionPointer, places_of, writable
 from leapnav.envs.kernels.types import constant
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.scenario import Scenario
@@ -352,7 +352,7 @@ class BatchSimulator:
         return {**{k: v for k, v in self.__dict__.items() if k not in shared}, "_contacts": {}, "_arrays": arrays}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        arrays: Simulation = state.pop("_arrays")
+        arrays: Simulation = writable(state.pop("_arrays"))
         self.__dict__.update(state)
         self._simulation = arrays._replace(fields=self.fields.places)
         self.episodes, self.states, self._noise = arrays.episodes, arrays.states, arrays.noise

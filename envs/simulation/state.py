@@ -73,7 +73,7 @@ class Episode(NamedTuple):
 
 EPISODE = np.dtype(list(get_type_hints(Episode).items()), align=True)
 # Reads a record in less time than NumPy.
-EPISODE_FORMAT = struct.Struct("".join({"i": "q", "f": "d", "b": "?"}[EPISODE[name].kind] for name in Episode._fields))
+EPISODE_FORMAT = struct.Struct("".join(EPISODE[name].char for name in Episode._fields))
 EPISODES = from_dtype(EPISODE)[::1]
 
 

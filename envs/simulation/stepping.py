@@ -264,7 +264,7 @@ def drive(actions, active, places, addresses):
             fraction = _follow(sim, i, motion, controls, episode.time, episode.duration, scratch)
             episode.effort += effort(row_of(sim.weights, i), controls) * episode.duration * fraction
             episode.remaining = episode.duration * (1.0 - fraction)
-        if active[i] and (episode.remaining == 0.0 or settings.terminate_on_collision):
+        if active[i] and (settings.terminate_on_collision or not episode.remaining > 0.0):
             _end_period(i, sim)
     return -1
 

@@ -86,6 +86,7 @@ class Task:
 
     def _make(self, **arguments: Any) -> gym.Env:
         limit = MAX_STEPS[self.horizon] * (1 if self.family in (*ALL_FAMILIES, ALL) else STEPS_FACTOR)
+        limit = ceil(limit * CONTROL_PERIOD / self.environment.get("control_period", CONTROL_PERIOD))
         given = {**self.environment, **arguments}
         return gym.make(ENVIRONMENT, family=self.family, max_episode_steps=limit, **given)
 

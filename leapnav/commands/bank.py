@@ -303,7 +303,7 @@ def _print_summary(bank: ScenarioBank) -> None:
     source = f"seed {bank.seed}" if bank.given is None else "given"
     print(f"{bank.path}: {len(bank)} scenarios of {bank.family}{kind}, {source}, leapnav {bank.software}")
     robots = {scenario.robot.model_dump_json(exclude_none=True) for scenario in bank}
-    others = "" if len(robots) == 1 else f" and {len(robots) - 1} others"
+    others = "" if len(robots) <= 1 else f" (of {len(robots)} different ones)"
     print(f"  robot              {bank.robot.model_dump_json(exclude_none=True)}{others}")
     print("  checksums, optima  verified")
     print(f"  {'sampled' if bank.given is None else 'given  '}            {bank.drawn}")

@@ -139,6 +139,31 @@ def test_robots_with_the_same_scenario_share_its_field():
         assert len(set(fields.places[:, 0].tolist())) == 2
 
 
+def test_copies_from_read_only_buffers_have_arrays_of_their_own():
+    env = NavigateVectorEnv(2, "open", split="test", lidar_beams=8, history=(0.4,))
+    env.reset(seed=0)
+    buffers = []
+    pickled = pickle.dumps(env, protocol=5, buffer_callback=buffers.append)
+    shared = [bytes(buffer) for buffer in buffers]  # as other processes may receive them
+    before = [hash(one) for one in shared]
+    first, second = (pickle.loads(pickled, buffers=shared) for _ in range(2))
+    start = second.states.copy()
+    found = [env_.step(np.ones((2, 2), np.float32))[0] for env_ in (env, first)]
+    assert np.array_equal(*found)
+    assert np.array_equal(second.states, start) and [hash(bytes(bytearray(one))) for one in shared] == before
+
+
+def test_an_episode_whose_state_is_not_finite_ends_after_its_steps():
+    env = NavigateEnv("clutter", split="test", terminate_on_collision=False)
+    env.reset(seed=0)
+    env._simulator.states[0, 0] = np.nan
+    for _ in range(1000):
+        *_, terminated, truncated, info = env.step(np.ones(2, np.float32))
+        if terminated or truncated:
+            break
+    assert terminated and not info["is_success"]
+
+
 @pytest.mark.parametrize("actuation", ["velocity", "motor"])
 @pytest.mark.parametrize("period", [0.05, 0.5])
 def test_a_pickled_environment_goes_on_in_the_middle_of_its_episodes(actuation, period):

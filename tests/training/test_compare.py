@@ -52,8 +52,14 @@ def test_a_model_observes_what_its_environment_contains(tmp_path):
     runs = compare(policies, "open", count=1, environment=settings, progress=False).runs
     found = [(runs[name][0].settings.observation, runs[name][0].settings.control_period) for name in policies]
     assert found == [("state", 0.2), ("state", 0.4), ("map", 0.1), ("lidar", 0.1)]
+    # Where the observations of a policy are known by its name, those of the comparison are not used.
+    model.save(tmp_path / "model.zip")
+    named = {"zip": (str(tmp_path / "model.zip"), {"control_period": 0.2}), "go": "go-to-goal"}
+    runs = compare(named, "open", count=1, environment=settings, progress=False).runs
+    found = [(runs[name][0].settings.observation, runs[name][0].settings.control_period) for name in named]
+    assert found == [("state", 0.2), ("state", 0.1)]
     wrapped = gym.wrappers.TransformObservation(env, lambda observation: 0 * observation, None)
-    with pytest.warns(UserWarning, match="observations are those without the wrappers TransformObservation"):
+    with pytest.warns(UserWarning, match="trained with the wrappers TransformObservation, which are not applied"):
         evaluate(PPO("MlpPolicy", wrapped, n_steps=8, batch_size=8), "open", count=1, progress=False)
 
 

@@ -76,7 +76,7 @@ def test_a_wrapper_of_the_training_environment_is_part_of_the_run(tmp_path):
 def test_a_bank_of_levels_has_the_robot_and_the_horizon_of_the_run(tmp_path):
     for arguments, message in (
         ({"horizon": "free"}, "level_bank: horizon: expected 'fixed', got 'free'"),
-        ({"family": "clutter", "robot": "car"}, "level_bank: another robot: model car, here unicycle"),
+        ({"family": "clutter", "robot": "car"}, "level_bank: expected a robot with model 'unicycle', got 'car'"),
     ):
         bank = ScenarioBank.shipped(**{"family": "open", "split": "train", **arguments})
         with pytest.raises(ValueError, match=message):

@@ -12,6 +12,7 @@ from leapnav.cli import main
 from leapnav.envs import NavigateEnv, ScenarioBank
 from leapnav.envs.robots import Unicycle
 from leapnav.envs.scenarios.families import sample_scenario, task_of
+from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.experts import build_bank, find_optimum, rollout
 from leapnav.experts.data.demonstrations import load_demonstrations
 from leapnav.training import (
@@ -62,6 +63,8 @@ def test_the_task_of_a_bank_is_that_of_its_scenarios(bank):
 
 
 def test_the_settings_of_a_run_follow_the_bank(bank, tmp_path):
+    narrow = BCConfig(out=tmp_path, family=bank, robot=Unicycle())
+    assert check_robot(narrow.task["robot"]) == Unicycle()  # which the bank then refuses
     config = DAggerRunConfig(out=tmp_path, family=bank)
     assert config.task == {"robot": "unicycle", "horizon": "free", "obstacles": "cost"}
     assert config.environment["horizon"] == "free" and config.environment["previous_action"]
@@ -113,6 +116,7 @@ def test_a_robot_with_other_parameters_is_trained_and_evaluated(tmp_path, monkey
     text = WIDE.model_dump_json(exclude_none=True)
     assert config.robot == BCConfig(out=tmp_path, robot=WIDE).robot == config.task["robot"] == text
     assert BCConfig(out=tmp_path, robot=Unicycle()).task["robot"] == "unicycle"
+    assert BCConfig(out=tmp_path, robot='{"radius": 0.3, "model": "unicycle"}').robot == text
     once = ["--cloning.epochs", "1"]
     assert (
         main(["train", "bc", "--family", "open", "--robot", text, "--scenarios", "3", "--out", "clone", *SMALL, *once])
@@ -139,8 +143,10 @@ def test_a_robot_with_other_parameters_is_trained_and_evaluated(tmp_path, monkey
     assert main(["evaluate", "clone", "--workers", "1", "--robot", text]) == 0
     assert main(["evaluate", "clone", "--robot", text.replace("0.3", "0.4")]) == 2
     assert "build a bank of its scenarios" in capsys.readouterr().err
-    with pytest.warns(UserWarning, match="policy: clone was trained in open, the run is in slalom"):
+    with pytest.warns(UserWarning, match="policy: clone was trained in open; the run is in slalom"):
         warn_of_family("policy", Path("clone"), DAggerRunConfig(out=tmp_path, family="slalom"))
+    PPO("MlpPolicy", gym.make("leapnav/Navigate-v0"), n_steps=4, batch_size=4).save("model.zip")
+    warn_of_family("policy", Path("model.zip"), DAggerRunConfig(out=tmp_path, family="slalom"))  # says no family
     assert main(["evaluate", "expert", "--robot", text]) == 2
     assert "build a bank of its scenarios" in capsys.readouterr().err
 

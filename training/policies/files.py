@@ -69,9 +69,18 @@ def save_policy(
             other observations than the policy.
 
     """
-    if (Path(folder) / "config.json").exists():
-        raise FileExistsError(f"{folder}: the directory of a training run; choose another directory")
+    if _is_run(Path(folder)):
+        raise FileExistsError(f"{folder}: the directory of a training run, whose policy would be replaced")
     write_policy(model, folder, environment, training=training, half=half)
+    warn_of_wrappers(model, 2)
+
+
+def _is_run(folder: Path) -> bool:
+    """Return whether a directory is that of a training run."""
+    try:
+        return "algorithm" in json.loads((folder / "config.json").read_text(encoding="utf-8"))["config"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def write_policy(
@@ -194,7 +203,8 @@ def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: see `load_policy`.
-        ValueError: see `load_policy`; or the model has no environment of leapnav.
+        TypeError: `policy` is neither a name, a path nor a model.
+        ValueError: see `load_policy`; or the model has no environment of leapnav in this process.
 
     """
     if isinstance(policy, BaseAlgorithm):
@@ -202,6 +212,8 @@ def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
         if not found:
             raise ValueError(f"policy: expected a model with one of leapnav's environments, got {policy.get_env()!r}")
         return found
+    if not isinstance(policy, (str, Path)):
+        raise TypeError(f"policy: expected a name, a path or a model of Stable-Baselines3, got {type(policy).__name__}")
     if is_zip(policy):
         return load_zip(policy)[1]
     description = read_description(policy)
@@ -211,17 +223,22 @@ def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
 def environment_of(model: Any) -> dict[str, Any]:
     """Return the arguments of `gym.make` that determine the observations and the period of a model's environment.
 
-    They are empty if the model has no environment, or not one of leapnav. Wrappers that change the observations are not
-    applied; a warning contains their names.
+    They are empty if the model has no environment, or not one of leapnav.
     """
     venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
     try:
         settings = unwrap(venv)[0].settings
     except TypeError:
         return {}
-    if names := observation_wrappers(venv):
-        warnings.warn(f"env: observations are those without the wrappers {', '.join(names)}", stacklevel=3)
     return {**{name: getattr(settings, name) for name in OBSERVED}, **_period(_as_dict(settings))}
+
+
+def warn_of_wrappers(model: Any, stacklevel: int) -> None:
+    """Warn if a model was trained with wrappers that change the observations of its environment."""
+    venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
+    if names := [] if venv is None else observation_wrappers(venv):
+        text = f"the model was trained with the wrappers {', '.join(names)}, which are not applied"
+        warnings.warn(text, stacklevel=stacklevel + 1)
 
 
 def _period(environment: Mapping[str, Any]) -> dict[str, float]:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
+from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import check_family, families_of, is_built_in, task_of
 from leapnav.envs.scenarios.scenario import Scenario
@@ -29,6 +30,7 @@ from leapnav.training.learning.dagger import check_dagger
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.warm_start import check_warm_start
 from leapnav.training.policies.files import read_description
+from leapnav.training.policies.zips import is_zip
 
 
 def check_config(config: RunConfig) -> None:
@@ -74,20 +76,29 @@ def check_demonstrations(config: RunConfig, dataset: Dataset) -> None:
     # One scenario of each robot and kind of horizon; validating all takes long.
     scenarios = [Scenario.from_json(text) for text in {_kind(text): text for text in dataset.scenarios}.values()]
     for scenario in scenarios:
-        expected, found = (one.model_dump(mode="json") for one in (body, scenario.robot))
-        different = [name for name in found if found[name] != expected.get(name)]
-        if different:
-            name = different[0]
-            raise ValueError(f"demos: expected a robot with {name} {expected.get(name)!r}, got {found[name]!r}")
+        check_robots("demos", body, scenario.robot)
         if scenario.horizon_kind != horizon:
             raise ValueError(f"demos: expected a {horizon} horizon, got a {scenario.horizon_kind} one")
 
 
+def check_robots(name: str, expected: RobotModel, found: RobotModel) -> None:
+    """Check that scenarios have the robot of a run.
+
+    Raises:
+        ValueError: they have another one; the message contains the first parameter that differs.
+
+    """
+    fields = expected.model_dump(mode="json")
+    for field, value in found.model_dump(mode="json").items():
+        if value != fields.get(field):
+            raise ValueError(f"{name}: expected a robot with {field} {fields.get(field)!r}, got {value!r}")
+
+
 def warn_of_family(name: str, path: Path, config: RunConfig) -> None:
-    """Warn if the policy with which a run starts was trained in another family, of which the results may be worse."""
-    family = read_description(path)["training"].get("family")
-    if is_built_in(family) and family not in families_of(config.family):
-        warnings.warn(f"{name}: {path} was trained in {family}, the run is in {config.family}", stacklevel=3)
+    """Warn if the policy with which a run starts was trained in another family."""
+    family = None if is_zip(path) else read_description(path)["training"].get("family")
+    if family is not None and is_built_in(family) and family not in families_of(config.family):
+        warnings.warn(f"{name}: {path} was trained in {family}; the run is in {config.family}", stacklevel=4)
 
 
 def _kind(text: str) -> tuple[str, bool]:

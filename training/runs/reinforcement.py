@@ -36,7 +36,7 @@ from leapnav.training.policies.files import load_policy, policy_environment, pol
 from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, symmetries_of
 from leapnav.training.policies.network import network
 from leapnav.training.policies.symmetries import Transformation, symmetries
-from leapnav.training.runs.checks import check_config, check_demonstrations, warn_of_family
+from leapnav.training.runs.checks import check_config, check_demonstrations, check_robots, warn_of_family
 from leapnav.training.runs.imitation import mean_scores, observed_settings
 from leapnav.training.runs.run import Run
 from leapnav.training.scoring.results import Evaluation
@@ -259,8 +259,7 @@ def _scenarios(config: Config) -> dict[str, Any]:
     if config.level_bank is not None:
         bank = ScenarioBank(config.level_bank)
         robot, horizon, obstacles = task_of(config.family, config.robot, config.horizon, config.obstacles)
-        for difference in bank.robot.differences(robot)[:1]:
-            raise ValueError(f"level_bank: another robot: {difference}")
+        check_robots("level_bank", robot, bank.robot)
         for name, expected, found in (("horizon", horizon, bank.horizon), ("obstacles", obstacles, bank.obstacles)):
             if found != expected:
                 raise ValueError(f"level_bank: {name}: expected {expected!r}, got {found!r}")

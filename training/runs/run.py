@@ -6,9 +6,8 @@ import json
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
-from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.policies import BasePolicy
 
 import leapnav
+from leapnav.envs.robots import RobotModel
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, families_of, sample_scenario, task_of
 from leapnav.envs.utils.files import digest, write_text
@@ -35,6 +35,7 @@ from leapnav.training.scoring.results import Evaluation
 FINAL_SCENARIOS: int | None = None  # in the final evaluation; None: all of the bank
 # Number of scenarios and seeds of the banks for the evaluations of a family that is not built in.
 BANK_COUNT, BANK_SEEDS = 100, {"train": 0, "test": 1}
+N_SAMPLED = 8  # scenarios of a function whose robots are compared
 LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")  # with their versions in config.json
 # Settings that may differ when a run is resumed.
 FREE_SETTINGS = ("out", "resume")
@@ -86,6 +87,7 @@ class Run:
             self.folder.mkdir(parents=True, exist_ok=True)
             content = {"leapnav": leapnav.__version__, "config": self._settings, "versions": _versions()}
             write_text(path, encode(content, indent=1) + "\n")
+        self._robot = _robot_of(config)
         self.evaluations: list[dict[str, Any]] = []
         self.logger: Logger = configure(str(self.folder / "tensorboard"), ["tensorboard"])
         self._started, self._seconds_before = time.monotonic(), 0.0
@@ -186,15 +188,6 @@ class Run:
         training["robot"] = self._robot
         write_policy(model, self.folder, self.config.environment, training=training)
 
-    @cached_property
-    def _robot(self) -> dict[str, Any] | None:
-        """The robot of the training; None if the scenarios have different ones."""
-        config = self.config
-        robot, *_ = task_of(config.family, config.robot, config.horizon, config.obstacles)
-        is_own = config.family not in (*FAMILIES, ALL)
-        first = [sample_scenario(config.family, seed, **config.task).robot for seed in range(8 if is_own else 0)]
-        return robot.model_dump(mode="json") if all(one == robot for one in first) else None
-
     def save_checkpoint(self, write: Callable[[Path], None], progress: Mapping[str, Any]) -> None:
         """Replace the checkpoint; if the process is killed meanwhile, the old one or the new one can be loaded.
 
@@ -253,6 +246,17 @@ class Run:
         if count:
             self._write_evaluations()
         return folder, progress
+
+
+def _robot_of(config: RunConfig) -> dict[str, Any] | None:
+    """Return the robot of a run; None if scenarios of a bank, or the first ones of a function, have different ones."""
+    robot, *_ = task_of(config.family, config.robot, config.horizon, config.obstacles)
+    found: Iterable[RobotModel] = ()
+    if config.family.endswith(BANK_ENDING):
+        found = (scenario.robot for scenario in ScenarioBank(config.family))
+    elif config.family not in (*FAMILIES, ALL):
+        found = (sample_scenario(config.family, seed, **config.task).robot for seed in range(N_SAMPLED))
+    return robot.model_dump(mode="json") if all(one == robot for one in found) else None
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -13,6 +13,7 @@ from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, check_family, families_of, is_built_in
 from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.training.config import PPOConfig, RunConfig, read_config
+from leapnav.training.policies.files import OBSERVED
 from leapnav.training.scoring.adapters import PolicyOrFactory
 from leapnav.training.scoring.evaluation import evaluate, known_environment
 from leapnav.training.scoring.policy_specs import PolicySpec, group_by_row, load_policy_spec
@@ -163,8 +164,9 @@ def compare(
         bank: a bank, its file (`.bank`), several banks, the name of a family for its test split, or "all" for those of
             all families, with the kinds of obstacles for which the policies were trained.
         count: number of scenarios of each bank, from the first; None: all.
-        environment: arguments of the environment, such as `control_period`. Those that determine the observations of
-            a policy, as far as they are known (see `evaluate`), and those in its tuple take precedence.
+        environment: arguments of the environment, such as `control_period`. Those that determine observations are not
+            used for policies that are given by their names, and those of a model's environment, and of a tuple, take
+            precedence.
         seed: random seed of the bootstrap intervals, the disturbances and the random policy.
         workers, dask: see `evaluate`.
         progress: show progress bars.
@@ -203,9 +205,10 @@ def _spec(label: str, name: str, given: Any, environment: Mapping[str, Any] | No
         given, own = given
     if isinstance(given, (str, Path)):
         spec = replace(load_policy_spec(str(given), seed=seed, environment=own), name=name, label=label)
+        common = {key: value for key, value in (environment or {}).items() if key not in OBSERVED}
     else:
-        spec = PolicySpec(name, label, None, given, known_environment(given))
-    return replace(spec, environment={**(environment or {}), **spec.environment, **(own or {})})
+        spec, common = PolicySpec(name, label, None, given, known_environment(given)), environment or {}
+    return replace(spec, environment={**common, **spec.environment, **(own or {})})
 
 
 def included_banks(
@@ -223,7 +226,8 @@ def included_banks(
         specs: the policies.
         families: the families.
         split: "train" or "test".
-        robot: model of the robot; None: that of the policies, or the unicycle if all of them are baselines.
+        robot: model of the robot, or JSON of its parameters; None: that of the policies, or the unicycle if all of them
+            are baselines.
         horizon: "fixed" or "free"; None: that of the policies, or "fixed" if all of them are baselines.
         obstacles: "cost" or "hard", which a policy does not depend on.
 
@@ -231,10 +235,11 @@ def included_banks(
         ValueError: there is no such bank, or the policies have different robots or horizons.
 
     """
-    model = None if robot is None else check_robot(robot).model
-    model = _common("robot", [spec.robot for spec in specs], model) or "unicycle"
+    body = None if robot is None else check_robot(robot)
+    model = _common("robot", [spec.robot for spec in specs], body.model if body else None) or "unicycle"
+    name = robot if robot is not None and body != check_robot(model) else model
     kind = _common("horizon", [spec.horizon for spec in specs], horizon) or "fixed"
-    return [ScenarioBank.shipped(family, split, robot or model, kind, obstacles) for family in families]
+    return [ScenarioBank.shipped(family, split, name, kind, obstacles) for family in families]
 
 
 def default_banks(
@@ -291,7 +296,7 @@ def default_banks(
 
 def _has_robot(bank: ScenarioBank, robot: str | None, config: RunConfig) -> bool:
     """Return whether the bank of a run has a robot, which its family may determine, see `task_of`."""
-    is_named = config.robot is None and robot == bank.robot.model
+    is_named = config.robot in (None, robot) and robot == bank.robot.model
     return robot is None or is_named or check_robot(robot) == bank.robot
 
 

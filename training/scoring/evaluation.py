@@ -31,7 +31,7 @@ from leapnav.experts.optimum import find_reached_optimum
 from leapnav.experts.pools import process_pool
 from leapnav.experts.problem.problem import Trajectory
 from leapnav.training.environments.playing import PlayedEpisode, play_episodes
-from leapnav.training.policies.files import environment_of
+from leapnav.training.policies.files import environment_of, warn_of_wrappers
 from leapnav.training.scoring.adapters import (
     FunctionPolicy,
     Policy,
@@ -80,9 +80,9 @@ def evaluate(
             obstacles of `environment`; by default the obstacles are those of the training of a policy that is given by
             its name.
         count: number of scenarios, from the first of the bank; None: all.
-        environment: arguments of the environment, such as `control_period`. They take precedence over those that
-            determine the observations of the model's environment, or of the training of a policy that is given by its
-            name, as far as these are known.
+        environment: arguments of the environment, such as `control_period`; None: no others than those that determine
+            the observations of the model's environment, or of the training of a policy that is given by its name, as
+            far as these are known. Given arguments take precedence over these.
         seed: random seed of the disturbances.
         timed: measure the computation time of an action; otherwise `milliseconds` is NaN.
         workers: number of processes that search the optima for the poses reached, which takes most of the time; the
@@ -136,6 +136,7 @@ def evaluate(
                 bar.update()
     milliseconds = _median_milliseconds(policy, bank, arguments) if timed else math.nan
     task = {"robot": bank.robot.model, "horizon": bank.horizon}
+    warn_of_wrappers(policy, 3)
     return Evaluation(tuple(episodes), milliseconds, EnvironmentSettings(**{**arguments, **task}))
 
 

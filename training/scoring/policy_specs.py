@@ -17,7 +17,7 @@ from leapnav.envs.scenarios.scenario import check_robot
 from leapnav.experts.acting.policy import ExpertPolicy
 from leapnav.training.policies.baselines import GoToGoal, RandomPolicy
 from leapnav.training.policies.files import BASELINES as BASELINES
-from leapnav.training.policies.files import load_policy, policy_environment, read_description, trained_robot
+from leapnav.training.policies.files import OBSERVED, load_policy, policy_environment, read_description, trained_robot
 from leapnav.training.policies.planners import PLANNERS, PlannerPolicy
 from leapnav.training.policies.zips import is_zip, load_zip
 from leapnav.training.scoring.adapters import (
@@ -106,7 +106,9 @@ def load_policy_spec(
         # A baseline reads the robot and the obstacles from the environment.
         return PolicySpec(place, label, None, factories[place], {"observation": "state"}, is_baseline=True)
     if is_zip(place):
-        model, arguments = load_zip(place, environment, trust=trust)
+        observed = {key: value for key, value in (environment or {}).items() if key in OBSERVED}
+        model, arguments = load_zip(place, observed or None, trust=trust)
+        arguments = {**arguments, **(environment or {})}
         beside = statistics_beside(place)
         if vecnormalize is not None:
             if not trust:
