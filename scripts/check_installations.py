@@ -86,7 +86,7 @@ def main() -> int:
                 install(python, "--constraint", ROOT / "constraints.txt", f"{wheel}[dev]")
                 shutil.copytree(ROOT / "tests", folder / "tests")
                 pages = "README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md"
-                for extra in (*pages, "pyproject.toml", "docs", "examples", "scripts", "mkdocs.yml"):
+                for extra in (*pages, "pyproject.toml", "docs", "examples", "scripts", "studies", "mkdocs.yml"):
                     source = ROOT / extra
                     (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / extra)
                 variables = {**os.environ, "OMP_NUM_THREADS": "1"}

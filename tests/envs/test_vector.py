@@ -144,6 +144,7 @@ def test_copies_from_read_only_buffers_have_arrays_of_their_own():
     env.reset(seed=0)
     buffers = []
     pickled = pickle.dumps(env, protocol=5, buffer_callback=buffers.append)
+    assert buffers
     shared = [bytes(buffer) for buffer in buffers]  # as other processes may receive them
     before = [hash(one) for one in shared]
     first, second = (pickle.loads(pickled, buffers=shared) for _ in range(2))

@@ -143,8 +143,9 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert "usage: leapnav train ppo" in commands
     assert "::help" not in commands
     assert 'href="../contributing/"' in changes
-    if CHROMIUM is not None:
-        assert check_in_the_browser(tmp_path) == []
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed, which loads the pages; the site was built without a warning")
+    assert check_in_the_browser(tmp_path) == []
 
 
 def check_in_the_browser(site):

@@ -49,7 +49,7 @@ def make_vec_env(
         arguments: arguments of the environment; they take precedence over those of the policy.
 
     Raises:
-        FileNotFoundError: there is no such policy.
+        FileNotFoundError, TypeError: there is no such policy.
         ValueError: an argument is invalid, or the environment is not one of leapnav's.
         gymnasium.error.Error: the environment does not exist.
 

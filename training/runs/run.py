@@ -76,6 +76,7 @@ class Run:
 
     def __init__(self, algorithm: str, config: RunConfig) -> None:
         check_config(config)
+        self._robot = _robot_of(config)  # before the directory exists: the function of a family may fail
         self.algorithm, self.config, self.folder = algorithm, config, Path(config.out)
         self._settings: dict[str, Any] = {"algorithm": algorithm, **plain(config)}
         path = self.folder / "config.json"
@@ -87,7 +88,6 @@ class Run:
             self.folder.mkdir(parents=True, exist_ok=True)
             content = {"leapnav": leapnav.__version__, "config": self._settings, "versions": _versions()}
             write_text(path, encode(content, indent=1) + "\n")
-        self._robot = _robot_of(config)
         self.evaluations: list[dict[str, Any]] = []
         self.logger: Logger = configure(str(self.folder / "tensorboard"), ["tensorboard"])
         self._started, self._seconds_before = time.monotonic(), 0.0
