@@ -196,7 +196,10 @@ class _ImitationConfig(RunConfig):
     scenarios: int = 10_000
     """Number of scenarios to demonstrate if no demonstrations are given."""
     symmetric: bool = True
-    """Actions that are means over the symmetries of the robot, as far as the observation has them."""
+    """Actions that are equivariant under the symmetries of the robot, as far as the observation has them."""
+    components: int = 1
+    """Number of actions of the network, of which the policy chooses one (mixture density network). With several, the
+    policy decides between paths of similar cost instead of a mean of them."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
     """Settings of the clone, in DAgger the first learner; its loss and batch size are those of all fits. The seed is
     that of the run."""
@@ -400,7 +403,7 @@ def read_config(run: Path) -> tuple[str, RunConfig]:
     try:
         stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         algorithm = "sac" if stored["algorithm"] == "tqc" else str(stored["algorithm"])
-        earlier = {"symmetric": False} if issubclass(ALGORITHMS[algorithm], _ImitationConfig) else {}
+        earlier = {"symmetric": False, "components": 1} if issubclass(ALGORITHMS[algorithm], _ImitationConfig) else {}
         return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
             {name: value for name, value in {**earlier, **stored}.items() if name != "algorithm" or algorithm == "sac"}
         )

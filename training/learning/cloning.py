@@ -220,10 +220,13 @@ class _Fit:
         return [transform for number, transform in enumerate(self._symmetries) if combination & 2**number]
 
     def _loss(self, batch: Batch) -> th.Tensor:
-        error = batch.actions_of(self._policy) - batch.actions
-        is_action_loss = self.config.loss == "action"
-        losses = _action_loss(error) if is_action_loss else _hamiltonian_loss(error, batch.slopes, batch.weights)
-        return losses.mul(self._scale).sum(dim=1).mean()
+        mixture = batch.mixture_of(self._policy)
+        error = mixture.actions - batch.actions[:, None]
+        if self.config.loss == "action":
+            losses = _action_loss(error)
+        else:
+            losses = _hamiltonian_loss(error, batch.slopes[:, None], batch.weights[:, None])
+        return mixture.loss(losses.mul(self._scale).sum(dim=2)).mean()
 
     def _validation_loss(self) -> float:
         if not len(self._held_out):
@@ -267,9 +270,9 @@ def _hamiltonian_loss(error: th.Tensor, slopes: th.Tensor, weights: th.Tensor) -
     is the cost of moving away from the limit; an action beyond the limit is not rewarded.
 
     Args:
-        error (B, m): action minus the expert's action.
-        slopes (B, m): p + r u*, per unit of the action.
-        weights (B, m): r, per square unit of the action.
+        error (..., m): action minus the expert's action.
+        slopes (..., m): p + r u*, per unit of the action.
+        weights (..., m): r, per square unit of the action.
 
     """
     return 0.5 * weights * error.square() + functional.relu(slopes * error)

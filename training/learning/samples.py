@@ -14,7 +14,8 @@ from stable_baselines3.common.policies import BasePolicy
 
 from leapnav.experts.problem.system import switching_functions
 from leapnav.training.learning.dataset import Dataset
-from leapnav.training.policies.actors import mean_action
+from leapnav.training.policies.actors import action_mixture, mean_action
+from leapnav.training.policies.mixture import Mixture
 from leapnav.training.policies.symmetries import Transformation
 
 SATURATION = 1.0 - 1e-4  # actions of this absolute value or more are limited by the robot's maximum speed or turn rate
@@ -42,6 +43,10 @@ class Batch:
     def actions_of(self, policy: BasePolicy) -> th.Tensor:
         """Compute the mean actions (B, m) of a policy, with gradients."""
         return mean_action(policy, self.observations)
+
+    def mixture_of(self, policy: BasePolicy) -> Mixture:
+        """Compute the mixture of the actions of a policy, with gradients."""
+        return action_mixture(policy, self.observations)
 
 
 class Samples:

@@ -14,7 +14,8 @@ from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from leapnav.envs.simulation.observations import OFFSETS
-from leapnav.training.policies.navigation_policy import MomentumActor, network_action
+from leapnav.training.policies.mixture import Mixture
+from leapnav.training.policies.navigation_policy import MomentumActor, components_of, network_mixture
 from leapnav.training.policies.network import NavigationFeatures
 
 
@@ -85,30 +86,37 @@ def as_observation(policy: BasePolicy, rows: Any) -> Any:
 
 
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
-    """Compute the actions of a policy's network, without momentum and symmetries, not clipped, with gradients.
+    """Compute the actions (B, m) of a policy's network; of a mixture, the one that the policy chooses.
 
-    They are in units of [-1, 1] also if the bounds of the policy's action space are others, as with Gymnasium's
-    `RescaleAction`.
+    Arguments and units are those of `action_mixture`.
+    """
+    return action_mixture(policy, observations).mode()
+
+
+def action_mixture(policy: BasePolicy, observations: th.Tensor) -> Mixture:
+    """Compute the mixture of a policy's network, without momentum and symmetries, not clipped, with gradients.
+
+    The actions are in units of [-1, 1] also if the bounds of the policy's action space are others, as with Gymnasium's
+    `RescaleAction`. A policy without a mixture has one component.
 
     Args:
         policy: the policy.
         observations: (B, d), or a dictionary of their parts.
 
-    Returns:
-        The actions (B, m).
-
     """
     observations = as_observation(policy, observations)
     if isinstance(policy, ActorCriticPolicy):
-        actions = network_action(policy, observations)
+        actions, log_weights = network_mixture(policy, observations)
         middle, half = (th.as_tensor(part, device=actions.device) for part in action_range(policy.action_space))
-        return (actions - middle) / half
+        return Mixture((actions - middle) / half, log_weights)
     actor = _actor(policy)
     if isinstance(actor, MomentumActor):
-        return th.tanh(Actor.get_action_dist_params(actor, cast(Any, observations))[0])
-    if hasattr(actor, "get_action_dist_params"):  # SAC and TQC squash a Gaussian
-        return th.tanh(actor.get_action_dist_params(observations)[0])
-    return actor(observations)
+        actions = th.tanh(Actor.get_action_dist_params(actor, cast(Any, observations))[0])
+    elif hasattr(actor, "get_action_dist_params"):  # SAC and TQC squash a Gaussian
+        actions = th.tanh(actor.get_action_dist_params(observations)[0])
+    else:
+        actions = actor(observations)
+    return Mixture.from_output(actions, 1)
 
 
 def set_noise(policy: BasePolicy, std: th.Tensor | float) -> None:
@@ -134,6 +142,11 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
         ValueError: the networks differ otherwise, or only one of the policies squashes its actions.
 
     """
+    if (found := components_of(source)) != (expected := components_of(target)):
+        raise ValueError(
+            f"policy: its network has a mixture of {found} components, that of the model {expected}; create the model "
+            f"with the class NavigationPolicy and policy_kwargs={{**network(), 'components': {found}}}"
+        )
     if isinstance(source, ActorCriticPolicy) != isinstance(target, ActorCriticPolicy):
         raise ValueError(
             f"policy: expected the same squashing of the actions, got a {type(source).__name__} for a "

@@ -19,6 +19,7 @@ from leapnav.training.policies.actors import parts_of_dict
 from leapnav.training.policies.navigation_policy import (
     MomentumSACPolicy,
     NavigationPolicy,
+    components_of,
     has_momentum,
     symmetries_of,
 )
@@ -41,7 +42,9 @@ class Architecture:
             an observation in a Dict).
         activation: name of the activation function in `torch.nn`.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`, or None.
-        symmetries: transformations over which the mean action is averaged, see `leapnav.training.policies.symmetries`.
+        symmetries: transformations under which the actions are equivariant, see
+            `leapnav.training.policies.symmetries`.
+        components: number of components of the mixture, see `leapnav.training.policies.mixture`.
 
     """
 
@@ -52,6 +55,7 @@ class Architecture:
     activation: str = "ReLU"
     effort_weights: tuple[float, ...] | None = None
     symmetries: tuple[Transformation, ...] = ()
+    components: int = 1
 
     def make(self, observation_space: spaces.Box | spaces.Dict, action_space: spaces.Space) -> BasePolicy:
         """Create an untrained policy on the CPU.
@@ -75,11 +79,12 @@ class Architecture:
         }
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
-        if self.symmetries:
-            if self.kind != "actor-critic":
-                raise ValueError(f"symmetries: expected none for a policy of kind {self.kind!r}")
-            arguments["symmetries"] = self.symmetries
-        kind = _policy_class(self.kind, own=self.effort_weights is not None or bool(self.symmetries))
+        for name in ("symmetries", "components"):
+            if (value := getattr(self, name)) != getattr(Architecture, name):
+                if self.kind != "actor-critic":
+                    raise ValueError(f"{name}: expected none for a policy of kind {self.kind!r}, got {value}")
+                arguments[name] = value
+        kind = _policy_class(self.kind, own=bool({"effort_weights", "symmetries", "components"} & set(arguments)))
         return kind(observation_space, action_space, lambda _: 3e-4, **arguments)
 
     @classmethod
@@ -104,7 +109,7 @@ class Architecture:
             raise ValueError("model: expected a policy without state-dependent exploration, got use_sde=True")
         hidden, critic = widths(given.net_arch)
         weights = given.effort_weights if has_momentum(policy) else None
-        return cls(kind, hidden, critic, extractor, activation, weights, symmetries_of(policy))
+        return cls(kind, hidden, critic, extractor, activation, weights, symmetries_of(policy), components_of(policy))
 
 
 def with_symmetries(policy: BasePolicy, symmetries: tuple[Transformation, ...]) -> BasePolicy:
@@ -162,7 +167,7 @@ def _is_installed(kind: str) -> bool:
 
 
 def _policy_class(kind: str, *, own: bool = False) -> Any:
-    """Return the class of a kind of policies, with momentum or symmetries the one of leapnav."""
+    """Return the class of a kind of policies, with momentum, symmetries or a mixture the one of leapnav."""
     if own:
         return {"actor-critic": NavigationPolicy, "sac": MomentumSACPolicy}[kind]
     if kind == "tqc":

@@ -1,4 +1,4 @@
-"""Policies of Stable-Baselines3 for the environment: momentum, less noise near the horizon, and symmetric actions.
+"""Policies of Stable-Baselines3 for the environment: mixtures, momentum, less noise near the horizon, and symmetries.
 
 With a free horizon and without drift, an optimal action a has an effort of at least a known size, sum(w a^2) >= 1. The
 action of a network that averages two paths of similar cost is smaller, and because neither the last action nor the time
@@ -7,7 +7,8 @@ the last action, which the observation contains with `previous_action=True`. The
 to demonstrations, it would repeat the last action.
 
 The actions of a network that was fitted to a symmetric task are symmetric only approximately. The mean over all
-symmetries is symmetric, see `leapnav.training.policies.symmetries.SymmetricMean`.
+symmetries is symmetric, see `leapnav.training.policies.symmetries.Symmetrised`. A mixture has several actions, of which
+the policy takes one, see `leapnav.training.policies.mixture`.
 """
 
 from __future__ import annotations
@@ -21,9 +22,12 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
 
 from leapnav.envs.simulation.observations import TIME_LEFT, parts_of
-from leapnav.training.policies.symmetries import SymmetricMean, Transformation
+from leapnav.envs.utils.validation import check_at_least
+from leapnav.training.policies.mixture import Mixture, MixtureDistribution
+from leapnav.training.policies.symmetries import Symmetrised, Transformation
 
 # Fraction of the action noise that remains at the horizon. Without any noise the likelihoods would be infinite.
 MIN_NOISE_FRACTION = 0.3
@@ -75,14 +79,14 @@ class _Momentum:
         return add_momentum(actions, observations[:, self._part], actions.new_tensor(self._weights))
 
 
-def network_action(policy: ActorCriticPolicy, observations: Any) -> th.Tensor:
-    """Return the actions (B, m) of the network of a policy, without what `NavigationPolicy` adds."""
+def network_mixture(policy: ActorCriticPolicy, observations: Any) -> Mixture:
+    """Return the mixture of the network of a policy, without what `NavigationPolicy` adds."""
     features = cast(th.Tensor, policy.extract_features(observations, policy.pi_features_extractor))
-    return policy.action_net(policy.mlp_extractor.forward_actor(features))
+    return Mixture.from_output(policy.action_net(policy.mlp_extractor.forward_actor(features)), components_of(policy))
 
 
 class NavigationPolicy(ActorCriticPolicy):
-    """An actor-critic policy with momentum, with less noise near the horizon, and with symmetric actions.
+    """An actor-critic policy with a mixture, momentum, less noise near the horizon, and symmetric actions.
 
     Args:
         args, kwargs: arguments of `ActorCriticPolicy`.
@@ -105,12 +109,15 @@ class NavigationPolicy(ActorCriticPolicy):
         effort_weights: Sequence[float] | None = None,
         quiet: float = 0.0,
         symmetries: Sequence[Any] = (),
+        components: int = 1,
         **kwargs: Any,
     ) -> None:
+        check_at_least("components", components, 1)
         self.effort_weights = None if effort_weights is None else tuple(map(float, effort_weights))
         self.quiet = quiet
         self.symmetries = tuple(Transformation(tuple(one), tuple(map(tuple, two))) for one, two in symmetries)
-        self._symmetric_mean = SymmetricMean(self.symmetries) if symmetries else None
+        self.components = components
+        self._symmetrised = Symmetrised(self.symmetries) if symmetries else None
         # The current batch: the base class makes the distribution from the latent features alone.
         self._batch: th.Tensor | None = None
         super().__init__(*args, **kwargs)
@@ -126,7 +133,14 @@ class NavigationPolicy(ActorCriticPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {"effort_weights": self.effort_weights, "quiet": self.quiet, "symmetries": self.symmetries}
-        return {**super()._get_constructor_parameters(), **own}
+        return {**super()._get_constructor_parameters(), **own, "components": self.components}
+
+    def _build(self, lr_schedule: Any) -> None:
+        if self.components > 1:
+            self.action_dist = MixtureDistribution(cast(Box, self.action_space).shape[0], self.components)
+        super()._build(lr_schedule)
+        if isinstance(self.action_dist, MixtureDistribution):
+            self.action_dist.spread(cast(nn.Linear, self.action_net))
 
     def forward(self, obs: Any, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Return actions, values and log-likelihoods."""
@@ -147,10 +161,10 @@ class NavigationPolicy(ActorCriticPolicy):
         log_std, batch = self.log_std, self._batch
         assert batch is not None  # set by the methods above
         self._batch = None
-        if self._symmetric_mean is None:
-            mean = self.action_net(latent_pi)
+        if self._symmetrised is None:
+            mean = Mixture.from_output(self.action_net(latent_pi), self.components).mode()
         else:
-            mean = self._symmetric_mean(partial(network_action, self), batch)
+            mean = self._symmetrised(partial(network_mixture, self), batch)
         if self._momentum is not None:
             mean = self._momentum(mean, batch)
         if self._is_quiet:
@@ -193,10 +207,10 @@ def has_momentum(policy: Any) -> bool:
     return getattr(policy, "effort_weights", None) is not None
 
 
-def deterministic_action(policy: Any, network: Callable[[th.Tensor], th.Tensor], observations: th.Tensor) -> th.Tensor:
+def deterministic_action(policy: Any, network: Callable[[th.Tensor], Mixture], observations: th.Tensor) -> th.Tensor:
     """Return the deterministic actions (B, m) of a policy with the given network, clipped."""
     transformations = symmetries_of(policy)
-    mean = SymmetricMean(transformations)(network, observations) if transformations else network(observations)
+    mean = Symmetrised(transformations)(network, observations) if transformations else network(observations).mode()
     if has_momentum(policy):
         mean = _Momentum(policy.observation_space, policy.effort_weights)(mean, observations)
     return mean.clamp(-1.0, 1.0)
@@ -205,3 +219,8 @@ def deterministic_action(policy: Any, network: Callable[[th.Tensor], th.Tensor],
 def symmetries_of(policy: Any) -> tuple[Transformation, ...]:
     """Return the transformations over which the mean action of a policy is averaged; empty without."""
     return getattr(policy, "symmetries", ())
+
+
+def components_of(policy: Any) -> int:
+    """Return the number of components of the mixture of a policy; 1 without."""
+    return getattr(policy, "components", 1)

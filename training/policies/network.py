@@ -240,6 +240,7 @@ def make_policy(
     critic: Sequence[int] | None = None,
     effort_weights: Sequence[float] | None = None,
     symmetries: Sequence[Transformation] = (),
+    components: int = 1,
 ) -> ActorCriticPolicy:
     """Create an untrained actor-critic policy for `leapnav/Navigate-v0`, which PPO and A2C can train.
 
@@ -250,19 +251,23 @@ def make_policy(
         critic: widths of the critic's hidden layers; None: those of the actor.
         effort_weights: weights of a policy with momentum, see `leapnav.training.policies.navigation_policy`; None:
             without.
-        symmetries: transformations over which the mean action is averaged, see `leapnav.training.policies.symmetries`.
+        symmetries: transformations under which the actions are equivariant, see
+            `leapnav.training.policies.symmetries`.
+        components: number of components of the mixture, see `leapnav.training.policies.mixture`.
 
     Raises:
         ValueError: the spaces are not those of the environment with a lidar, the observations of a policy with
-            momentum do not contain the last action, or the symmetries are those of other observations.
+            momentum do not contain the last action, the symmetries are those of other observations, or `components` is
+            less than 1.
 
     """
     check_spaces(observation_space, action_space)
     arguments = network(hidden, critic)
     kind: Any = ActorCriticPolicy
-    if effort_weights is not None or symmetries:
+    if effort_weights is not None or symmetries or components != 1:
         kind = NavigationPolicy
-        arguments = {**arguments, "effort_weights": effort_weights, "symmetries": symmetries}
+        own = {"effort_weights": effort_weights, "symmetries": symmetries, "components": components}
+        arguments = {**arguments, **own}
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         return kind(observation_space, action_space, lr_schedule=lambda _: 3e-4, log_std_init=-2.0, **arguments)

@@ -24,7 +24,7 @@ from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.observations import Entry, observation_entries
 from leapnav.envs.utils.files import atomic_path, write_text
 from leapnav.envs.utils.json_utils import encode
-from leapnav.training.policies.actors import mean_action, parts_of_dict, policy_of
+from leapnav.training.policies.actors import action_mixture, parts_of_dict, policy_of
 from leapnav.training.policies.files import load_policy, policy_environment
 from leapnav.training.policies.navigation_policy import deterministic_action
 
@@ -41,7 +41,7 @@ class _Actor(nn.Module):
         self.policy: Any = policy
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
-        return deterministic_action(self.policy, partial(mean_action, self.policy), observation)
+        return deterministic_action(self.policy, partial(action_mixture, self.policy), observation)
 
 
 def export_onnx(

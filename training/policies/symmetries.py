@@ -17,6 +17,7 @@ import torch as th
 from leapnav.envs.robots import RobotModel, Symmetry
 from leapnav.envs.settings import EnvironmentSettings
 from leapnav.envs.simulation.observations import ObservationLayout
+from leapnav.training.policies.mixture import Mixture
 
 # Signs of the first entries of the observation (see the docstring of the environment) under each symmetry.
 _MIRROR_SIGNS = th.tensor([1.0, -1, 1, -1, 1, 1, -1, 1, -1])
@@ -155,11 +156,12 @@ def _transformation(
     return Transformation(tuple(changed.flatten().int().tolist()), controls)
 
 
-class SymmetricMean:
-    """The mean of a network's actions over all combinations of transformations, which is equivariant under them.
+class Symmetrised:
+    """The action of a network for the images of an observation under all combinations of transformations.
 
-    An observation that is transformed then leads to the transformed action, and the errors of the network for the
-    transformed observations partly cancel.
+    It is equivariant: an observation that is transformed leads to the transformed action, and the errors of the network
+    for the images partly cancel. The action is the mean of those for the images, or, of a network with a mixture, the
+    mode of the mixture of all their components.
 
     Args:
         transformations: at least one; they commute, such as those of `symmetries`.
@@ -177,9 +179,13 @@ class SymmetricMean:
         # The rows of a matrix are the images of the components of an action. The combinations are their own inverses.
         self._matrices = th.stack([matrix for _, matrix in images])
 
-    def __call__(self, network: Callable[[th.Tensor], th.Tensor], observations: th.Tensor) -> th.Tensor:
-        """Return the mean actions (B, m) of a network for observations (B, d)."""
-        device = observations.device
+    def __call__(self, network: Callable[[th.Tensor], Mixture], observations: th.Tensor) -> th.Tensor:
+        """Return the actions (B, m) of a network for observations (B, d)."""
+        device, n_images = observations.device, len(self._entries)
         images = observations[:, self._entries.to(device)] * self._signs.to(device)
-        actions = network(images.flatten(0, 1)).unflatten(0, (-1, len(self._entries)))
-        return th.einsum("bki,kij->bj", actions, self._matrices.to(device)) / len(self._entries)
+        actions, log_weights = (part.unflatten(0, (-1, n_images)) for part in network(images.flatten(0, 1)))
+        matrices = self._matrices.to(device)
+        if log_weights.shape[2] == 1:
+            return th.einsum("bki,kij->bj", actions[:, :, 0], matrices) / n_images
+        actions = th.einsum("bkci,kij->bkcj", actions, matrices)
+        return Mixture(actions.flatten(1, 2), log_weights.flatten(1)).mode()

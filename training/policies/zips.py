@@ -199,14 +199,14 @@ def _architecture(path: Path, data: Mapping[str, Any]) -> Architecture:
     if data.get("use_sde") or arguments.pop("use_sde", False):
         raise ValueError(f"{path}: use_sde: expected False, got True; {ADVICE}")
     hidden, critic = widths(arguments.pop("net_arch", default))
-    weights, symmetries = arguments.pop("effort_weights", None), arguments.pop("symmetries", ())
+    own = {name: arguments.pop(name) for name in ("effort_weights", "symmetries", "components") if name in arguments}
     activation = _class_name(arguments.pop("activation_fn", "Tanh" if kind == "actor-critic" else "ReLU"))
     extractor = _class_name(arguments.pop("features_extractor_class", "FlattenExtractor"))
     extractors = {value.__name__: name for name, value in EXTRACTORS.items()}
     if activation not in ACTIVATIONS or extractor not in extractors or arguments:
         unknown = next(iter(arguments), extractor if extractor not in extractors else activation)
         raise ValueError(f"{path}: policy_kwargs: {unknown} is not supported; {ADVICE}")
-    return Architecture(kind, hidden, critic, extractors[extractor], activation, weights, symmetries)
+    return Architecture(kind, hidden, critic, extractors[extractor], activation, **own)
 
 
 def _load_actor(path: Path, policy: BasePolicy, weights: Mapping[str, th.Tensor]) -> None:

@@ -146,6 +146,7 @@ def _check_nested(name: str, config: Any) -> None:
 
 
 _COUNTS = (
+    "components",
     "scenarios",
     "n_envs",
     "total_timesteps",

@@ -190,6 +190,7 @@ def _new_policy(config: BCConfig | DAggerRunConfig) -> ActorCriticPolicy:
         config.hidden,
         effort_weights=config.effort_weights,
         symmetries=symmetries(env.settings, [env.source.robot]) if config.symmetric else (),
+        components=config.components,
     )
 
 

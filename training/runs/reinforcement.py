@@ -33,7 +33,12 @@ from leapnav.training.learning.replay import DemonstrationReplayBuffer, imitate
 from leapnav.training.learning.warm_start import warm_start
 from leapnav.training.policies.actors import actor_parameters, copy_actor, set_noise
 from leapnav.training.policies.files import load_policy, policy_environment, policy_folder
-from leapnav.training.policies.navigation_policy import MomentumSACPolicy, NavigationPolicy, symmetries_of
+from leapnav.training.policies.navigation_policy import (
+    MomentumSACPolicy,
+    NavigationPolicy,
+    components_of,
+    symmetries_of,
+)
 from leapnav.training.policies.network import network
 from leapnav.training.policies.symmetries import Transformation, symmetries
 from leapnav.training.runs.checks import check_config, check_demonstrations, check_robots, warn_of_family
@@ -92,6 +97,7 @@ def train_ppo(
                 "quiet": config.quiet,
                 "effort_weights": config.effort_weights,
                 "symmetries": _symmetries(start, venv) if config.start.actor else (),
+                "components": components_of(start) if config.start.actor else 1,
             },
             seed=config.seed,
             device="cpu",
