@@ -1,4 +1,4 @@
-"""Policies whose actions are means over the symmetries of the robot."""
+"""Policies whose actions are equivariant under the symmetries of the robot, with and without a mixture."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -61,10 +61,12 @@ def actions_of(policy, observations):
     return th.as_tensor(policy.predict(observations.numpy(), deterministic=True)[0])
 
 
+@pytest.mark.parametrize("components", [1, 3])
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_a_transformed_observation_leads_to_the_transformed_action(name):
+def test_a_transformed_observation_leads_to_the_transformed_action(name, components):
     env = environment(**ENVIRONMENTS[name])
-    policy = symmetric_policy(env, effort_weights=(1.0, 1.0) if name == "free" else None)
+    weights = (1.0, 1.0) if name == "free" else None
+    policy = symmetric_policy(env, effort_weights=weights, components=components)
     observations = observations_of(env)
     actions = actions_of(policy, observations)
     assert actions.abs().max() > 1e-4
@@ -94,9 +96,10 @@ def test_what_is_not_symmetric():
         symmetric_policy(env)
 
 
-def test_files_contain_the_symmetries(tmp_path):
+def test_files_contain_the_symmetries_and_the_components(tmp_path):
     env = environment()
-    options = {**network((16, 16)), "symmetries": symmetries(env.settings, [env.source.robot])}
+    found = symmetries(env.settings, [env.source.robot])
+    options = {**network((16, 16)), "symmetries": found, "components": 3}
     model = PPO(NavigationPolicy, env, policy_kwargs=options, n_steps=32, batch_size=32, device="cpu", seed=0)
     model.learn(32)
     observations = observations_of(env)
@@ -106,6 +109,7 @@ def test_files_contain_the_symmetries(tmp_path):
     for saved in (tmp_path / "policy", tmp_path / "model.zip"):
         loaded = load_policy(saved)
         assert loaded.symmetries == model.policy.symmetries
+        assert loaded.components == 3
         th.testing.assert_close(actions_of(loaded, observations), expected)
     export_onnx(tmp_path / "policy", tmp_path / "policy.onnx")
     session = InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
@@ -137,12 +141,12 @@ def test_runs_of_imitation_are_symmetric_and_ppo_starts_from_them(tmp_path):
     cloning = CloningConfig(epochs=1, validation_share=0.0)
     settings = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 2, "cloning": cloning}
     for symmetric in (True, False):
-        config = BCConfig(
-            out=tmp_path / str(symmetric), observation="lidar", scenarios=2, symmetric=symmetric, **settings
-        )
+        chosen = {"symmetric": symmetric, "components": 3 if symmetric else 1}
+        config = BCConfig(out=tmp_path / str(symmetric), observation="lidar", scenarios=2, **chosen, **settings)
         train_bc(config, progress=False)
         clone = load_policy(config.out)
         assert bool(getattr(clone, "symmetries", ())) == symmetric
+        assert getattr(clone, "components", 1) == chosen["components"]
     start = tmp_path / "True"
     options = {"n_envs": 2, "n_steps": 8, "batch_size": 16, "total_timesteps": 16, "warm_start": (start,)}
     config = PPOConfig(out=tmp_path / "ppo", learning_rate=1e-12, **options, **settings)
@@ -150,6 +154,7 @@ def test_runs_of_imitation_are_symmetric_and_ppo_starts_from_them(tmp_path):
     trained, clone = load_policy(config.out), load_policy(start)
     observations = observations_of(environment())
     assert trained.symmetries == clone.symmetries
+    assert trained.components == 3
     options |= {"actuation": "motor", "start": WarmStartConfig(critic=False)}
     train_ppo(PPOConfig(out=tmp_path / "motor", **options, **settings), progress=False)
     assert len(load_policy(tmp_path / "motor").symmetries) == 2

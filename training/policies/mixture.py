@@ -55,7 +55,7 @@ class Mixture(NamedTuple):
         squares = (self.actions[:, :, None] - self.actions[:, None]).square().sum(dim=3)
         densities = (self.log_weights[:, None] - squares / (2 * BANDWIDTH**2)).exp()  # at each, from each
         highest = densities.sum(dim=2).argmax(dim=1)[:, None, None]
-        weights = densities.take_along_dim(highest, dim=1)  # (B, 1, k)
+        weights = densities.gather(1, highest.expand(-1, 1, densities.shape[2]))  # (B, 1, k)
         return ((weights @ self.actions) / weights.sum(dim=2, keepdim=True))[:, 0]
 
     def loss(self, losses: th.Tensor) -> th.Tensor:
