@@ -88,6 +88,7 @@ def test_a_number_of_components_that_does_not_fit(dataset, env):
     start = make(env, 3, seed=5)
     warm_start(model, dataset, config, policy=start, progress=False)
     rows = dataset.observations[:9]
-    np.testing.assert_array_equal(model.predict(rows, deterministic=True)[0], start.predict(rows, deterministic=True)[0])
+    found, expected = (one.predict(rows, deterministic=True)[0] for one in (model, start))
+    np.testing.assert_array_equal(found, expected)
     with pytest.raises(ValueError, match="components: expected none for a policy of kind 'sac', got 3"):
         Architecture("sac", SMALL, SMALL, components=3).make(env.observation_space, env.action_space)
