@@ -90,5 +90,5 @@ def test_a_number_of_components_that_does_not_fit(dataset, env):
     rows = dataset.observations[:9]
     found, expected = (one.predict(rows, deterministic=True)[0] for one in (model, start))
     np.testing.assert_array_equal(found, expected)
-    with pytest.raises(ValueError, match="components: expected none for a policy of kind 'sac', got 3"):
+    with pytest.raises(ValueError, match="components: expected none for a policy of kind 'sac'"):
         Architecture("sac", SMALL, SMALL, components=3).make(env.observation_space, env.action_space)

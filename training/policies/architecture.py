@@ -79,11 +79,11 @@ class Architecture:
         }
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
-        for name in ("symmetries", "components"):
-            if (value := getattr(self, name)) != getattr(Architecture, name):
+        for name, is_set in (("symmetries", bool(self.symmetries)), ("components", self.components != 1)):
+            if is_set:
                 if self.kind != "actor-critic":
-                    raise ValueError(f"{name}: expected none for a policy of kind {self.kind!r}, got {value}")
-                arguments[name] = value
+                    raise ValueError(f"{name}: expected none for a policy of kind {self.kind!r}")
+                arguments[name] = getattr(self, name)
         kind = _policy_class(self.kind, own=bool({"effort_weights", "symmetries", "components"} & set(arguments)))
         return kind(observation_space, action_space, lambda _: 3e-4, **arguments)
 

