@@ -83,7 +83,9 @@ clean:
 .venv/sources: .venv/bin/python FORCE
 	@echo "$(SOURCES)" | cmp --silent - $@ || echo "$(SOURCES)" > $@
 
+# The pip of Python 3.11 takes more than twice the time to install the tools of the developers.
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --upgrade --constraint constraints.txt pip
 
 FORCE:
