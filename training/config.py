@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _FOLDER = files("leapnav.training")
 INHERITED = ("robot", "horizon", "observation", "lidar_beams", "previous_action")  # from the policy at the start
 LATER_SENSORS = {"velocities": False, "lidar_fov": math.tau}  # those that older descriptions of policies do not contain
+LATER_SETTINGS = {"symmetric": False, "components": 1}  # those that older configurations of runs do not contain
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
 PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
 
@@ -198,8 +199,8 @@ class _ImitationConfig(RunConfig):
     symmetric: bool = True
     """Actions that are equivariant under the symmetries of the robot, as far as the observation has them."""
     components: int = 1
-    """Number of actions of the network, of which the policy chooses one (mixture density network). With several, the
-    policy decides between paths of similar cost instead of a mean of them."""
+    """Number of actions of the network (mixture density network). With several, the policy takes the mode of their
+    density, and decides between paths of similar cost instead of a mean of them."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
     """Settings of the clone, in DAgger the first learner; its loss and batch size are those of all fits. The seed is
     that of the run."""
@@ -361,13 +362,15 @@ def _as_paths(value: Any) -> list[Path]:
 
 
 def _inherited(paths: Sequence[Path]) -> dict[str, Any]:
-    """Return the task and the sensors of the policy among some paths; empty without one."""
+    """Return the task, the sensors and the components of the policy among some paths; empty without one."""
     included = _FOLDER.joinpath("policies", "pretrained")
     for path in paths:
         for folder in (Path(path), included.joinpath(str(path))):
             try:
-                environment = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))["environment"]
+                description = json.loads(folder.joinpath("policy.json").read_text(encoding="utf-8"))
+                environment = description["environment"]
                 known = {name: environment[name] for name in INHERITED}
+                known |= {"components": description.get("components", LATER_SETTINGS["components"])}
                 known |= {name: environment.get(name, value) for name, value in LATER_SENSORS.items()}
                 return {**known, "history": tuple(environment["history"])}
             except (OSError, ValueError, KeyError, TypeError):  # `load_policy` reports a damaged file
@@ -403,7 +406,8 @@ def read_config(run: Path) -> tuple[str, RunConfig]:
     try:
         stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["config"]
         algorithm = "sac" if stored["algorithm"] == "tqc" else str(stored["algorithm"])
-        earlier = {"symmetric": False, "components": 1} if issubclass(ALGORITHMS[algorithm], _ImitationConfig) else {}
+        names = {field.name for field in fields(ALGORITHMS[algorithm])}
+        earlier = {name: value for name, value in LATER_SETTINGS.items() if name in names}
         return algorithm, TypeAdapter(ALGORITHMS[algorithm]).validate_python(
             {name: value for name, value in {**earlier, **stored}.items() if name != "algorithm" or algorithm == "sac"}
         )

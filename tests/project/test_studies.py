@@ -9,7 +9,7 @@ from helpers import ROOT, run_with_d3rlpy
 STUDIES = sorted({path.parent.name for path in (ROOT / "studies").glob("*/run.py")} - {"offline"})  # which needs d3rlpy
 # Words of a run with a tiny budget, of which a part may stand for all.
 WORDS = {
-    "components": ["clutter-4"],
+    "components": ["four"],
     "curricula": ["uniform"],
     "demonstrations": ["100"],
     "included_policies": ["open", "--train"],
@@ -23,7 +23,7 @@ WORDS = {
 ALL_WORDS = {"included_policies": ["open", "--train"]}  # of the slow test; training of all would take hours
 ROWS = {
     "clients": "| gymnasium ",
-    "components": "| `clutter` | 4 |",
+    "components": "| 4 |",
     "curricula-scores": "| 0.5 M | MaxMC |",
     "curricula-stages": "| 0.5 M |",
     "curricula-runs": "| uniform |",

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import RescaleAction
 from helpers import SMALL
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 
 from leapnav.training import CloningConfig, WarmStartConfig, behaviour_clone, network, warm_start
 from leapnav.training.policies.actors import action_mixture
@@ -53,13 +54,15 @@ def test_a_mixture_decides_between_two_actions(dataset, env):
     actions[:, 0] = np.random.default_rng(0).choice([-0.8, 0.8], len(dataset))
     samples = replace(dataset, actions=actions)[:4000]
     settings = CloningConfig(epochs=10, batch_size=64, patience=0, augment=False)
-    medians = {}
+    medians, noise = {}, {}
     for components in (1, 3):
         policy = make(env, components)
         losses = behaviour_clone(policy, samples, settings, progress=False)
         found, _ = policy.predict(samples.observations[::50], deterministic=True)
         medians[components] = np.median(np.abs(found[:, 0]))
         assert losses[-1].training < losses[0].training
+        noise[components] = float(policy.log_std.exp()[0].detach())
+    assert noise[3] < 0.2 < 0.7 < noise[1]
     assert medians[3] == pytest.approx(0.8, abs=0.05)
     assert medians[1] < 0.5
 
@@ -77,11 +80,11 @@ def test_the_weights_of_a_new_mixture_depend_on_its_seed_alone(env):
 
 
 def test_a_number_of_components_that_does_not_fit(dataset, env):
-    with pytest.raises(ValueError, match="components: expected at least 1, got 0"):
+    with pytest.raises(ValueError, match="components: expected an integer >= 1, got 0"):
         make(env, 0)
     model = PPO("MlpPolicy", env, policy_kwargs=network(SMALL), n_steps=8, batch_size=8, device="cpu")
     config = WarmStartConfig(critic=False)
-    with pytest.raises(ValueError, match=r"a mixture of 3 components, that of the model 1; .*'components': 3"):
+    with pytest.raises(ValueError, match=r"has 3 components, that of the model 1; .*'components': 3"):
         warm_start(model, dataset, config, policy=make(env, 3), progress=False)
     options = {**network(SMALL), "components": 3}
     model = PPO(NavigationPolicy, env, policy_kwargs=options, n_steps=8, batch_size=8, device="cpu")
@@ -90,5 +93,10 @@ def test_a_number_of_components_that_does_not_fit(dataset, env):
     rows = dataset.observations[:9]
     found, expected = (one.predict(rows, deterministic=True)[0] for one in (model, start))
     np.testing.assert_array_equal(found, expected)
+    sac = SAC("MlpPolicy", env, policy_kwargs=network(SMALL), device="cpu")
+    with pytest.raises(ValueError, match="expected the same squashing of the actions"):
+        warm_start(sac, dataset, config, policy=start, progress=False)
+    with pytest.raises(ValueError, match="components: expected none for actions with other bounds than -1 and 1"):
+        make(RescaleAction(env, -2.0, 2.0), 3)
     with pytest.raises(ValueError, match="components: expected none for a policy of kind 'sac'"):
         Architecture("sac", SMALL, SMALL, components=3).make(env.observation_space, env.action_space)

@@ -1,5 +1,6 @@
 """Policies whose actions are equivariant under the symmetries of the robot, with and without a mixture."""
 
+import json
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -23,6 +24,7 @@ from leapnav.training import (
     train_ppo,
     warm_start,
 )
+from leapnav.training.config import read_config
 from leapnav.training.policies.architecture import with_symmetries
 from leapnav.training.policies.navigation_policy import NavigationPolicy
 from leapnav.training.policies.network import make_policy, network
@@ -161,12 +163,28 @@ def test_runs_of_imitation_are_symmetric_and_ppo_starts_from_them(tmp_path):
     th.testing.assert_close(actions_of(trained, observations), actions_of(clone, observations), atol=1e-4, rtol=1e-4)
 
 
+def test_a_run_of_an_earlier_version_is_resumed(tmp_path):
+    cloning = CloningConfig(epochs=1, validation_share=0.0)
+    settings = {"family": "open", "hidden": (16, 16), "lidar_beams": 16, "evaluation_scenarios": 2, "cloning": cloning}
+    config = BCConfig(out=tmp_path / "run", observation="lidar", scenarios=2, symmetric=False, **settings)
+    first = train_bc(config, progress=False)
+    path = config.out / "config.json"
+    stored = json.loads(path.read_text())
+    for name in ("symmetric", "components"):
+        del stored["config"][name]
+    path.write_text(json.dumps(stored))
+    assert replace(read_config(config.out)[1], out=config.out) == config
+    again = train_bc(replace(config, resume=True), progress=False)
+    costs = [[episode.cost for episode in one.episodes] for one in (*first, *again)]
+    assert costs[0] == costs[1]
+
+
 def test_a_warm_start_without_the_symmetries_of_the_policy_says_so(tmp_path):
     rollout("open", 2, tmp_path, progress=False)
     env = environment()
     start = symmetric_policy(env)
     for policy, options, expected in (
-        ("MlpPolicy", {}, pytest.warns(UserWarning, match="policy: its actions are means over symmetries")),
+        ("MlpPolicy", {}, pytest.warns(UserWarning, match="policy: its actions are equivariant under symmetries")),
         (NavigationPolicy, {"symmetries": start.symmetries}, nullcontext()),
     ):
         model = PPO(policy, env, policy_kwargs={**network((16, 16)), **options}, n_steps=8, batch_size=8, device="cpu")

@@ -31,6 +31,7 @@ from leapnav.training.fit_settings import DEFAULT_EPOCHS, CloningConfig
 from leapnav.training.learning.dataset import Dataset
 from leapnav.training.learning.samples import Batch, Samples, split_courses
 from leapnav.training.policies.actors import actor_parameters, parts_of_dict, policy_of, set_noise, update_target
+from leapnav.training.policies.mixture import Mixture
 from leapnav.training.policies.symmetries import Transformation
 from leapnav.training.threads import limit_threads
 
@@ -75,7 +76,8 @@ def behaviour_clone(
 ) -> list[EpochLoss]:
     """Fit the mean action of a policy to the expert's actions, in place.
 
-    The standard deviation of a stochastic policy is set to the root mean square of the remaining error. The same model,
+    The standard deviation of a stochastic policy is set to the root mean square of the remaining error, of a mixture to
+    that of the component that explains the expert's action. The same model,
     dataset and configuration give the same weights on the same machine. The global random generators are not used.
 
     Args:
@@ -206,11 +208,11 @@ class _Fit:
         if self._best is not None:
             self._policy.load_state_dict(self._best[1])
         samples = self._held_out if len(self._held_out) else self._train
+        squares = []
         with th.no_grad():
-            squares = [
-                (batch.actions_of(self._policy) - batch.actions).square().sum(dim=0)
-                for batch in map(samples.batch, samples.in_order(EVALUATION_BATCH_SIZE))
-            ]
+            for batch in map(samples.batch, samples.in_order(EVALUATION_BATCH_SIZE)):
+                mixture, error, losses = self._errors(batch)
+                squares.append((mixture.responsibilities(losses)[:, :, None] * error.square()).sum(dim=(0, 1)))
         set_noise(self._policy, (th.stack(squares).sum(dim=0) / len(samples)).sqrt().clamp(min=MIN_STD))
         update_target(self._policy)
 
@@ -220,13 +222,18 @@ class _Fit:
         return [transform for number, transform in enumerate(self._symmetries) if combination & 2**number]
 
     def _loss(self, batch: Batch) -> th.Tensor:
+        mixture, _, losses = self._errors(batch)
+        return mixture.loss(losses).mean()
+
+    def _errors(self, batch: Batch) -> tuple[Mixture, th.Tensor, th.Tensor]:
+        """Return the mixture for a batch, and errors (B, k, m) and losses (B, k) of its components."""
         mixture = batch.mixture_of(self._policy)
         error = mixture.actions - batch.actions[:, None]
         if self.config.loss == "action":
             losses = _action_loss(error)
         else:
             losses = _hamiltonian_loss(error, batch.slopes[:, None], batch.weights[:, None])
-        return mixture.loss(losses.mul(self._scale).sum(dim=2)).mean()
+        return mixture, error, losses.mul(self._scale).sum(dim=2)
 
     def _validation_loss(self) -> float:
         if not len(self._held_out):

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from leapnav.experts.problem.system import switching_functions
 from leapnav.training.learning.dataset import Dataset
-from leapnav.training.policies.actors import action_mixture, mean_action
+from leapnav.training.policies.actors import action_mixture
 from leapnav.training.policies.mixture import Mixture
 from leapnav.training.policies.symmetries import Transformation
 
@@ -39,10 +39,6 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.actions)
-
-    def actions_of(self, policy: BasePolicy) -> th.Tensor:
-        """Compute the mean actions (B, m) of a policy, with gradients."""
-        return mean_action(policy, self.observations)
 
     def mixture_of(self, policy: BasePolicy) -> Mixture:
         """Compute the mixture of the actions of a policy, with gradients."""

@@ -111,8 +111,9 @@ def warm_start(
         copy_actor(policy, target)
         if symmetries_of(policy) and not symmetries_of(target):
             warnings.warn(
-                "policy: its actions are means over symmetries, those of the model are not; create the model with the "
-                "class NavigationPolicy and policy_kwargs={**network(), 'symmetries': policy.symmetries}",
+                "policy: its actions are equivariant under symmetries, those of the model are not; create the model "
+                "with the class NavigationPolicy and policy_kwargs={**network(), 'symmetries': policy.symmetries, "
+                "'components': policy.components}",
                 stacklevel=3,  # around `limit_threads`
             )
     elif config.actor:

@@ -142,15 +142,15 @@ def copy_actor(source: BasePolicy, target: BasePolicy) -> None:
         ValueError: the networks differ otherwise, or only one of the policies squashes its actions.
 
     """
-    if (found := components_of(source)) != (expected := components_of(target)):
-        raise ValueError(
-            f"policy: its network has a mixture of {found} components, that of the model {expected}; create the model "
-            f"with the class NavigationPolicy and policy_kwargs={{**network(), 'components': {found}}}"
-        )
     if isinstance(source, ActorCriticPolicy) != isinstance(target, ActorCriticPolicy):
         raise ValueError(
             f"policy: expected the same squashing of the actions, got a {type(source).__name__} for a "
             f"{type(target).__name__}; start from demonstrations instead"
+        )
+    if (found := components_of(source)) != (expected := components_of(target)):
+        raise ValueError(
+            f"policy: its network has {found} components, that of the model {expected}; give --components {found}, or "
+            f"create the model with the class NavigationPolicy and policy_kwargs={{**network(), 'components': {found}}}"
         )
     tensors = _actor_tensors(source), _actor_tensors(target)
     extractors = [_extractor(policy) for policy in (source, target)]

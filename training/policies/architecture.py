@@ -79,11 +79,13 @@ class Architecture:
         }
         if self.effort_weights is not None:
             arguments["effort_weights"] = self.effort_weights
-        for name, is_set in (("symmetries", bool(self.symmetries)), ("components", self.components != 1)):
-            if is_set:
-                if self.kind != "actor-critic":
-                    raise ValueError(f"{name}: expected none for a policy of kind {self.kind!r}")
-                arguments[name] = getattr(self, name)
+        if self.symmetries:
+            arguments["symmetries"] = self.symmetries
+        if self.components != 1:
+            arguments["components"] = self.components
+        for name in ("symmetries", "components"):
+            if name in arguments and self.kind != "actor-critic":
+                raise ValueError(f"{name}: expected none for a policy of kind {self.kind!r}")
         kind = _policy_class(self.kind, own=bool({"effort_weights", "symmetries", "components"} & set(arguments)))
         return kind(observation_space, action_space, lambda _: 3e-4, **arguments)
 
@@ -113,7 +115,7 @@ class Architecture:
 
 
 def with_symmetries(policy: BasePolicy, symmetries: tuple[Transformation, ...]) -> BasePolicy:
-    """Return a policy with the weights of another one, whose actions are means over symmetries.
+    """Return a policy with the weights of another one, whose actions are equivariant under symmetries.
 
     Args:
         policy: a policy of PPO or A2C.

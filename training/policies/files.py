@@ -285,7 +285,7 @@ def load_policy(folder: str | Path, env: Any = None) -> BasePolicy:
             for name, bound in (("action_low", -1.0), ("action_high", 1.0))
         )
         action_space = spaces.Box(least, most, dtype=np.float32)
-        # Older files contain no `symmetries`.
+        # Older files contain no `symmetries` and `components`.
         known = {field.name: description[field.name] for field in fields(Architecture) if field.name in description}
         architecture = Architecture(**known)
         policy = architecture.make(observation_space, action_space)

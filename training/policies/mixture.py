@@ -3,7 +3,7 @@
 Where a small displacement decides on which side the expert passes an obstacle, or whether it drives forwards or
 backwards, the expert's actions for similar observations form several groups. A network with one action learns a value
 between the groups: the robot drives into the obstacle, or it stops. A mixture density network has several actions with
-weights, and the policy takes the one of the highest density.
+weights, and the policy takes the mode of their density.
 
 Reference: C. M. Bishop, "Mixture density networks" (Aston University, 1994), with a loss in place of the squared error.
 """
@@ -54,6 +54,7 @@ class Mixture(NamedTuple):
         """
         if self.actions.shape[1] == 1:
             return self.actions[:, 0]
+        # The density at the component of the largest weight is at least that weight, so that it is not 0.
         squares = (self.actions[:, :, None] - self.actions[:, None]).square().sum(dim=3)
         densities = (self.log_weights[:, None] - squares / (2 * BANDWIDTH**2)).exp()  # at each, from each
         highest = densities.sum(dim=2).argmax(dim=1)[:, None, None]
@@ -66,7 +67,13 @@ class Mixture(NamedTuple):
         The loss is the negative logarithm of the likelihood in units of the temperature. With one component it is the
         loss of that.
         """
+        if losses.shape[1] == 1:
+            return losses[:, 0]
         return -TEMPERATURE * (self.log_weights - losses / TEMPERATURE).logsumexp(dim=1)
+
+    def responsibilities(self, losses: th.Tensor) -> th.Tensor:
+        """Return the probabilities (B, k) with which each component explains an action with these losses (B, k)."""
+        return (self.log_weights - losses / TEMPERATURE).softmax(dim=1)
 
 
 class MixtureDistribution(DiagGaussianDistribution):

@@ -25,7 +25,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from leapnav.envs.simulation.observations import TIME_LEFT, parts_of
-from leapnav.envs.utils.validation import check_at_least
+from leapnav.envs.utils.validation import check_integer
 from leapnav.training.policies.mixture import Mixture, MixtureDistribution
 from leapnav.training.policies.symmetries import Symmetrised, Transformation
 
@@ -95,11 +95,13 @@ class NavigationPolicy(ActorCriticPolicy):
             proportional to the remaining time from then on, but not below 30 %; 0: it does not decrease. An error
             shortly before the horizon cannot be corrected, and would hide the effect of earlier actions on the return.
             Not used with a free horizon.
-        symmetries: transformations of observations and actions over which the mean action is averaged, see
+        symmetries: transformations of observations and actions under which the actions are equivariant, see
             `leapnav.training.policies.symmetries`.
+        components: number of components of the mixture, see `leapnav.training.policies.mixture`.
 
     Raises:
-        ValueError: symmetric actions with other bounds than -1 and 1, or symmetries of other observations.
+        ValueError: symmetries or a mixture for actions with other bounds than -1 and 1, symmetries of other
+            observations, or `components` is not an integer of at least 1.
 
     """
 
@@ -112,7 +114,7 @@ class NavigationPolicy(ActorCriticPolicy):
         components: int = 1,
         **kwargs: Any,
     ) -> None:
-        check_at_least("components", components, 1)
+        check_integer("components", components, 1)
         self.effort_weights = None if effort_weights is None else tuple(map(float, effort_weights))
         self.quiet = quiet
         self.symmetries = tuple(Transformation(tuple(one), tuple(map(tuple, two))) for one, two in symmetries)
@@ -125,8 +127,9 @@ class NavigationPolicy(ActorCriticPolicy):
         self._momentum = None if self.effort_weights is None else _Momentum(space, self.effort_weights)
         self._is_quiet = quiet > 0 and parts_of(space)["goal"].stop > TIME_LEFT
         actions = cast(Box, self.action_space)
-        if symmetries and not ((actions.low == -1).all() and (actions.high == 1).all()):
-            raise ValueError(f"symmetries: expected none for actions with other bounds than -1 and 1, got {actions}")
+        for name, is_set in (("symmetries", bool(symmetries)), ("components", components > 1)):
+            if is_set and not ((actions.low == -1).all() and (actions.high == 1).all()):
+                raise ValueError(f"{name}: expected none for actions with other bounds than -1 and 1, got {actions}")
         shape, expected = self.observation_space.shape, [(len(one.observation),) for one in self.symmetries]
         if any(shape != one for one in expected):
             raise ValueError(f"symmetries: expected those of observations of shape {shape}, got {expected[0]}")
@@ -217,7 +220,7 @@ def deterministic_action(policy: Any, network: Callable[[th.Tensor], Mixture], o
 
 
 def symmetries_of(policy: Any) -> tuple[Transformation, ...]:
-    """Return the transformations over which the mean action of a policy is averaged; empty without."""
+    """Return the transformations under which the actions of a policy are equivariant; empty without."""
     return getattr(policy, "symmetries", ())
 
 

@@ -159,9 +159,9 @@ def _transformation(
 class Symmetrised:
     """The action of a network for the images of an observation under all combinations of transformations.
 
-    It is equivariant: an observation that is transformed leads to the transformed action, and the errors of the network
-    for the images partly cancel. The action is the mean of those for the images, or, of a network with a mixture, the
-    mode of the mixture of all their components.
+    The action is the mean of those for the images, or, of a network with a mixture, the mode of the mixture of the
+    components for all images. It is equivariant, unless two modes are equal: an observation that is transformed leads
+    to the transformed action. The errors of the network for the images partly cancel.
 
     Args:
         transformations: at least one; they commute, such as those of `symmetries`.

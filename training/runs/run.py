@@ -24,7 +24,7 @@ from leapnav.envs.scenarios.families import ALL, BANK_ENDING, FAMILIES, families
 from leapnav.envs.utils.files import digest, write_text
 from leapnav.envs.utils.json_utils import encode, plain
 from leapnav.experts.data.banks import build_bank
-from leapnav.training.config import LATER_SENSORS, RunConfig
+from leapnav.training.config import LATER_SENSORS, LATER_SETTINGS, RunConfig
 from leapnav.training.policies.files import write_policy
 from leapnav.training.runs.checks import check_config
 from leapnav.training.scoring.adapters import PolicyOrFactory
@@ -116,7 +116,7 @@ class Run:
                 f"{self.folder}: a run of {str(stored.get('algorithm')).upper()}, not of {self.algorithm.upper()}; "
                 f"resume it by `leapnav train {stored.get('algorithm')}`"
             )
-        later = LATER_SENSORS | ({"symmetric": False} if "symmetric" in self._settings else {})
+        later = LATER_SENSORS | {name: value for name, value in LATER_SETTINGS.items() if name in self._settings}
         stored = {**later, **stored}
         missing = sorted(set(self._settings) - set(stored))
         if missing:
