@@ -40,7 +40,8 @@ def test_the_start_of_a_run_determines_its_profile():
     sac = SACConfig.tuned("clutter", warm=True, actuation="motor")
     assert sac == replace(SACConfig.tuned("clutter", warm=True), actuation="motor")
     assert sac.imitation == 50.0
-    assert DAggerRunConfig.tuned("clutter", observation="lidar").dagger.rounds > DAggerConfig.rounds
+    lidar = DAggerRunConfig.tuned("clutter", observation="lidar")
+    assert lidar.dagger.rounds > DAggerConfig.rounds and lidar.components == 4
     with pytest.raises(ValueError, match="town"):
         PPOConfig.tuned("town")
 
