@@ -116,12 +116,12 @@ class Run:
                 f"{self.folder}: a run of {str(stored.get('algorithm')).upper()}, not of {self.algorithm.upper()}; "
                 f"resume it by `leapnav train {stored.get('algorithm')}`"
             )
-        later = LATER_SENSORS | {name: value for name, value in LATER_SETTINGS.items() if name in self._settings}
-        stored = {**later, **stored}
-        missing = sorted(set(self._settings) - set(stored))
+        after = _flat(self._settings)
+        later = {name: value for name, value in (LATER_SENSORS | LATER_SETTINGS).items() if name in after}
+        missing = sorted(set(self._settings) - set(stored) - set(later))
         if missing:
             raise ValueError(f"{path}: a run of another version of leapnav, without {missing[0]}; it cannot be resumed")
-        before, after = _flat(stored), _flat(self._settings)
+        before = {**later, **_flat(stored)}
         names = sorted({*before, *after} - set(FREE_SETTINGS))
         changed = [name for name in names if before.get(name) != after.get(name)]
         for name in changed:
