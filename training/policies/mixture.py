@@ -20,7 +20,8 @@ from torch import nn
 # 0.3, 0.5 and 0.8 gave a symmetric policy with lidar 98.6, 98.8, 98.9, 98.9 and 98.8 % success; the component of the
 # highest weight alone 98.6 %, and a network with one action that was fitted to the same samples 98.0 %.
 BANDWIDTH = 0.3
-# Loss at which a component has 1/e of the likelihood of one without loss; the loss of the mean action is 1.
+# Loss at which a component has 1/e of the likelihood of one without loss; the loss of the mean action is 1. After half
+# of the epochs, 0.03 and 0.1 gave 97.6 and 98.4 % success in these scenarios.
 TEMPERATURE = 0.1
 INITIAL_SPREAD = 0.5  # largest initial action of the components, which learn nothing different if they are equal
 
