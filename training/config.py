@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 _FOLDER = files("leapnav.training")
 INHERITED = ("robot", "horizon", "observation", "lidar_beams", "previous_action")  # from the policy at the start
 LATER_SENSORS = {"velocities": False, "lidar_fov": math.tau}  # those that older descriptions of policies do not contain
-# Settings that older configurations of runs do not contain
-LATER_SETTINGS = {"symmetric": False, "components": 1, "dagger.refit": False}
+LATER_SETTINGS = {"symmetric": False, "components": 1}  # those that older configurations of runs do not contain
 # The settings of an algorithm for another start than that of its defaults, by the name of the profile.
 PROFILES: dict[str, Any] = tomllib.loads(_FOLDER.joinpath("profiles.toml").read_text(encoding="utf-8"))
 

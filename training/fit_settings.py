@@ -55,9 +55,6 @@ class DAggerConfig:
     """Passes over all samples after the last round."""
     learning_rate: float = 1e-3
     """Peak learning rate of each round (cosine decay to zero)."""
-    refit: bool = False
-    """Start the fit after the last round from the first weights instead of those of the round before, with the learning
-    rate of the clone."""
     seed: int = 0
     """Random seed of the scenarios and the times of the takeovers."""
 

@@ -23,7 +23,7 @@ def test_a_profile_contains_all_settings_of_its_algorithm():
         algorithm = ALGORITHMS[name.partition("-")[0]]
         assert isinstance(algorithm.tuned("open"), algorithm)
         if algorithm is DAggerRunConfig:
-            assert set(profile["dagger"]) == {field.name for field in fields(DAggerConfig)} - {"seed", "refit"}
+            assert set(profile["dagger"]) == {field.name for field in fields(DAggerConfig)} - {"seed"}
             continue
         own = set(algorithm.__annotations__) - set(BCConfig.__annotations__)
         unset = {"gamma", "levels", "level_bank", "algorithm", "evaluate_every", "checkpoint_every"}

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers import QUICK, fresh
@@ -38,18 +36,6 @@ def test_dagger_learns_what_the_expert_does_where_it_takes_over(dataset, env, tm
         assert expert.predict(observation)[0] == pytest.approx(kept.actions[i], abs=2e-2)
         assert -expert.value() == pytest.approx(kept.returns[i], rel=1e-4)
         assert expert.costate() == pytest.approx(kept.costates[i], abs=1e-2 * max(1, np.abs(kept.costates[i]).max()))
-
-
-def test_the_last_fit_may_start_from_the_first_weights(dataset, env):
-    policy, few = fresh(env), dataset[:1000]
-    config = DAggerConfig(rounds=1, max_episodes=4, lead=1.0, last_epochs=2, refit=True)
-    dagger = DAgger(policy, "open", config, cloning=QUICK, dataset=few, robots=4)
-    behaviour_clone(policy, few, QUICK, progress=False)
-    dagger.run(progress=False)
-    expected = fresh(env)
-    settings = replace(QUICK, epochs=config.last_epochs, patience=0)
-    behaviour_clone(expected, dagger.dataset, settings, progress=False, stream=1)
-    assert policy.parameters_to_vector().tobytes() == expected.parameters_to_vector().tobytes()
 
 
 def driven(scenario, states, *, success=False, collision=False, costs=None):

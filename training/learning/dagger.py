@@ -11,7 +11,6 @@ because most collisions are decided seconds before.
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,8 +77,7 @@ class DAgger:
         scenarios: the name of a family, from which each round draws new scenarios, or a bank.
         config: settings.
         environment: arguments of the environment, such as `observation`, `robot` or `horizon`.
-        cloning: settings of the fits, of which `epochs`, `learning_rate` and `patience` are ignored, apart from the
-            learning rate with `config.refit`.
+        cloning: settings of the fits, of which `epochs`, `learning_rate` and `patience` are ignored.
         dataset: initial samples: a `Dataset`, a directory written by `leapnav rollout`, or demonstrations.
         folder: directory in which the samples of each round are stored; None keeps them in memory only.
         robots: number of robots that a process simulates together; the scenarios depend on it.
@@ -127,7 +125,6 @@ class DAgger:
         self._source, self._settings = env.source, env.settings
         _check_environment(self._settings)
         self._policy, self._robots, self._workers = policy_of(model), robots, workers
-        self._initial = copy.deepcopy(self._policy.state_dict()) if self.config.refit else {}
         if self._policy.observation_space != env.single_observation_space:
             has, expected = env.single_observation_space.shape, self._policy.observation_space.shape
             raise ValueError(
@@ -258,13 +255,9 @@ class DAgger:
 
     def _fit(self, number: int, progress: bool) -> float:
         """Fit the policy to all samples after a round, and return the lowest validation loss."""
-        config, is_last = self.config, number + 1 == self.config.rounds
-        rate = config.learning_rate
-        if config.refit and is_last:
-            self._policy.load_state_dict(self._initial)
-            rate = self._cloning.learning_rate
-        epochs = config.last_epochs if is_last else config.epochs
-        settings = replace(self._cloning, epochs=epochs, learning_rate=rate, patience=0)
+        config = self.config
+        epochs = config.epochs if number + 1 < config.rounds else config.last_epochs
+        settings = replace(self._cloning, epochs=epochs, learning_rate=config.learning_rate, patience=0)
         losses = behaviour_clone(
             self._policy, self.dataset, settings, progress=progress, label="Fitting", stream=number + 1
         )
