@@ -13,7 +13,7 @@ SOC = {
     "all": 0.986,
     "car-clutter": 0.977,
     "clutter": 0.992,
-    "clutter-lidar": 0.959,
+    "clutter-lidar": 0.952,
     "crossing": 0.869,
     "crowd": 0.868,
     "dynamic_unicycle-clutter": 0.972,
