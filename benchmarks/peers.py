@@ -260,27 +260,33 @@ def _direct(solve: Callable[..., Solution], scenario: Scenario, path: Trajectory
 
 def _prebuilt(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
     solver = transcription(len(scenario.obstacles), len(times) - 1)
-    limits = np.concatenate([np.full(states.size, np.inf), np.tile(scenario.robot.limits(), len(times))])
-    values, cost, success, seconds = _solve(solver, scenario, states, np.append(states, speeds), limits)
+    bounds = np.vstack([_unbounded(states.size), np.tile(scenario.robot.control_bounds(), (len(times), 1))])
+    values, cost, success, seconds = _solve(solver, scenario, states, np.append(states, speeds), bounds)
     return values[: states.size].reshape(-1, 3), cost, success, seconds
 
 
 def _staged(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
     solver = staged_transcription(len(scenario.obstacles), len(times) - 1)
     guess = np.append(np.hstack([states, speeds])[:-1], states[-1])
-    limits = np.append(np.tile([np.inf] * 3 + list(scenario.robot.limits()), len(times) - 1), [np.inf] * 3)
-    values, cost, success, seconds = _solve(solver, scenario, states, guess, limits)
+    stage = np.vstack([_unbounded(3), scenario.robot.control_bounds()])
+    bounds = np.vstack([np.tile(stage, (len(times) - 1, 1)), _unbounded(3)])
+    values, cost, success, seconds = _solve(solver, scenario, states, guess, bounds)
     return np.append(values, [0.0, 0.0]).reshape(-1, 5)[:, :3], cost, success, seconds
 
 
+def _unbounded(count: int) -> np.ndarray:
+    """Return the bounds (count, 2) of variables that have none."""
+    return np.tile([-np.inf, np.inf], (count, 1))
+
+
 def _solve(
-    solver: tuple[casadi.Function, int], scenario: Scenario, states: np.ndarray, guess: np.ndarray, limits: np.ndarray
+    solver: tuple[casadi.Function, int], scenario: Scenario, states: np.ndarray, guess: np.ndarray, bounds: np.ndarray
 ) -> Solution:
-    """Call a prebuilt solver, whose time is measured; the values are those of all variables."""
+    """Call a prebuilt solver, whose time is measured; `bounds` and the values are those of all variables."""
     function, count = solver
     numbers, zeros = _numbers(scenario, states[-1]), np.zeros(count)
     start = time.perf_counter()
-    found = function(x0=guess, p=numbers, lbx=-limits, ubx=limits, lbg=zeros, ubg=zeros)
+    found = function(x0=guess, p=numbers, lbx=bounds[:, 0], ubx=bounds[:, 1], lbg=zeros, ubg=zeros)
     seconds = time.perf_counter() - start
     return np.array(found["x"]).ravel(), float(found["f"]), bool(function.stats()["success"]), seconds
 
