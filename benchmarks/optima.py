@@ -50,7 +50,7 @@ def compare(count: int) -> None:
             ours.append(time.perf_counter() - start)
             costs.append(optimum.cost)
             start = time.perf_counter()
-            transcription = Transcription(scenario, N_INTERVALS)
+            transcription = Transcription(scenario, OptimalControlProblem.from_scenario(scenario), N_INTERVALS)
             building = time.perf_counter() - start
             cost, seconds = ipopt(scenario, transcription)
             theirs.append(seconds)
@@ -115,7 +115,7 @@ def compare_dense(count: int) -> None:
                 ours.append(time.perf_counter() - start)
                 found.append((1 + len(optimum.alternatives)) if optimum.success else 0)
                 start = time.perf_counter()
-                transcription = Transcription(scenario, DENSE_INTERVALS)
+                transcription = Transcription(scenario, OptimalControlProblem.from_scenario(scenario), DENSE_INTERVALS)
                 built.append(time.perf_counter() - start)
                 theirs.append(ipopt(scenario, transcription, 1)[1])
             middle, other = statistics.median(ours), statistics.median(theirs)
