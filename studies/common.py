@@ -171,6 +171,32 @@ def play(
     write_episodes({name: found}, results / f"{name}.jsonl.gz")
 
 
+def score_clones(
+    arguments: argparse.Namespace, folder: Path, family: str, *, demonstrations: int, seed: int, runs: int
+) -> None:
+    """Train clones of the same demonstrations with each of the named settings, and score them on the test split.
+
+    Args:
+        arguments: the command line of the study.
+        folder: directory of the study, with the settings.
+        family: the family.
+        demonstrations: number of demonstrations.
+        seed: seed of their scenarios.
+        runs: number of clones with the same settings.
+
+    """
+    tiny, trained, test = arguments.tiny, arguments.runs / folder.name, ScenarioBank.shipped(family, "test")
+    count = 4 if tiny else demonstrations
+    demos = demonstrate(family, count, trained / "demonstrations", seed=seed, tiny=tiny)
+    for name in arguments.names:
+        settings = folder / "configurations" / f"{name}.json"
+        clones = [
+            train(settings, trained / f"{name}-{number}", tiny=tiny, seed=number, demos=(demos,))
+            for number in range(2 if tiny else runs)
+        ]
+        play(map(load, clones), [test], arguments.results, name, count=2 if tiny else None, progress=not tiny)
+
+
 def score_tables(results: Path, heading: str, labels: Mapping[str, str]) -> tuple[str, str]:
     """Return two Markdown tables of scores: over the scenarios, and with the values of each of several runs.
 

@@ -11,10 +11,8 @@ budget, to try the script; it needs `--out`.
 import sys
 from pathlib import Path
 
-from leapnav.envs import ScenarioBank
-
 sys.path.append(str(Path(__file__).parents[1]))
-from common import demonstrate, load, play, read_arguments, score_tables, train
+from common import read_arguments, score_clones, score_tables
 
 HERE = Path(__file__).parent
 FAMILY, DEMONSTRATIONS, DEMONSTRATION_SEED, SEEDS = "clutter", 1000, 63_000, 5
@@ -31,16 +29,8 @@ def tables(results: Path) -> dict[str, str]:
 def main() -> None:
     """Train and score clones with the named numbers of actions."""
     arguments = read_arguments(__doc__, NAMES, HERE)
-    tiny, runs, test = arguments.tiny, arguments.runs / "components", ScenarioBank.shipped(FAMILY, "test")
-    count = 4 if tiny else DEMONSTRATIONS
-    demonstrations = demonstrate(FAMILY, count, runs / "demonstrations", seed=DEMONSTRATION_SEED, tiny=tiny)
-    for name in arguments.names:
-        settings, demos = HERE / "configurations" / f"{name}.json", (demonstrations,)
-        clones = [
-            train(settings, runs / f"{name}-{seed}", tiny=tiny, seed=seed, demos=demos)
-            for seed in range(2 if tiny else SEEDS)
-        ]
-        play(map(load, clones), [test], arguments.results, name, count=2 if tiny else None, progress=not tiny)
+    demonstrations = {"demonstrations": DEMONSTRATIONS, "seed": DEMONSTRATION_SEED}
+    score_clones(arguments, HERE, FAMILY, **demonstrations, runs=SEEDS)
     print("\n".join(tables(arguments.results).values()))
 
 
