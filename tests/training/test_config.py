@@ -13,6 +13,7 @@ def test_a_run_that_starts_from_a_policy_has_its_observation():
     given = DAggerRunConfig.tuned("clutter", observation="lidar")
     inherited = DAggerRunConfig.tuned("clutter", policy=Path("clutter-lidar"))
     assert inherited.observation == "lidar" and inherited.dagger == given.dagger
+    assert DAggerRunConfig.tuned("slalom", policy=Path("slalom-lidar")).components == 1  # not that of the profile
     warm = PPOConfig.tuned("clutter", warm_start=(Path("free-clutter"),))
     assert warm.task["horizon"] == "free" and warm.environment["previous_action"]
     assert PPOConfig.tuned("clutter", warm_start=(Path("car-clutter"),)).task["robot"] == "car"

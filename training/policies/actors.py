@@ -86,7 +86,7 @@ def as_observation(policy: BasePolicy, rows: Any) -> Any:
 
 
 def mean_action(policy: BasePolicy, observations: th.Tensor) -> th.Tensor:
-    """Compute the actions (B, m) of a policy's network; of a mixture, the one that the policy chooses.
+    """Compute the actions (B, m) of a policy's network; of a mixture, its mode.
 
     Arguments and units are those of `action_mixture`.
     """
