@@ -21,7 +21,7 @@ from leapnav.experts import find_optimum
 from leapnav.experts.acting.policy import plan_actions
 from leapnav.experts.data.banks import build_bank
 
-ENV_ID, ROUNDS, SECONDS, ROBOTS = "leapnav/Navigate-v0", 5, 0.5, 1024
+ENV_ID, ROUNDS, SECONDS, ROBOTS = "leapnav/Navigate-v0", 3, 1, 1024
 RATES = [
     # Name, robots (None: the single environment), arguments, target of the ratio to Pendulum-v1.
     ("vector, state", ROBOTS, {"observation": "state"}, 50.0),

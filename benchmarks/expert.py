@@ -2,6 +2,7 @@
 
 import statistics
 import time
+from typing import Literal, get_args
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -9,6 +10,8 @@ from tqdm.auto import tqdm
 from leapnav.envs import NavigateEnv, NavigateVectorEnv, ScenarioBank
 from leapnav.envs.scenarios.families import ALL_FAMILIES
 from leapnav.experts import ExpertPolicy
+
+Feedback = Literal["resolve", "gains"]
 
 EPISODES, ROBOTS, ROUNDS = 20, 256, 25
 SETTINGS = [
@@ -18,7 +21,7 @@ SETTINGS = [
 ]
 
 
-def measure_time(family: str, feedback: str) -> tuple[float, float, float]:
+def measure_time(family: str, feedback: Feedback) -> tuple[float, float, float]:
     """Median and 99th percentile of the time of an action, and the median of the first in an episode (ms)."""
     env = NavigateEnv(family, split="test", observation="state")
     expert = ExpertPolicy(env, feedback=feedback, workers=1)
@@ -80,7 +83,7 @@ def main() -> None:
     print(f"{ROBOTS} robots: {batched:.1f} ms as a batch, {looped:.1f} ms in a loop, ratio {ratio:.2f} (target 1.5)\n")
     print(f"{'':10}{'feedback':>10}{'median ms':>12}{'99 % ms':>10}{'first ms':>10}   (targets 2 and 30)")
     for family in ALL_FAMILIES:
-        for feedback in ("resolve", "gains"):
+        for feedback in get_args(Feedback):
             median, slow, first = measure_time(family, feedback)
             print(f"{family:10}{feedback:>10}{median:12.3f}{slow:10.2f}{first:10.1f}")
     print(f"\n{f'successes of {EPISODES}, median regret':32}" + "".join(f"{name:>24}" for name, _ in SETTINGS))

@@ -37,6 +37,7 @@ def takeovers(family: str, count: int) -> list[Scenario]:
         if len(found) == count:
             break
         scenario, step = bank[episode.index], int(rng.integers(1, len(episode.states) - 1))
+        assert scenario.horizon is not None
         left = round(scenario.horizon - step * SETTINGS.control_period, 9)
         if episode.success or left < MIN_TIME_LEFT + LEAD:
             continue

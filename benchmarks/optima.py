@@ -18,10 +18,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from leapnav.envs import Scenario, Unicycle, sample_scenario
+from leapnav.envs import Circle, Obstacle, Polygon, Scenario, Unicycle, sample_scenario
 from leapnav.envs.field.clearance import clearances
 from leapnav.envs.scenarios.families import ALL_FAMILIES
-from leapnav.envs.scenarios.scenario import Circle, Obstacle, Polygon
 from leapnav.experts import OptimalControlProblem, Trajectory, build_bank, find_optimum
 from leapnav.experts.ipopt import Transcription
 from leapnav.experts.search.candidates import CandidateSearch

@@ -16,7 +16,7 @@ import casadi
 import numpy as np
 from scipy.integrate import solve_bvp
 
-from leapnav.envs import Scenario
+from leapnav.envs import Scenario, Unicycle
 from leapnav.envs.field.clearance import clearances
 from leapnav.experts import Status, Trajectory, certify
 from leapnav.experts.problem.problem import OptimalControlProblem
@@ -59,7 +59,7 @@ def bvp(scenario: Scenario, states: np.ndarray, costates: np.ndarray, tol: float
         at_start[:3, :3] = at_end[3:, :3] = np.eye(3)
         return at_start, at_end
 
-    mesh = np.linspace(0.0, scenario.horizon, len(states))
+    mesh = np.linspace(0.0, _horizon(scenario), len(states))
     guess = np.concatenate([states, costates], axis=1).T
     start = time.perf_counter()
     with np.errstate(all="ignore"):
@@ -74,7 +74,7 @@ def bvp(scenario: Scenario, states: np.ndarray, costates: np.ndarray, tol: float
             max_nodes=MAX_NODES,
         )
     seconds = time.perf_counter() - start
-    dense = np.linspace(0.0, scenario.horizon, POINTS)
+    dense = np.linspace(0.0, _horizon(scenario), POINTS)
     z = np.nan_to_num(found.sol(dense))
     clear = clearances(np.ascontiguousarray(z[:2].T), scenario.field).min() > 0
     cost = float(np.trapezoid(_running_cost(problem, np.ascontiguousarray(z.T)), dense))
@@ -95,15 +95,31 @@ def line_guess(scenario: Scenario, points: int = 33) -> tuple[np.ndarray, np.nda
     states = problem.with_winding_of(np.array([scenario.start])).straight_line(points).states
     displacement = np.subtract(scenario.goal[:2], scenario.start[:2])
     costates = np.zeros_like(states)
-    costates[:, :2] = -scenario.cost.speed_weight * displacement / scenario.horizon
+    costates[:, :2] = -scenario.cost.speed_weight * displacement / _horizon(scenario)
     return states, costates
+
+
+def _horizon(scenario: Scenario) -> float:
+    assert scenario.horizon is not None
+    return scenario.horizon
+
+
+def _unicycle(scenario: Scenario) -> Unicycle:
+    assert isinstance(scenario.robot, Unicycle)
+    return scenario.robot
+
+
+def _discs(scenario: Scenario) -> np.ndarray:
+    """Return x, y and radius of each obstacle."""
+    circles = [obstacle.circle for obstacle in scenario.obstacles]
+    return np.array([(*circle.center, circle.radius) for circle in circles if circle is not None])
 
 
 def _in_numpy(scenario: Scenario):
     """The extremal flow of a scenario with discs, vectorised over the mesh as a user would write it."""
-    cost, robot = scenario.cost, scenario.robot
-    centers = np.array([o.circle.center for o in scenario.obstacles])[:, :, None]
-    rims = np.array([o.circle.radius for o in scenario.obstacles])[:, None] + robot.radius
+    cost, robot = scenario.cost, _unicycle(scenario)
+    discs = _discs(scenario)
+    centers, rims = discs[:, :2, None], discs[:, 2:] + robot.radius
     x_min, y_min, x_max, y_max = scenario.arena
     sigma, k = cost.proximity_scale, cost.proximity_weight
 
@@ -174,10 +190,9 @@ def _model(numbers: casadi.SX, obstacles: int) -> Callable[[casadi.SX, casadi.SX
 
 def _numbers(scenario: Scenario, goal: np.ndarray) -> list[float]:
     """The numbers of a scenario with discs, in the order of `_model`; the heading of the goal has its winding."""
-    robot, cost = scenario.robot, scenario.cost
+    robot, cost = _unicycle(scenario), scenario.cost
     weights = [cost.proximity_scale, cost.proximity_weight, robot.radius, cost.speed_weight, cost.turn_weight]
-    discs = [value for o in scenario.obstacles for value in (*o.circle.center, o.circle.radius)]
-    return [scenario.horizon, *weights, *scenario.arena, *scenario.start, *goal, *discs]
+    return [_horizon(scenario), *weights, *scenario.arena, *scenario.start, *goal, *_discs(scenario).ravel()]
 
 
 @functools.cache
@@ -248,12 +263,12 @@ Solution = tuple[np.ndarray, float, bool, float]
 
 
 def _direct(solve: Callable[..., Solution], scenario: Scenario, path: Trajectory, intervals: int) -> Result:
-    times = np.linspace(0.0, scenario.horizon, intervals + 1)
+    times = np.linspace(0.0, _horizon(scenario), intervals + 1)
     states = path.resample(times).states
     rates = np.gradient(states, times, axis=0)
     speed = rates[:, 0] * np.cos(states[:, 2]) + rates[:, 1] * np.sin(states[:, 2])
     values, cost, success, seconds = solve(scenario, times, states, np.stack([speed, rates[:, 2]], axis=1))
-    dense = Trajectory(times, values).resample(np.linspace(0.0, scenario.horizon, POINTS)).states
+    dense = Trajectory(times, values).resample(np.linspace(0.0, _horizon(scenario), POINTS)).states
     clear = clearances(np.ascontiguousarray(dense), scenario.field).min() > 0
     return Result(success and bool(clear), cost, seconds)
 
@@ -292,8 +307,8 @@ def _solve(
 
 
 def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.ndarray) -> Solution:
-    intervals, cost, robot = len(times) - 1, scenario.cost, scenario.robot
-    h = scenario.horizon / intervals
+    intervals, cost, robot = len(times) - 1, scenario.cost, _unicycle(scenario)
+    h = _horizon(scenario) / intervals
     opti = casadi.Opti()
     q, u = opti.variable(3, intervals + 1), opti.variable(2, intervals + 1)
     v, w = u[0, :], u[1, :]
@@ -303,8 +318,7 @@ def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.
     proximity = 0
     for d in (q[0, :] - x_min, x_max - q[0, :], q[1, :] - y_min, y_max - q[1, :]):
         proximity += casadi.exp(-(d - robot.radius) / cost.proximity_scale)
-    for obstacle in scenario.obstacles:
-        (cx, cy), r = obstacle.circle.center, obstacle.circle.radius
+    for cx, cy, r in _discs(scenario):
         d = casadi.sqrt((q[0, :] - cx) ** 2 + (q[1, :] - cy) ** 2 + 1e-6) - r - robot.radius
         proximity += casadi.exp(-d / cost.proximity_scale)
     running = (cost.speed_weight * v**2 + cost.turn_weight * w**2) / 2 + cost.proximity_weight * proximity
@@ -325,4 +339,4 @@ def _opti(scenario: Scenario, times: np.ndarray, states: np.ndarray, speeds: np.
     except RuntimeError:
         return states, np.inf, False, time.perf_counter() - start
     seconds = time.perf_counter() - start
-    return solution.value(q).T, float(solution.value(objective)), True, seconds
+    return np.asarray(solution.value(q)).T, float(solution.value(objective)), True, seconds

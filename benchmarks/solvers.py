@@ -19,11 +19,12 @@ from leapnav.envs import Scenario, sample_scenario
 from leapnav.experts import Trajectory, find_optimum, solve
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.solve import Method
 
 Run = Callable[[Scenario, Trajectory], Result]
 
 
-def leapnav_method(method: str) -> Run:
+def leapnav_method(method: Method) -> Run:
     def run(scenario: Scenario, path: Trajectory) -> Result:
         start = time.perf_counter()
         extremal = solve(scenario, method=method, guess=path)
@@ -60,7 +61,8 @@ def peers() -> dict[str, Run]:
 
 def compare(count: int) -> None:
     scenarios = [sample_scenario("clutter", seed=seed) for seed in range(500, 500 + count)]
-    own = {name: leapnav_method(name) for name in ("multiple_shooting", "leapfrog", "collocation", "single_shooting")}
+    names: tuple[Method, ...] = "multiple_shooting", "leapfrog", "collocation", "single_shooting"
+    own = {name: leapnav_method(name) for name in names}
     methods = own | peers()
     paths = []
     for scenario in scenarios:

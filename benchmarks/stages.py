@@ -10,7 +10,6 @@ only, and that its cost is the same.
 import argparse
 import statistics
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
@@ -35,7 +34,7 @@ ROBOTS = ("differential_drive", "car", "dynamic_unicycle")
 COST_TOLERANCE = 1e-8  # relative; at vertices of polygons, costs are accurate to about 1e-9
 
 
-def timed(function: Callable[..., Any], seconds: Counter[str], stage: str) -> Callable[..., Any]:
+def timed(function: Callable[..., Any], seconds: dict[str, float], stage: str) -> Callable[..., Any]:
     def wrapped(*arguments: Any, **options: Any) -> Any:
         start = time.perf_counter()
         try:
@@ -48,7 +47,7 @@ def timed(function: Callable[..., Any], seconds: Counter[str], stage: str) -> Ca
 
 def measure(scenarios: list[Scenario]) -> tuple[dict[str, float], list[float], list[float]]:
     """Return the mean time (ms) of each stage, and the times (ms) of the search and of that for the best path only."""
-    seconds: Counter[str] = Counter()
+    seconds = dict.fromkeys(STAGES, 0.0)
     whole, best = [], []
     find_optimum(scenarios[0])  # loads the kernels
     for scenario in scenarios:

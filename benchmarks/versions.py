@@ -15,9 +15,12 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
+
+Method = Literal["multiple_shooting", "leapfrog", "collocation", "single_shooting"]
+Feedback = Literal["resolve", "gains"]
 
 ENV_ID = "leapnav/Navigate-v0"
 FAMILIES = ("open", "clutter", "polygons", "rooms", "slalom")
@@ -32,7 +35,8 @@ ENVIRONMENTS: dict[str, tuple[int | None, dict[str, Any]]] = {
     "single, 32 lidar beams": (None, {}),
     "single, 32 lidar beams, motors": (None, {"actuation": "motor"}),
 }
-METHODS = ("multiple_shooting", "leapfrog", "collocation", "single_shooting")
+METHODS: tuple[Method, ...] = get_args(Method)
+LAWS: tuple[Feedback, ...] = get_args(Feedback)
 N_SCENARIOS, N_STEPS = 30, 40
 
 Work = Callable[[], list[float]]  # returns costs, to be compared between the versions
@@ -99,7 +103,7 @@ def dense_optimum(shape: str) -> Work:
     return lambda: [find_optimum(scenario).cost]
 
 
-def solutions(method: str) -> Work:
+def solutions(method: Method) -> Work:
     """Extremals of clutter scenarios with one method, from the states of the bank's optimum."""
     from leapnav.envs import ScenarioBank
     from leapnav.experts import OptimalControlProblem, solve
@@ -109,12 +113,13 @@ def solutions(method: str) -> Work:
     for index in range(6 if method == "single_shooting" else N_SCENARIOS):
         problem = OptimalControlProblem.from_scenario(bank[index])
         states = np.array(bank.reference(index).states, dtype=float)
+        assert problem.horizon is not None
         guess = type(problem.straight_line())(np.linspace(0.0, problem.horizon, len(states)), states)
         tasks.append((problem, guess))
     return lambda: [solve(problem, method=method, guess=guess).cost for problem, guess in tasks]
 
 
-def feedback(family: str, law: str) -> Work:
+def feedback(family: str, law: Feedback) -> Work:
     """The expert's actions in three episodes, without the first action of each, which finds the optimum."""
     from leapnav.envs import NavigateEnv
     from leapnav.experts import ExpertPolicy
@@ -143,7 +148,7 @@ def rows() -> dict[str, Callable[[], Work]]:
         **{
             f"expert's episodes, {family}, {law}": lambda family=family, law=law: feedback(family, law)
             for family in ("clutter", "rooms")
-            for law in ("resolve", "gains")
+            for law in LAWS
         },
     }
 

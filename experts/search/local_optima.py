@@ -31,7 +31,15 @@ from leapnav.experts.search.lifting import Lifting
 from leapnav.experts.solvers.multiple_shooting import confirm, polish_in_stages
 from leapnav.experts.solvers.nodes import SolverOptions
 from leapnav.experts.transcription.adaptive import INTERVALS_PER_SEGMENT, settled_attempts
-from leapnav.experts.transcription.direct import MAX_VIOLATION, RELAXED_DISTANCE, DirectPath, discretise, optimise
+from leapnav.experts.transcription.descent import KnownPaths
+from leapnav.experts.transcription.direct import (
+    MAX_VIOLATION,
+    NO_PATHS,
+    RELAXED_DISTANCE,
+    DirectPath,
+    discretise,
+    optimise,
+)
 
 TOLERANCE = 1e-9
 # Newton steps of a candidate, and of a manoeuvre, whose Hamiltonian changes abruptly at contacts.
@@ -150,6 +158,7 @@ class LocalOptima:
         self._wound: dict[tuple[float | None, ...], OptimalControlProblem] = {}  # by the goal
         self._found: list[tuple[Extremal, np.ndarray]] = []  # the distinct extremals, with their shapes
         self._seen = np.empty((0, len(COMPARED_FRACTIONS), 3))
+        self._relaxed = self._seen  # the paths with the relaxed barrier
         self._lowest_settled = math.inf  # lowest cost of a path that was retried on adaptive meshes
 
     @property
@@ -192,7 +201,9 @@ class LocalOptima:
             lifted = self._lift(path)
             if lifted is not None:
                 problem, relaxed = self._relax(lifted)
-                if self._clearance(relaxed) < -COLLISION_DEPTH * self._radius:
+                if relaxed.known:
+                    self.verdicts.append(Verdict(Outcome.DUPLICATE, problem, relaxed))
+                elif self._clearance(relaxed) < -COLLISION_DEPTH * self._radius:
                     self.verdicts.append(Verdict(Outcome.COLLISION, problem, relaxed))
                 else:
                     found.append((problem, self._tighten(problem, relaxed)))
@@ -208,7 +219,11 @@ class LocalOptima:
     def _relax(self, path: Trajectory) -> tuple[OptimalControlProblem, DirectPath]:
         """Return the direct path of a path with the relaxed barrier, with its problem."""
         problem = self._with_winding(path.states)
-        return problem, self._optimise(problem, discretise(problem, path), RELAXED_DISTANCE)
+        known = KnownPaths(self._relaxed, self._duplicate_distance)
+        relaxed = self._optimise(problem, discretise(problem, path), RELAXED_DISTANCE, known)
+        if relaxed.converged:
+            self._relaxed = np.concatenate([self._relaxed, _shape(relaxed.times, relaxed.states)[None]])
+        return problem, relaxed
 
     def _with_winding(self, states: np.ndarray) -> OptimalControlProblem:
         """Return the problem with the winding of a path."""
@@ -288,12 +303,16 @@ class LocalOptima:
         return self._optimise(problem, self._clear(problem, refined))
 
     def _optimise(
-        self, problem: OptimalControlProblem, guess: DirectPath, relaxed_distance: float | None = None
+        self,
+        problem: OptimalControlProblem,
+        guess: DirectPath,
+        relaxed_distance: float | None = None,
+        known: KnownPaths = NO_PATHS,
     ) -> DirectPath:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
         weight = None if relaxed_distance is None else self._relaxed_weight
-        path = optimise(problem, guess, relaxed_weight=weight, relaxed_distance=relaxed_distance)
-        if problem.horizon is None:
+        path = optimise(problem, guess, relaxed_weight=weight, relaxed_distance=relaxed_distance, known=known)
+        if problem.horizon is None and not path.known:
             for _ in range(MAX_LENGTHENED):
                 # Otherwise more time would not help: the path is feasible, or the descent is slow.
                 if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):

@@ -23,36 +23,20 @@ BUCKETS, BUCKETS_PER_COST = 4096, 2000
 MAX_BUCKET_INDEX = 1e15  # before the conversion to an integer: costs deep in an obstacle may reach 1e40
 
 
-@kernel(int64(INDICES, LINKS, int64))
-def dequeue(bucket, links, node):
-    """Remove a node from its bucket; return 1, or 0 if it is in none."""
-    index = links[node, 2]
-    if index < 0:
-        return 0
-    before, after = links[node, 0], links[node, 1]
-    if before >= 0:
-        links[before, 1] = after
-    else:
-        bucket[index] = after
-    if after >= 0:
-        links[after, 0] = before
-    links[node, 2] = -1
-    return 1
+# The queue. Each bucket is a list: `bucket` has the index of its first entry, an entry the node and the index of the
+# next one; -1 is the end. A node whose cost decreases is queued again, so that the list of an earlier entry does not
+# change; that entry is ignored, because the node is not open any more when it is reached.
+@kernel(NOTHING(INDICES, LINKS, int64, int64, int64))
+def enqueue(bucket, entries, entry, node, index):
+    """Put a node into a bucket, as a new entry."""
+    entries[entry, 0], entries[entry, 1] = node, bucket[index]
+    bucket[index] = entry
 
 
-@kernel(int64(INDICES, LINKS, int64, int64))
-def enqueue(bucket, links, node, index):
-    """Move a node into a bucket; return the number of nodes by which the queue grew, 0 or 1.
-
-    The rows of `links` (nodes, 3) are the previous and the next node in the bucket's list, and the bucket; -1 for none.
-    """
-    grown = 1 - dequeue(bucket, links, node)
-    head = bucket[index]
-    links[node, 0], links[node, 1], links[node, 2] = -1, head, index
-    if head >= 0:
-        links[head, 0] = node
-    bucket[index] = node
-    return grown
+@kernel(LINKS(LINKS, int64))
+def with_room(entries, count):
+    """Return the entries of a queue, of which `count` are needed, in a larger array if necessary."""
+    return entries if count <= len(entries) else np.concatenate((entries, np.empty_like(entries)))
 
 
 class Metric(NamedTuple):
@@ -142,29 +126,37 @@ def plane_costs(metric, seeds):
     for k in range(len(flat)):
         min_speed = min(min_speed, flat[k])
     width = 3.0 * min_speed * length[0]  # half of the cheapest edge
-    bucket = np.full(BUCKETS, -1, dtype=np.int32)
-    links = np.full((size, 3), -1, dtype=np.int32)
-    current, waiting = 0, 0
+    bucket, is_open = np.full(BUCKETS, -1, dtype=np.int32), np.zeros(size, dtype=np.bool_)
+    entries = np.empty((max(2 * size, len(seeds.nodes)), 2), dtype=np.int32)
+    current, visited, queued = 0, 0, 0
     for k in range(len(seeds.nodes)):
         node = seeds.nodes[k]
         if seeds.costs[k] < cost[node]:
-            cost[node] = seeds.costs[k]
-            waiting += enqueue(bucket, links, node, int(min(seeds.costs[k] / width, BUCKETS - 1.0)))
-    while waiting > 0:
-        node = bucket[current % BUCKETS]
-        if node < 0:
+            cost[node], is_open[node] = seeds.costs[k], True
+            enqueue(bucket, entries, queued, node, int(min(seeds.costs[k] / width, BUCKETS - 1.0)))
+            queued += 1
+    while visited < queued:
+        entry = bucket[current % BUCKETS]
+        if entry < 0:
             current += 1
             continue
-        waiting -= dequeue(bucket, links, node)
+        node, bucket[current % BUCKETS] = entries[entry, 0], entries[entry, 1]
+        visited += 1
+        if not is_open[node]:
+            continue
+        is_open[node] = False
+        entries = with_room(entries, queued + HEADINGS)
         here = 2 * (node // lines) * stride + 2 * (node % lines)
+        speed_here = flat[here]
         for k in range(HEADINGS):
             following = node + ahead[k]
-            edge = flat[here] + 4.0 * flat[here + middle[k]] + flat[here + 2 * middle[k]]
+            edge = speed_here + 4.0 * flat[here + middle[k]] + flat[here + 2 * middle[k]]
             total = cost[node] + length[k] * edge
             if total < cost[following]:
-                cost[following] = total
+                cost[following], is_open[following] = total, True
                 index = min(max(int(min(total / width, MAX_BUCKET_INDEX)), current), current + BUCKETS - 1)
-                waiting += enqueue(bucket, links, following, index % BUCKETS)
+                enqueue(bucket, entries, queued, following, index % BUCKETS)
+                queued += 1
     return cost
 
 
@@ -245,23 +237,28 @@ def tree(metric, seeds, ends, rest, exact, limits):
         return cost, parent, limit
     # The order within a bucket is arbitrary: a node whose cost decreases later is queued again.
     width = max(first, slack) / BUCKETS_PER_COST
-    bucket = np.full(BUCKETS, -1, dtype=np.int32)
-    links = np.full((size, 3), -1, dtype=np.int32)
-    current, waiting = 0, 0
+    bucket, is_open = np.full(BUCKETS, -1, dtype=np.int32), np.zeros(size, dtype=np.bool_)
+    entries = np.empty((max(2 * size, len(seeds.nodes)), 2), dtype=np.int32)
+    current, visited, queued = 0, 0, 0
     for k in range(len(seeds.nodes)):
         node = seeds.nodes[k]
         bound = seeds.costs[k] + (rest[node] if exact else rest[node // HEADINGS])
         # `rest` is infinite for a seed without a path to the ends, and so is the limit while it is unknown.
         if seeds.costs[k] < cost[node] and bound <= limit and bound < np.inf:
-            cost[node] = seeds.costs[k]
-            waiting += enqueue(bucket, links, node, int(min((bound - first) / width, BUCKETS - 1.0)))
+            cost[node], is_open[node] = seeds.costs[k], True
+            enqueue(bucket, entries, queued, node, int(min((bound - first) / width, BUCKETS - 1.0)))
+            queued += 1
     best = np.inf
-    while waiting > 0:
-        node = bucket[current % BUCKETS]
-        if node < 0:
+    while visited < queued:
+        entry = bucket[current % BUCKETS]
+        if entry < 0:
             current += 1
             continue
-        waiting -= dequeue(bucket, links, node)
+        node, bucket[current % BUCKETS] = entries[entry, 0], entries[entry, 1]
+        visited += 1
+        if not is_open[node]:
+            continue
+        is_open[node] = False
         key = cost[node]
         k = node % HEADINGS
         position = node // HEADINGS
@@ -270,13 +267,15 @@ def tree(metric, seeds, ends, rest, exact, limits):
         if key + arrival[node] < best:
             best = key + arrival[node]
             limit = min(limit, reach * best + slack)
+        entries = with_room(entries, queued + count)
         here = 2 * (position // lines) * stride + 2 * (position % lines)
+        speed_here = flat[here]
         for move in range(count):
             following = node + ahead[k, move]
             if straight:  # saves a quarter of the time
                 between = middle[k, move, 0]
                 total = key + straight_length[k, move] * (
-                    flat[here] + 4.0 * flat[here + between] + flat[here + 2 * between]
+                    speed_here + 4.0 * flat[here + between] + flat[here + 2 * between]
                 )
             else:
                 total = key
@@ -286,14 +285,14 @@ def tree(metric, seeds, ends, rest, exact, limits):
             if total < cost[following]:
                 bound = total + (rest[following] if exact else rest[position + cells[k, move]])
                 if bound <= limit and bound < np.inf:
-                    cost[following] = total
-                    parent[following] = node
+                    cost[following], parent[following], is_open[following] = total, node, True
                     # A node beyond the last bucket is put into the last bucket: it may be visited early, and is queued
                     # again if its cost decreases later.
                     index = min(
                         max(int(min((bound - first) / width, MAX_BUCKET_INDEX)), current), current + BUCKETS - 1
                     )
-                    waiting += enqueue(bucket, links, following, index % BUCKETS)
+                    enqueue(bucket, entries, queued, following, index % BUCKETS)
+                    queued += 1
     return cost, parent, limit
 
 

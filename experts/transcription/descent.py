@@ -9,7 +9,8 @@ from numba import boolean, float64, int64
 
 from leapnav.envs.kernels import kernel, record_type
 from leapnav.envs.kernels.internals import part_of
-from leapnav.envs.kernels.types import MATRIX, VECTOR, tuple_of
+from leapnav.envs.kernels.types import CUBE, MATRIX, VECTOR, tuple_of
+from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.transcription.discrete_problem import (
     DISCRETE_PROBLEM,
     EVALUATION,
@@ -38,6 +39,23 @@ END_PENALTY, PENALTY = 1e4, 10.0
 # 1e7, a first version of the adaptive descents solved 4 of 7 tight parking tasks, with these values 6.
 MAX_STEP_LENGTHS = 10
 MAX_ACTIVE_SETS = 8  # iterations per step that determine the controls at their limits
+CONVERGED, NOT_CONVERGED, KNOWN = 0, 1, 2  # exit codes
+
+
+class KnownPaths(NamedTuple):
+    """Local optima near which a descent ends.
+
+    Attributes:
+        points: (K, P, 3), x, y (m) and heading (rad) of K paths at equal fractions of the horizon.
+        distance: distance (m and rad) within which a path is close to a known one at all points.
+
+    """
+
+    points: np.ndarray
+    distance: float
+
+
+KNOWN_PATHS = record_type(KnownPaths, points=CUBE, distance=float64)
 
 
 class _Step(NamedTuple):
@@ -145,17 +163,39 @@ def _take_step(problem, path, found, model, step, damping, follows, moved):
     return True
 
 
-@kernel(tuple_of(boolean, float64, float64)(DISCRETE_PROBLEM, BACKWARD_FUNCTION, PATH, float64, int64, boolean))
-def descend(problem, backward, path, tolerance, max_iterations, alternates):
+@kernel(boolean(KNOWN_PATHS, VECTOR, MATRIX))
+def _is_known(known, times, q):
+    """Return whether a path with states q at the times is close to a known path."""
+    count, size, columns = known.points.shape
+    if count == 0:
+        return False
+    points = interpolate(np.linspace(0.0, times[-1], size), times, q)
+    for path in range(count):
+        is_close = True
+        for k in range(size):
+            for i in range(columns):
+                is_close = is_close and abs(points[k, i] - known.points[path, k, i]) < known.distance
+            if not is_close:
+                break
+        if is_close:
+            return True
+    return False
+
+
+@kernel(
+    tuple_of(int64, float64, float64)(DISCRETE_PROBLEM, BACKWARD_FUNCTION, PATH, float64, int64, boolean, KNOWN_PATHS)
+)
+def descend(problem, backward, path, tolerance, max_iterations, alternates, known):
     """Apply sequential quadratic programming to a path, in place; without costates, they are zero.
 
     Linear steps are tried after those along the dynamics: at each length if it `alternates`, otherwise after all.
 
-    Returns (converged, cost times the unit, sum of the constraint violations).
+    Returns (exit code, cost times the unit, sum of the constraint violations).
     """
     intervals, m = path.u.shape
     n = path.q.shape[1]
-    horizon = problem.h.sum()
+    times = np.append(np.zeros(1), np.cumsum(problem.h))
+    horizon = times[-1]
     first_shift, max_shift = FIRST_SHIFT / horizon**2, MAX_SHIFT / horizon**2
     expansion, model = empty_expansion(intervals, n, m), empty_model(intervals, n, m)
     step = _Step(np.zeros((intervals + 1, n)), np.zeros((intervals, m)), np.zeros((intervals + 1, n)), np.zeros(n))
@@ -184,7 +224,7 @@ def descend(problem, backward, path, tolerance, max_iterations, alternates):
             ):
                 shift = max(4.0 * shift, first_shift)
                 if not shift <= max_shift:
-                    return False, current, violations(problem, path, found, step.multipliers, step.nu)[0]
+                    return NOT_CONVERGED, current, violations(problem, path, found, step.multipliers, step.nu)[0]
             largest = _forward(problem, expansion, model, step)
             if not _update_active_set(problem, path, expansion, step):
                 break
@@ -204,7 +244,7 @@ def descend(problem, backward, path, tolerance, max_iterations, alternates):
         if not descends:
             shift = max(8.0 * shift, first_shift)
             if shift > max_shift:
-                return False, current, violation
+                return NOT_CONVERGED, current, violation
             continue
         current, violation = cost, left
         found, tried = tried, found
@@ -214,10 +254,12 @@ def descend(problem, backward, path, tolerance, max_iterations, alternates):
             for i in range(n):
                 path.costates[k, i] += fraction * (step.multipliers[k, i] - path.costates[k, i])
         if damping == 1.0 and largest < tolerance and shift <= first_shift:
-            return True, current, violation
+            return CONVERGED, current, violation
+        if _is_known(known, times, path.q):
+            return KNOWN, current, violation
         is_cold_start = False
         if damping == 1.0:
             shift = 0.25 * shift if shift > 0.01 * first_shift else 0.0
         elif damping < 0.3:
             shift = max(4.0 * shift, first_shift)
-    return False, current, violation
+    return NOT_CONVERGED, current, violation

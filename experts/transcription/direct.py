@@ -30,7 +30,7 @@ from leapnav.experts.numerics.shooting import hamiltonians
 from leapnav.experts.numerics.time_scaling import time_factor
 from leapnav.experts.problem.dynamics import controls_along
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
-from leapnav.experts.transcription.descent import descend
+from leapnav.experts.transcription.descent import CONVERGED, KNOWN, KnownPaths, descend
 from leapnav.experts.transcription.discrete_problem import DiscreteProblem, Path
 from leapnav.experts.transcription.riccati import recursion
 
@@ -45,6 +45,7 @@ MIN_TIME_FACTOR = 0.8  # smallest factor by which a free horizon changes at once
 # 72 of 72 candidates among the walls of `slalom` led to an extremal, and 6 without relaxation; 1.0 gave the same.
 RELAXED_DISTANCE = 0.5
 MAX_VIOLATION = 1e-3  # sum of the constraint violations of a path that is feasible
+NO_PATHS = KnownPaths(np.empty((0, 0, 3)), 0.0)
 STEP_TOLERANCE = 1e-3  # m and rad, less on short paths; the iteration has converged when a full step is smaller
 
 
@@ -60,6 +61,7 @@ class DirectPath:
         cost: J of the discretised problem.
         violation: sum of the constraint violations.
         converged: whether the iteration converged.
+        known: whether it ended because the path is close to a known one.
 
     """
 
@@ -70,6 +72,7 @@ class DirectPath:
     cost: float
     violation: float
     converged: bool
+    known: bool = False
 
     def refined(self, pieces: np.ndarray | int = 2) -> DirectPath:
         """Return the path with intervals divided, as an initial guess of the finer discretisation.
@@ -155,6 +158,7 @@ def optimise(
     max_iterations: int = MAX_ITERATIONS,
     relaxed_weight: float | None = None,
     relaxed_distance: float | None = None,
+    known: KnownPaths = NO_PATHS,
 ) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
 
@@ -167,6 +171,7 @@ def optimise(
             of the obstacles; None for the barrier of the problem.
         relaxed_distance: distance (proximity scales) below which the relaxed barrier is a quadratic polynomial; by
             default RELAXED_DISTANCE.
+        known: known local optima; the iteration ends when the path is close to one of them.
 
     """
     max_iterations *= min(max(1, len(guess.controls) // INTERVALS_PER_LIMIT), MAX_LIMITS)
@@ -195,6 +200,6 @@ def optimise(
     path = Path(states, controls, costates, np.zeros(controls.shape, dtype=np.int8))
     # Close to obstacles, a path that is consistent on other intervals may be in contact when it follows the dynamics.
     alternates = problem.field is not None
-    converged, cost, violation = descend(task, backward, path, tolerance, max_iterations, alternates)
+    code, cost, violation = descend(task, backward, path, tolerance, max_iterations, alternates, known)
     costates, cost = costates * unit, cost * unit
-    return DirectPath(guess.times, states, controls, costates, cost, violation, converged)
+    return DirectPath(guess.times, states, controls, costates, cost, violation, code == CONVERGED, code == KNOWN)
