@@ -10,12 +10,12 @@ from leapnav.envs.robots import RobotModel, Unicycle
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.problem.dynamics import least_squares_controls
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
+from leapnav.experts.search.path_class import SeenPaths, shape_of
 from leapnav.experts.transcription.direct import discretise, optimise
 
 MAX_LIMIT = 1e3  # m/s or rad/s, for robots without a limit of the speed or the turn rate
 # Two paths of the kinematic robot are duplicates if they stay within this distance of each other (m, and rad).
 DUPLICATE_DISTANCE = 0.05
-COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 33)  # of the horizon
 
 
 class Lifting:
@@ -34,7 +34,7 @@ class Lifting:
     def __init__(self, scenario: Scenario, problem: OptimalControlProblem, relaxed_weight: float) -> None:
         self._scenario, self._problem, self._relaxed_weight = scenario, problem, relaxed_weight
         self._companion: OptimalControlProblem | None = None
-        self._seen: list[np.ndarray] = []
+        self._seen = SeenPaths(DUPLICATE_DISTANCE)
         if not scenario.robot.is_kinematic:
             self._kinematic = scenario.robot.kinematic() or _unicycle(scenario.robot)
             update = {"robot": self._kinematic, "start_motion": None, "goal_motion": None}
@@ -59,12 +59,13 @@ class Lifting:
             lifted = self._kinematic.lift(path.times, path.states, self._companion.start)
             lifted = self._timed(path if lifted is None else Trajectory(path.times, lifted))
             companion = self._companion.with_winding_of(lifted.states)
-            direct = optimise(companion, discretise(companion, lifted), relaxed_weight=self._relaxed_weight)
-            path = Trajectory(direct.times, direct.states[:, :3])
-            shape = path.resample(COMPARED_FRACTIONS * path.times[-1]).states
-            if any(np.abs(shape - other).max() < DUPLICATE_DISTANCE for other in self._seen):
+            guess = discretise(companion, lifted)
+            direct = optimise(companion, guess, relaxed_weight=self._relaxed_weight, known=self._seen.known)
+            shape = shape_of(direct.times, direct.states)
+            if self._seen.contain(shape):
                 return None
-            self._seen.append(shape)
+            self._seen.add(shape)
+            path = Trajectory(direct.times, direct.states[:, :3])
         if len(self._scenario.robot.state_names) == 3:
             return path
         start = self._scenario.start_state

@@ -23,23 +23,16 @@ from leapnav.envs.field.clearance import footprint_clearances, path_clearance
 from leapnav.envs.robots import Box
 from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.hard_limits import LARGEST_REDUCTION, SEARCH_WEIGHT, expected_limit, softened, without_barrier
-from leapnav.experts.numerics.interpolation import interpolate
 from leapnav.experts.problem.certificate import certify
 from leapnav.experts.problem.extremal import Extremal, Iteration, Status
 from leapnav.experts.problem.problem import OptimalControlProblem, Trajectory
 from leapnav.experts.search.lifting import Lifting
+from leapnav.experts.search.path_class import SeenPaths, shape_of
 from leapnav.experts.solvers.multiple_shooting import confirm, polish_in_stages
 from leapnav.experts.solvers.nodes import SolverOptions
 from leapnav.experts.transcription.adaptive import INTERVALS_PER_SEGMENT, settled_attempts
 from leapnav.experts.transcription.descent import KnownPaths
-from leapnav.experts.transcription.direct import (
-    MAX_VIOLATION,
-    NO_PATHS,
-    RELAXED_DISTANCE,
-    DirectPath,
-    discretise,
-    optimise,
-)
+from leapnav.experts.transcription.direct import MAX_VIOLATION, RELAXED_DISTANCE, DirectPath, discretise, optimise
 
 TOLERANCE = 1e-9
 # Newton steps of a candidate, and of a manoeuvre, whose Hamiltonian changes abruptly at contacts.
@@ -75,7 +68,6 @@ RESOLUTION, MAX_PIECES = 0.25, 64
 # Factor of the proximity scale in this for a rectangle, whose corners turn the direction of the distance abruptly. With
 # 1, a rectangle does not pass a gap that is 4 % wider; with 0.05, the search there takes three times as long.
 CORNER_RESOLUTION = 0.2
-COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 65)  # of the horizon, at which paths are compared
 
 
 class Outcome(Enum):
@@ -152,13 +144,11 @@ class LocalOptima:
         self._scale = scenario.cost.proximity_scale * (CORNER_RESOLUTION if has_corners else 1.0) / sharpness
         self._lift = Lifting(scenario, self.problem, self._relaxed_weight)
         self._bounds = scenario.robot.control_bounds()
-        self._duplicate_distance = DUPLICATE_DISTANCE * min(
-            1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE
-        )
         self._wound: dict[tuple[float | None, ...], OptimalControlProblem] = {}  # by the goal
         self._found: list[tuple[Extremal, np.ndarray]] = []  # the distinct extremals, with their shapes
-        self._seen = np.empty((0, len(COMPARED_FRACTIONS), 3))
-        self._relaxed = self._seen  # the paths with the relaxed barrier
+        distance = DUPLICATE_DISTANCE * min(1.0, math.dist(scenario.start[:2], scenario.goal[:2]) / SHORT_DISTANCE)
+        self._seen = SeenPaths(distance)
+        self._relaxed = SeenPaths(distance)  # those with the relaxed barrier
         self._lowest_settled = math.inf  # lowest cost of a path that was retried on adaptive meshes
 
     @property
@@ -219,10 +209,11 @@ class LocalOptima:
     def _relax(self, path: Trajectory) -> tuple[OptimalControlProblem, DirectPath]:
         """Return the direct path of a path with the relaxed barrier, with its problem."""
         problem = self._with_winding(path.states)
-        known = KnownPaths(self._relaxed, self._duplicate_distance)
+        # With a free horizon, paths of the same shape may differ in their durations.
+        known = None if problem.horizon is None else self._relaxed.known
         relaxed = self._optimise(problem, discretise(problem, path), RELAXED_DISTANCE, known)
         if relaxed.converged:
-            self._relaxed = np.concatenate([self._relaxed, _shape(relaxed.times, relaxed.states)[None]])
+            self._relaxed.add(shape_of(relaxed.times, relaxed.states))
         return problem, relaxed
 
     def _with_winding(self, states: np.ndarray) -> OptimalControlProblem:
@@ -307,12 +298,12 @@ class LocalOptima:
         problem: OptimalControlProblem,
         guess: DirectPath,
         relaxed_distance: float | None = None,
-        known: KnownPaths = NO_PATHS,
+        known: KnownPaths | None = None,
     ) -> DirectPath:
         """Return the local optimum of the discretised problem; a free horizon is lengthened if the limits need it."""
         weight = None if relaxed_distance is None else self._relaxed_weight
         path = optimise(problem, guess, relaxed_weight=weight, relaxed_distance=relaxed_distance, known=known)
-        if problem.horizon is None and not path.known:
+        if problem.horizon is None:
             for _ in range(MAX_LENGTHENED):
                 # Otherwise more time would not help: the path is feasible, or the descent is slow.
                 if (path.converged and path.violation < MAX_VIOLATION) or not self._is_limited(path):
@@ -328,16 +319,16 @@ class LocalOptima:
 
     def _judge(self, problem: OptimalControlProblem, direct: DirectPath) -> Verdict:
         """Compute the extremal of a direct path, unless the path is a duplicate or unlikely to lead to a useful one."""
-        shape = _shape(direct.times, direct.states)
-        if self._is_seen(shape):
+        shape = shape_of(direct.times, direct.states)
+        if self._seen.contain(shape):
             return Verdict(Outcome.DUPLICATE, problem, direct)
         if self._is_discarded(direct, DIRECT_ERROR):
             return Verdict(Outcome.EXPENSIVE, problem, direct)
         # Where the cost is flat, duplicates of an optimum are recognised only after refinement.
         refined = self.refine(problem, direct)
-        refined_shape = _shape(refined.times, refined.states)
-        is_duplicate = self._is_seen(refined_shape)
-        self._seen = np.concatenate([self._seen, [shape, refined_shape]])
+        refined_shape = shape_of(refined.times, refined.states)
+        is_duplicate = self._seen.contain(refined_shape)
+        self._seen.add(shape, refined_shape)
         if is_duplicate:
             return Verdict(Outcome.DUPLICATE, problem, refined)
         if self._is_discarded(refined, REFINED_ERROR):
@@ -370,11 +361,11 @@ class LocalOptima:
         """Return the end of a path with its extremal."""
         if extremal is None:
             return Verdict(Outcome.STALLED, problem, path)
-        shape = _shape(extremal.times, extremal.states)
+        shape = shape_of(extremal.times, extremal.states)
         if self._is_known(extremal, shape):
             return Verdict(Outcome.DUPLICATE, problem, path, extremal)
         self._found.append((extremal, shape))
-        self._seen = np.concatenate([self._seen, shape[None]])
+        self._seen.add(shape)
         if not extremal.success:
             return Verdict(Outcome.REFUSED, problem, path, extremal)
         return Verdict(Outcome.CERTIFIED, problem, path, extremal, expected_limit(without_barrier(extremal)))
@@ -394,7 +385,7 @@ class LocalOptima:
         total, refused = 0, None
         for segments, direct in attempts:
             for extremal, shape in known:
-                if self._is_close(_shape(direct.times, direct.states), shape):
+                if self._seen.are_close(shape_of(direct.times, direct.states), shape):
                     return extremal, total
             times, nodes = direct.nodes(problem, segments)
             status, rows, evaluations = polish_in_stages(problem, times, nodes, TOLERANCE, max_iterations)
@@ -440,20 +431,13 @@ class LocalOptima:
             cost -= LARGEST_REDUCTION * barrier
         return cost > (1 + error) * best
 
-    def _is_seen(self, shape: np.ndarray) -> bool:
-        """Return whether a path, given by its `_shape`, is a duplicate of an earlier one."""
-        return bool((np.abs(self._seen - shape).max(axis=(1, 2)) < self._duplicate_distance).any())
-
     def _is_known(self, extremal: Extremal, shape: np.ndarray) -> bool:
         """Return whether an extremal is a duplicate of an earlier one."""
         for other, other_shape in self._found:
             is_same_cost = abs(extremal.cost - other.cost) <= DUPLICATE_COST_TOLERANCE * abs(other.cost)
-            if is_same_cost and self._is_close(shape, other_shape):
+            if is_same_cost and self._seen.are_close(shape, other_shape):
                 return True
         return False
-
-    def _is_close(self, shape: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.abs(shape - other).max() < self._duplicate_distance)
 
 
 def _segments(path: DirectPath) -> int:
@@ -461,8 +445,3 @@ def _segments(path: DirectPath) -> int:
     intervals, is_long = len(path.controls), len(path.controls) > LONG_PATH * 2**REFINEMENTS_OF_LONG_PATH
     length = INTERVALS_PER_SEGMENT_OF_LONG_PATH if is_long else INTERVALS_PER_SEGMENT
     return max(round(intervals / length), MIN_SEGMENTS)
-
-
-def _shape(times: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Return the poses of a path at fixed fractions of the horizon, to compare it with others."""
-    return interpolate(COMPARED_FRACTIONS * times[-1], times, np.ascontiguousarray(states[:, :3]))

@@ -1,4 +1,4 @@
-"""Classification of paths: sides of the obstacles, driving modes and winding of the heading."""
+"""Comparison of paths: duplicates, sides of the obstacles, driving modes and winding of the heading."""
 
 from __future__ import annotations
 
@@ -8,11 +8,46 @@ from typing import Literal
 import numpy as np
 
 from leapnav.envs.field.packing import obstacle_centres
+from leapnav.experts.numerics.interpolation import interpolate
+from leapnav.experts.transcription.descent import KnownPaths
 
 Side = Literal["left", "right"]
 Mode = Literal["forward", "backward"]
 
 MIN_MODE_DISTANCE = 0.02  # m; shorter sections in one driving mode are ignored
+COMPARED_FRACTIONS = np.linspace(0.0, 1.0, 65)  # of the horizon, at which paths are compared
+
+
+def shape_of(times: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Return the poses (65, 3) of a path at fixed fractions of the horizon, to compare it with others."""
+    return interpolate(COMPARED_FRACTIONS * times[-1], times, np.ascontiguousarray(states[:, :3]))
+
+
+class SeenPaths:
+    """Paths that were found, each given by its `shape_of`, to recognise duplicates.
+
+    Args:
+        distance: distance (m, and rad for the heading) within which two paths are duplicates.
+
+    Attributes:
+        known: the paths as an argument of `optimise`.
+
+    """
+
+    def __init__(self, distance: float) -> None:
+        self.known = KnownPaths(np.empty((0, len(COMPARED_FRACTIONS), 3)), distance)
+
+    def add(self, *shapes: np.ndarray) -> None:
+        """Add paths."""
+        self.known = self.known._replace(points=np.concatenate([self.known.points, shapes]))
+
+    def contain(self, shape: np.ndarray) -> bool:
+        """Return whether a path is a duplicate of one of them."""
+        return bool((np.abs(self.known.points - shape).max(axis=(1, 2)) < self.known.distance).any())
+
+    def are_close(self, shape: np.ndarray, other: np.ndarray) -> bool:
+        """Return whether two paths are duplicates of each other."""
+        return bool(np.abs(shape - other).max() < self.known.distance)
 
 
 def path_sides(times: np.ndarray, positions: np.ndarray, field: np.ndarray) -> tuple[Side, ...]:

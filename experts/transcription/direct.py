@@ -158,7 +158,7 @@ def optimise(
     max_iterations: int = MAX_ITERATIONS,
     relaxed_weight: float | None = None,
     relaxed_distance: float | None = None,
-    known: KnownPaths = NO_PATHS,
+    known: KnownPaths | None = None,
 ) -> DirectPath:
     """Compute a local optimum of the discretised problem from a guess.
 
@@ -200,6 +200,6 @@ def optimise(
     path = Path(states, controls, costates, np.zeros(controls.shape, dtype=np.int8))
     # Close to obstacles, a path that is consistent on other intervals may be in contact when it follows the dynamics.
     alternates = problem.field is not None
-    code, cost, violation = descend(task, backward, path, tolerance, max_iterations, alternates, known)
+    code, cost, violation = descend(task, backward, path, tolerance, max_iterations, alternates, known or NO_PATHS)
     costates, cost = costates * unit, cost * unit
     return DirectPath(guess.times, states, controls, costates, cost, violation, code == CONVERGED, code == KNOWN)

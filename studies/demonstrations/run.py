@@ -17,7 +17,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from common import demonstrate, fresh_bank, load, play, read_arguments, score_tables, train
 
 HERE = Path(__file__).parent
-FAMILY, COUNTS, SCENARIOS = "clutter", (100, 300, 1000, 3000, 10000), 1000
+FAMILY, COUNTS, SCENARIOS = "clutter", (100, 300, 1000, 3000, 10_000, 30_000), 1000
 SEEDS, DEMONSTRATION_SEED, SEED_DISTANCE = 3, 61_000, 100_000  # distance: of the seeds of two directories
 NAMES = tuple(map(str, COUNTS))
 TABLES = {"demonstrations": "docs/results.md", "demonstrations-runs": "docs/results.md"}
