@@ -13,7 +13,7 @@ from leapnav.experts import ExpertPolicy
 
 Feedback = Literal["resolve", "gains"]
 
-EPISODES, ROBOTS, ROUNDS = 20, 256, 25
+EPISODES, TIMED_EPISODES, ROBOTS, ROUNDS = 10, 6, 256, 25
 SETTINGS = [
     ("ideal", {}),
     ("10 % actuation noise", {"disturbance": {"actuation": 0.1}}),
@@ -26,7 +26,7 @@ def measure_time(family: str, feedback: Feedback) -> tuple[float, float, float]:
     env = NavigateEnv(family, split="test", observation="state")
     expert = ExpertPolicy(env, feedback=feedback, workers=1)
     first, later = [], []
-    for index in range(12):
+    for index in range(TIMED_EPISODES):
         observation, _ = env.reset(seed=index, options={"index": index})
         terminated = False
         while not terminated:

@@ -25,7 +25,7 @@ from leapnav.experts.search.lattice import Lattice
 matplotlib.use("svg")
 import matplotlib.pyplot as plt
 
-ROUNDS = 7  # of each measurement, whose median is printed
+ROUNDS = 5  # of each measurement, whose median is printed
 OBSTACLES, HORIZONS, SEGMENTS = (8, 16, 32, 64, 128, 256, 512), (10, 20, 40, 80), (16, 32, 64, 128, 256)
 FIRST_DISCS = [(4.0, 4.5, 0.8), (6.0, 3.0, 0.5), (2.5, 6.0, 0.6), (7.0, 6.5, 0.5)]
 NEAR, SMALL_RADIUS = (0.6, 2.5), 0.1  # m: distances of small discs from the path, and their radius

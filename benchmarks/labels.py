@@ -68,7 +68,7 @@ def in_the_environment(env: NavigateEnv, scenario: Scenario) -> list[np.ndarray]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--episodes", type=int, default=30)
     parser.add_argument("--families", nargs="*", choices=FAMILIES, default=FAMILIES)
     arguments = parser.parse_args()
     table = Table(title="labels per second of one core")

@@ -90,10 +90,10 @@ def measure(name: str, cases: list[tuple[Scenario, Optimum]], gap: float, time_l
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=2, help="scenarios of each test bank")
-    parser.add_argument("--worlds", type=int, default=1, help="worlds with 250 discs")
+    parser.add_argument("--count", type=int, default=1, help="scenarios of each test bank")
+    parser.add_argument("--worlds", type=int, default=0, help="worlds with 250 discs")
     parser.add_argument("--gap", type=float, default=0.05, help="gap to prove; for the worlds twice as large")
-    parser.add_argument("--time-limit", type=float, default=60.0, help="seconds; for the worlds twice as long")
+    parser.add_argument("--time-limit", type=float, default=20.0, help="seconds; for the worlds twice as long")
     arguments = parser.parse_args()
     table = Table(title=f"gap {100 * arguments.gap:g} % in {arguments.time_limit:g} s: median, 90th percentile")
     for column in ("scenarios", "proved", "gap (%)", "proof (s)", "check / proof", "proof / second opinion"):

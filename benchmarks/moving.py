@@ -2,7 +2,7 @@
 
 The environments alternate in one process, so that other load affects both; the results are medians.
 
-python benchmarks/moving.py            # 1,024 robots with 20 discs each; 50 scenarios of each family
+python benchmarks/moving.py            # 1,024 robots with 20 discs each; 25 scenarios of each family
 """
 
 import statistics
@@ -15,7 +15,7 @@ from leapnav.envs.scenarios.layouts.moving import MOVING_LAYOUTS
 from leapnav.experts import find_optimum
 
 ROBOTS, DISCS, ROUNDS, STEPS = 1024, 20, 7, 60
-SCENARIOS, FIRST_SEED = 50, 500_000
+SCENARIOS, FIRST_SEED = 25, 500_000
 EFFORTS = "high", "medium"
 
 

@@ -167,14 +167,15 @@ def scaling(count: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=40, help="number of scenarios per family")
-    parser.add_argument("--bank", type=int, default=500, help="number of scenarios of the bank")
+    parser.add_argument("--count", type=int, default=5, help="number of scenarios per family")
+    parser.add_argument("--bank", type=int, default=100, help="number of scenarios of the bank")
     parser.add_argument(
-        "--dense", type=int, default=2, help="number of scenarios with hundreds of obstacles, per kind and arena size"
+        "--dense", type=int, default=0, help="number of scenarios with hundreds of obstacles, per kind and arena size"
     )
     arguments = parser.parse_args()
     compare(arguments.count)
-    compare_dense(arguments.dense)
+    if arguments.dense > 0:
+        compare_dense(arguments.dense)
     scaling(arguments.bank)
 
 

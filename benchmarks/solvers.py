@@ -118,7 +118,7 @@ def timed(run: Callable[[], object]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=40, help="number of clutter scenarios")
+    parser.add_argument("--count", type=int, default=10, help="number of clutter scenarios")
     compare(parser.parse_args().count)
 
 

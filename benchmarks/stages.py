@@ -68,7 +68,7 @@ def measure(scenarios: list[Scenario]) -> tuple[dict[str, float], list[float], l
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=30, help="scenarios per row")
+    parser.add_argument("--count", type=int, default=15, help="scenarios per row")
     count = parser.parse_args().count
     table = Table(title=f"Stages of find_optimum, {count} scenarios per row, one process (ms)")
     for column in ("family", "robot", *STAGES, "rest", "mean", "median", "effort=medium", "ratio"):

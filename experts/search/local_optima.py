@@ -2,8 +2,8 @@
 
 Each candidate path goes through the same steps, and ends in one `Verdict`:
 
-1. Direct transcription with a relaxed barrier, which moves a path that cuts into obstacles out of them; a path that
-   remains in an obstacle is given up.
+1. Direct transcription with a relaxed barrier, which moves a path that cuts into obstacles out of them. A path that
+   remains in an obstacle is given up, and one that comes close to an earlier one is a duplicate.
 2. Direct transcription with the barrier itself, and again on halved intervals. Duplicates of earlier paths, and paths
    that cost more than the best extremal, end here.
 3. Multiple shooting and its certificate.

@@ -6,6 +6,7 @@ from leapnav.envs import Scenario
 from leapnav.experts import OptimalControlProblem, Trajectory, find_optimum
 from leapnav.experts.search.candidates import CandidateSearch
 from leapnav.experts.search.lattice import Lattice
+from leapnav.experts.search.path_class import SeenPaths, shape_of
 from leapnav.experts.transcription.direct import DirectPath, discretise, optimise
 
 BEST_KNOWN = best_known()
@@ -111,6 +112,23 @@ def test_an_infeasible_problem_does_not_converge():
     guess = DirectPath(times, states, controls, np.zeros((33, 3)), np.inf, np.inf, False)
     direct = optimise(problem, guess)
     assert not direct.converged or direct.violation > 0.5
+
+
+def test_the_descent_ends_close_to_a_known_path_and_nowhere_else():
+    problem, path = first_candidate(BEST_KNOWN[0][0])
+    guess, seen, other = discretise(problem, path), SeenPaths(0.15), SeenPaths(0.15)
+    full = optimise(problem, guess)
+    shape = shape_of(full.times, full.states)
+    seen.add(shape + 0.3, shape)
+    other.add(shape + np.array([0.0, 0.0, 0.3]))
+    stopped = optimise(problem, guess, known=seen.known)
+    assert full.converged and not full.known
+    assert stopped.known and not stopped.converged
+    assert seen.contain(shape_of(stopped.times, stopped.states))
+    assert (stopped.states != full.states).any()
+    continued = optimise(problem, guess, known=other.known)
+    assert continued.converged and not continued.known
+    assert (continued.states == full.states).all()
 
 
 @pytest.mark.parametrize("robot", ["car", "dynamic_car", "trailer"])

@@ -14,10 +14,12 @@ from leapnav.experts.search.shortest_paths import (
     Limits,
     Metric,
     Nodes,
+    enqueue,
     meeting_nodes,
     path_through,
     plane_costs,
     tree,
+    with_room,
 )
 from leapnav.experts.transcription.direct import discretise, optimise
 
@@ -92,6 +94,19 @@ def trees(speed, reach, moves, layers=1):
     behind = tree(back, target, root, bound, False, Limits(reach, 0.5, np.inf))
     ahead = tree(metric, root, target, behind[0], True, Limits(reach, 0.5, behind[2]))
     return start, goal, bound, ahead, behind
+
+
+def test_the_queue_keeps_its_entries_when_it_grows():
+    bucket, entries = np.full(2, -1, dtype=np.int32), np.empty((2, 2), dtype=np.int32)
+    for entry, (node, index) in enumerate([(7, 0), (8, 1), (9, 0), (7, 0), (5, 0)]):
+        entries = with_room(entries, entry + 1)
+        enqueue(bucket, entries, entry, node, index)
+    assert len(entries) == 8
+    found, entry = [], bucket[0]
+    while entry >= 0:
+        found.append(entries[entry, 0])
+        entry = entries[entry, 1]
+    assert found == [5, 7, 9, 7]
 
 
 @pytest.mark.parametrize("layers", [1, HEADINGS])
