@@ -28,7 +28,10 @@ VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where not
 
 @kernel(tuple_of(*[float64] * 6)(MATRIX, int64, HEADER_TYPE), forceinline=True, fastmath={"contract", "reassoc"})
 def _sum_terms(terms, count, header):
-    """Sum the barriers of distances: (b, b_x, b_y, b_xx, b_xy, b_yy). The loop is vectorised.
+    """Sum the barriers of distances: (b, b_x, b_y, b_xx, b_xy, b_yy).
+
+    The loop is vectorised. The order of the sum depends on the width of the processor's vectors, so that the results of
+    two processors differ by rounding errors.
 
     Args:
         terms (4, BLOCK): distance (m), its gradient (2), and the curvature (1/m) of its level line, of `count` shapes.
