@@ -38,6 +38,9 @@ MAX_PARABOLA_MINIMUM = 0.7
 # fraction of its values at the neighbouring steps. A steep barrier or a small control weight make all values small: in
 # one extremal they were 4e-6 to 1e-5 over 0.5 s, without a zero.
 ZERO_SINGULAR_VALUE, ZERO_FRACTION = 1e-5, 0.1
+# Tolerances of the time of a minimum, relative to the two steps. At a zero, the coarse minimum is far below the values
+# at the neighbouring steps.
+COARSE, FINE = 1e-2, 1e-9
 DIVERGENCE = "the sensitivities diverge along the extremal"
 
 
@@ -141,14 +144,17 @@ def _first_rank_loss(
     """Return the first time, in the order of `times`, at which the upper block of the frame loses rank, or None."""
     for i in _dips(times, determinants, check_parabola):
         low, high = sorted((float(times[i - 1]), float(times[i + 1])))
-        found: Any = minimize_scalar(
-            lambda t: smallest_singular_value(frame(t), clock),
-            bounds=(low, high),
-            method="bounded",
-            options={"xatol": 1e-9 * (high - low)},
-        )
         around = max(smallest_singular_value(frame(t), clock) for t in (low, high))
-        if found.fun < min(ZERO_SINGULAR_VALUE, ZERO_FRACTION * around):
+        for tolerance, threshold in ((COARSE, ZERO_FRACTION * around), (FINE, ZERO_SINGULAR_VALUE)):
+            found: Any = minimize_scalar(
+                lambda t: smallest_singular_value(frame(t), clock),
+                bounds=(low, high),
+                method="bounded",
+                options={"xatol": tolerance * (high - low)},
+            )
+            if not found.fun < threshold:
+                break
+        else:
             return float(found.x)
     return None
 
