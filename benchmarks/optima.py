@@ -4,6 +4,7 @@ The scenarios are not in the banks. The IPOPT problem (CasADi, trapezoidal trans
 per scenario, which is timed separately, and solved from each candidate of the lattice search that `find_optimum` uses.
 Its best path is accurate to about 1e-3 and not certified. In scenes with hundreds of obstacles, which are sampled here,
 IPOPT solves from the first candidate only, with 400 intervals; with fewer, paths cut through obstacles between nodes.
+These take minutes and are compared with `--dense N` only.
 """
 
 import argparse

@@ -111,8 +111,11 @@ def _unicycle(scenario: Scenario) -> Unicycle:
 
 def _discs(scenario: Scenario) -> np.ndarray:
     """Return x, y and radius of each obstacle."""
-    circles = [obstacle.circle for obstacle in scenario.obstacles]
-    return np.array([(*circle.center, circle.radius) for circle in circles if circle is not None])
+    rows = []
+    for obstacle in scenario.obstacles:
+        assert obstacle.circle is not None
+        rows.append((*obstacle.circle.center, obstacle.circle.radius))
+    return np.array(rows)
 
 
 def _in_numpy(scenario: Scenario):

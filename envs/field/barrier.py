@@ -21,12 +21,12 @@ from leapnav.envs.kernels.types import tuple_of
 # with 5e-4 from 6. The corner of a rectangle passes a vertex at a smaller distance: with 5e-4 for rectangles, the
 # continuation to hard obstacles stalls in gaps that are 12 and 20 % wider than the robot.
 CONTACT, CORNER_CONTACT = 5e-4, 5e-5
-FARTHEST = 40.0  # distance (scales) beyond which the barrier is zero
+LARGEST_ARGUMENT = 40.0  # distance (scales) above which b has the value there, 2e-16
 
 
 @kernel(float64(float64), forceinline=True, fastmath={"contract"})
-def decay(s):
-    """Return exp(-s) - 1 for s from 0 to FARTHEST, with an error of 1e-12 near 0 and of 1e-15 elsewhere."""
+def negative_expm1(s):
+    """Return exp(-s) - 1 for s from 0 to LARGEST_ARGUMENT, with a relative error of 1e-15."""
     x = -0.0625 * s
     x2 = x * x
     x4 = x2 * x2
@@ -41,12 +41,12 @@ def decay(s):
 
 @kernel(tuple_of(*[float64] * 3)(float64, float64), forceinline=True, fastmath={"contract"})
 def barrier(s, contact):
-    """Return b(s), with a relative error of 1e-12 or an absolute one of 1e-15, and its first and second derivative.
+    """Return b(s), with a relative error of 1e-14 or an absolute one of 2e-15, and its first and second derivative.
 
     Below `contact` it is a quadratic polynomial.
     """
     inside = s if s > contact else contact
-    b = -1.0 - 1.0 / decay(inside if inside < FARTHEST else FARTHEST)
+    b = -1.0 - 1.0 / negative_expm1(inside if inside < LARGEST_ARGUMENT else LARGEST_ARGUMENT)
     slope = -b * (1.0 + b)
     bend = -slope * (1.0 + 2.0 * b)
     beyond = s - inside  # zero above `contact`

@@ -21,7 +21,8 @@ from leapnav.envs.kernels import kernel
 from leapnav.envs.kernels.internals import carray, scratch_buffer
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 
-BLOCK, LANES = 16, 4  # shapes whose barriers are computed in one loop, and of these at once, with 256-bit vectors
+BLOCK = 16  # shapes whose barriers are computed in one loop
+LANES = 4  # numbers of a vector instruction, of 256 bits
 TERM_ENTRIES = 4 * BLOCK  # of a block, see `_sum_terms`
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
 

@@ -31,7 +31,8 @@ def find_optima(
     Args:
         problems: scenarios or optimal control problems.
         effort: see `find_optimum`.
-        workers: number of processes.
+        workers: number of processes. They take about 4 s to start, so that two need more time than one for fewer than
+            about 250 scenarios of `clutter`.
         dask: address of a Dask scheduler (`tcp://host:8786`) whose workers are used instead.
         progress: whether to show a progress bar.
 

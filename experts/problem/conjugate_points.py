@@ -38,9 +38,9 @@ MAX_PARABOLA_MINIMUM = 0.7
 # fraction of its values at the neighbouring steps. A steep barrier or a small control weight make all values small: in
 # one extremal they were 4e-6 to 1e-5 over 0.5 s, without a zero.
 ZERO_SINGULAR_VALUE, ZERO_FRACTION = 1e-5, 0.1
-# Tolerances of the time of a minimum, relative to the two steps. At a zero, the coarse minimum is far below the values
-# at the neighbouring steps.
-COARSE, FINE = 1e-2, 1e-9
+# Tolerances of the time of a minimum, relative to the two steps. Only a minimum that is below ZERO_FRACTION of the
+# values at the neighbouring steps with the first one is computed with the second one.
+COARSE_TIME_TOLERANCE, TIME_TOLERANCE = 1e-3, 1e-9
 DIVERGENCE = "the sensitivities diverge along the extremal"
 
 
@@ -145,18 +145,22 @@ def _first_rank_loss(
     for i in _dips(times, determinants, check_parabola):
         low, high = sorted((float(times[i - 1]), float(times[i + 1])))
         around = max(smallest_singular_value(frame(t), clock) for t in (low, high))
-        for tolerance, threshold in ((COARSE, ZERO_FRACTION * around), (FINE, ZERO_SINGULAR_VALUE)):
-            found: Any = minimize_scalar(
-                lambda t: smallest_singular_value(frame(t), clock),
-                bounds=(low, high),
-                method="bounded",
-                options={"xatol": tolerance * (high - low)},
-            )
-            if not found.fun < threshold:
-                break
-        else:
-            return float(found.x)
+        coarse = _smallest_between(low, high, frame, clock, COARSE_TIME_TOLERANCE)
+        if coarse.fun < ZERO_FRACTION * around:
+            found = _smallest_between(low, high, frame, clock, TIME_TOLERANCE)
+            if found.fun < min(ZERO_SINGULAR_VALUE, ZERO_FRACTION * around):
+                return float(found.x)
     return None
+
+
+def _smallest_between(low: float, high: float, frame: Callable[[float], np.ndarray], clock: int, tol: float) -> Any:
+    """Return SciPy's minimum of the smallest singular value between two times (s)."""
+    return minimize_scalar(
+        lambda t: smallest_singular_value(frame(t), clock),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": tol * (high - low)},
+    )
 
 
 def smallest_singular_value(frame: np.ndarray, clock: int) -> float:

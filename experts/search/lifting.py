@@ -59,8 +59,7 @@ class Lifting:
             lifted = self._kinematic.lift(path.times, path.states, self._companion.start)
             lifted = self._timed(path if lifted is None else Trajectory(path.times, lifted))
             companion = self._companion.with_winding_of(lifted.states)
-            guess = discretise(companion, lifted)
-            direct = optimise(companion, guess, relaxed_weight=self._relaxed_weight, known=self._seen.known)
+            direct = optimise(companion, discretise(companion, lifted), relaxed_weight=self._relaxed_weight)
             shape = shape_of(direct.times, direct.states)
             if self._seen.contain(shape):
                 return None

@@ -66,6 +66,18 @@ def test_the_proximity_cost_is_the_formula(scenario):
         assert proximity(x, y, scenario.field)[0] == pytest.approx(formula, rel=1e-11, abs=left_out)
 
 
+@pytest.mark.parametrize("count", [11, 12, 13, 15, 16, 17, 40])
+def test_the_proximity_cost_is_the_formula_among_many_obstacles(count):
+    rng = np.random.default_rng(count)
+    angles, distances = rng.uniform(0.0, 2 * math.pi, count), rng.uniform(0.5, 1.5, count)
+    discs = np.column_stack([3.0 + distances * np.cos(angles), 3.0 + distances * np.sin(angles), np.full(count, 0.1)])
+    scenario = Scenario.from_discs(
+        discs, start=(0.5, 0.5, 0.0), goal=(5.5, 5.5, 0.0), horizon=9.0, arena=(0.0, 0.0, 6.0, 6.0)
+    )
+    for x, y in rng.uniform(2.8, 3.2, (20, 2)):
+        assert proximity(x, y, scenario.field)[0] == pytest.approx(plain_proximity(scenario, x, y), rel=1e-11)
+
+
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_gradient_and_hessian_agree_with_finite_differences(scenario):
     for x, y in points(scenario, 200):
@@ -109,7 +121,7 @@ def test_the_barrier_function_and_its_derivatives():
     for s in np.geomspace(CONTACT * 1.001, 300.0, 2000):
         b = 1 / math.expm1(s)
         expected = b, -b * (1 + b), b * (1 + b) * (1 + 2 * b)
-        assert barrier(s, CONTACT) == pytest.approx(expected, rel=2e-12, abs=2e-15)
+        assert barrier(s, CONTACT) == pytest.approx(expected, rel=1e-14, abs=2e-15)
     for s in (0.3, 2.0):
         h = 1e-4
         (left, right), (_, slope, bend) = (barrier(s + sign * h, CONTACT) for sign in (-1, 1)), barrier(s, CONTACT)

@@ -7,7 +7,7 @@ import pytest
 import sympy
 from helpers import known_problems, scenario_fields
 
-from leapnav.envs import Scenario
+from leapnav.envs import Scenario, sample_scenario
 from leapnav.experts import (
     ControlAffineSystem,
     OptimalControlProblem,
@@ -124,3 +124,8 @@ def test_an_optimum_with_alternatives_is_drawn_and_converted(name, tmp_path):
     assert len(content["alternatives"]) == len(optimum.alternatives)
     assert "driving_modes" not in content
     plot_extremal(optimum, tmp_path / "optimum.png")
+
+
+def test_the_better_of_two_close_local_optima_is_found():
+    """They stay within 0.12 m and rad of each other, and the one of the shorter lattice path costs 0.85 % more."""
+    assert find_optimum(sample_scenario("corridors", 907, "car")).cost == pytest.approx(8.7314937, rel=1e-6)

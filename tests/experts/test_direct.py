@@ -120,7 +120,9 @@ def test_the_descent_ends_close_to_a_known_path_and_nowhere_else():
     full = optimise(problem, guess)
     shape = shape_of(full.times, full.states)
     seen.add(shape + 0.3, shape)
-    other.add(shape + np.array([0.0, 0.0, 0.3]))
+    elsewhere = shape.copy()
+    elsewhere[40, 2] += 0.3
+    other.add(elsewhere)
     stopped = optimise(problem, guess, known=seen.known)
     assert full.converged and not full.known
     assert stopped.known and not stopped.converged
