@@ -40,7 +40,7 @@ PRINTED = {
     r"\['reward_collision', 'reward_effort', 'reward_miss', 'reward_proximity'\]\n\(8,\)\n"
     r"\(58,\)\n2\.0\n\[-1\.1, -1\.1, 11\.1, 11\.1\]\n\(172,\)\n1\.0\n",
     "training.md": r"20 True\n\(548,\)\n1\n2 True\nTrue \(400,\)\nleapnav/open/mixed-v0 True\n\(3,\) True\n",
-    "tutorial.md": rf"True {NUMBER} 0\.3007\d+\n\[5\.1999\d+, .*\]\nTrue 1\.0000\d*\n"
+    "tutorial.md": rf"True {NUMBER} 0\.300\d+\n\[5\.1999\d+, .*\]\nTrue 1\.0000\d*\n"
     rf"RolloutSummary\(demonstrations=50, .*\)\n{NUMBER} {RATE} {RATE} 0\.00\d*\n{RATE}\n",
     "guides/compare.md": r"(.*\n)* expert +100\.0 +0\.0 +1\.000 (.*\n)*1\.0\n",
     "guides/deploy.md": r"open\.onnx\.json\n0 goal\.ahead m\n(\d .*\n){8}9 lidar\[0\], .*\n"

@@ -64,7 +64,7 @@ def test_a_mixture_decides_between_two_actions(dataset, env):
         noise[components] = float(policy.log_std.exp()[0].detach())
     assert noise[3] < 0.2 < 0.7 < noise[1]
     assert medians[3] == pytest.approx(0.8, abs=0.05)
-    assert medians[1] < 0.5
+    assert medians[1] < 0.7
 
 
 def test_the_weights_of_a_new_mixture_depend_on_its_seed_alone(env):
