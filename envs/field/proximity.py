@@ -78,7 +78,7 @@ def disc_proximity(x, y, radius, field):
                     value, gx, gy = value + b, gx + bx, gy + by
                     hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
                     count = 0
-    while count % LANES > 0:  # shapes that are far away, which take less time than a loop over the last few
+    while count % LANES > 0:  # filled up with shapes far away: a loop over the last few would take longer
         terms[0, count], terms[1, count], terms[2, count], terms[3, count] = 2.0 * reach, 0.0, 0.0, 0.0
         count += 1
     b, bx, by, bxx, bxy, byy = _sum_terms(terms, count, header)

@@ -38,8 +38,8 @@ MAX_PARABOLA_MINIMUM = 0.7
 # fraction of its values at the neighbouring steps. A steep barrier or a small control weight make all values small: in
 # one extremal they were 4e-6 to 1e-5 over 0.5 s, without a zero.
 ZERO_SINGULAR_VALUE, ZERO_FRACTION = 1e-5, 0.1
-# Tolerances of the time of a minimum, relative to the two steps. Only a minimum that is below ZERO_FRACTION of the
-# values at the neighbouring steps with the first one is computed with the second one.
+# Tolerances of the time of a minimum, relative to the two steps. The minimum is computed with the second one only if,
+# with the first one, it is below ZERO_FRACTION of the values at the neighbouring steps.
 COARSE_TIME_TOLERANCE, TIME_TOLERANCE = 1e-3, 1e-9
 DIVERGENCE = "the sensitivities diverge along the extremal"
 
