@@ -24,8 +24,8 @@ MAX_BUCKET_INDEX = 1e15  # before the conversion to an integer: costs deep in an
 
 
 # The queue. Each bucket is a list: `bucket` has the index of its first entry, an entry the node and the index of the
-# next one; -1 is the end. A node whose cost decreases is queued again. Its earlier entry remains and is ignored, because
-# the node is not open any more when that entry is reached.
+# next one; -1 is the end. A node whose cost decreases is queued again. Its earlier entry remains and is ignored,
+# because the node is not open any more when that entry is reached.
 @kernel(NOTHING(INDICES, LINKS, int64, int64, int64))
 def enqueue(bucket, entries, entry, node, index):
     """Put a node into a bucket, as a new entry."""
