@@ -14,40 +14,76 @@ from numba import float64, int64
 
 from leapnav.envs.field.barrier import barrier
 from leapnav.envs.field.distance import HASH_FACTOR, barrier_term, closest_feature, part_geometry, wall_distance
-from leapnav.envs.field.layout import CUTOFF, header_of, parts_in, parts_near, time_of
+from leapnav.envs.field.layout import CUTOFF, HEADER_TYPE, header_of, parts_in, parts_near, time_of
 from leapnav.envs.field.moving import moving_row_value
 from leapnav.envs.field.rectangle import OUTLINE_ENTRIES, add_rectangle, rectangle_features, row_axis
 from leapnav.envs.kernels import kernel
+from leapnav.envs.kernels.internals import carray, scratch_buffer
 from leapnav.envs.kernels.types import CONSTANT, CONSTANT_MATRIX, MATRIX, VECTOR, tuple_of
 
+BLOCK = 16  # shapes whose barriers are computed in one loop
+LANES = 4  # numbers of a vector instruction, of 256 bits
+TERM_ENTRIES = 4 * BLOCK  # of a block, see `_sum_terms`
 VALUE_CUTOFF = 20.0  # proximity scales beyond which a term is skipped where nothing is differentiated
+
+
+@kernel(tuple_of(*[float64] * 6)(MATRIX, int64, HEADER_TYPE), forceinline=True, fastmath={"contract", "reassoc"})
+def _sum_terms(terms, count, header):
+    """Sum the barriers of distances: (b, b_x, b_y, b_xx, b_xy, b_yy).
+
+    The loop is vectorised. The order of the sum depends on the width of the processor's vectors, so that the results of
+    two processors differ by rounding errors.
+
+    Args:
+        terms (4, BLOCK): distance (m), its gradient (2), and the curvature (1/m) of its level line, of `count` shapes.
+        count: at most BLOCK.
+        header: header of the packed obstacle field.
+
+    """
+    value = gx = gy = hxx = hxy = hyy = 0.0
+    for k in range(count):
+        b, bx, by, bxx, bxy, byy = barrier_term(terms[0, k], terms[1, k], terms[2, k], terms[3, k], header)
+        value, gx, gy = value + b, gx + bx, gy + by
+        hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+    return value, gx, gy, hxx, hxy, hyy
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, float64, CONSTANT))
 def disc_proximity(x, y, radius, field):
-    """Proximity cost of a disc: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy)."""
+    """Proximity cost of a disc: (Phi, Phi_x, Phi_y, Phi_xx, Phi_xy, Phi_yy).
+
+    The distances of up to BLOCK shapes are computed first, and then their barriers, several at once.
+    """
     header, parts = header_of(field), parts_in(field)
     reach = CUTOFF * header.scale
+    terms, count = carray(scratch_buffer(TERM_ENTRIES), (4, BLOCK)), 0
     value = gx = gy = hxx = hxy = hyy = 0.0
     for side in range(4):
         distance = wall_distance(x, y, header, side) - radius
         if distance < reach:
             sign = 1.0 if side < 2 else -1.0
             nx, ny = (sign, 0.0) if side % 2 == 0 else (0.0, sign)
-            b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, 0.0, header)
-            value, gx, gy = value + b, gx + bx, gy + by
-            hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+            terms[0, count], terms[1, count], terms[2, count], terms[3, count] = distance, nx, ny, 0.0
+            count += 1
     for number in parts_near(x, y, field):
         part = parts[number]
         dx, dy = x - part.x, y - part.y
         if dx * dx + dy * dy < (part.rim + radius + reach) ** 2:
             distance, nx, ny, curvature = part_geometry(x, y, radius, field, part)
             if distance < reach:
-                b, bx, by, bxx, bxy, byy = barrier_term(distance, nx, ny, curvature, header)
-                value, gx, gy = value + b, gx + bx, gy + by
-                hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+                terms[0, count], terms[1, count], terms[2, count], terms[3, count] = distance, nx, ny, curvature
+                count += 1
+                if count == BLOCK:
+                    b, bx, by, bxx, bxy, byy = _sum_terms(terms, count, header)
+                    value, gx, gy = value + b, gx + bx, gy + by
+                    hxx, hxy, hyy = hxx + bxx, hxy + bxy, hyy + byy
+                    count = 0
+    while count > 2 and count % LANES > 0:  # filled up with shapes far away: the remainder of a loop takes longer
+        terms[0, count], terms[1, count], terms[2, count], terms[3, count] = 2.0 * reach, 0.0, 0.0, 0.0
+        count += 1
+    b, bx, by, bxx, bxy, byy = _sum_terms(terms, count, header)
     k = header.weight
-    return k * value, k * gx, k * gy, k * hxx, k * hxy, k * hyy
+    return k * (value + b), k * (gx + bx), k * (gy + by), k * (hxx + bxx), k * (hxy + bxy), k * (hyy + byy)
 
 
 @kernel(tuple_of(*[float64] * 6)(float64, float64, CONSTANT))

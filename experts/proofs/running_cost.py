@@ -40,7 +40,8 @@ from leapnav.envs.scenarios.scenario import Scenario
 from leapnav.experts.proofs.cells import GEOMETRY, Grid
 
 ROUNDING = 1e-9  # m, added to e: 1000 times the rounding errors of distances
-RELATIVE_ROUNDING = 1e-6  # of a bound: 10 times that of single precision, and 1e6 times that of the barrier
+RELATIVE_ROUNDING = 1e-6  # of a bound: 10 times that of single precision
+ABSOLUTE_ROUNDING = 1e-14  # of the barrier of each shape, 10 times the measured one
 SQUARE = 1 / 8  # width of a square, in proximity scales, that is small enough
 MAX_SQUARES = 4  # squares per axis of a cell
 
@@ -103,7 +104,8 @@ def _bound(field, weight, geometry, needed, cost):
                     px, py = cx + ((a + 0.5) / n - 0.5) * spacing, cy + ((b + 0.5) / n - 0.5) * spacing
                     if middle < spacing and clearance(px, py, field)[0] + reach < 0.0:
                         continue
-                    total, value = proximity_value(px, py, header.radius, field), 0.0
+                    total = proximity_value(px, py, header.radius, field) - ABSOLUTE_ROUNDING * (4 + header.parts)
+                    value = 0.0
                     if 0.0 < total < np.inf:  # otherwise far away, or deep in an obstacle where the barrier overflows
                         bound = min(1.0 / (growth / total + (growth - 1.0)), highest)
                         value = weight * bound * (1.0 - RELATIVE_ROUNDING)

@@ -5,6 +5,7 @@ Every number is computed when a lesson is opened. The sentences describe the com
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -61,8 +62,8 @@ def compare_methods() -> dict[str, Any]:
     Returns:
         A dictionary: `scenario`, `optimum` (cost, states), and `methods`, each with `name`, `status` and `iterates`.
         An iterate has `cost`, `residual`, `miss` (distance (m) from the end of the path to the goal), `jump` (largest
-        distance (m) between the end of a piece and the start of the next), `pieces` (states of each segment) and
-        `nodes` (x, y). `steps` contains the title and the explanation of each iteration.
+        distance (m) between the end of a piece and the start of the next), `pieces` (states of each segment, up to
+        where the flow diverges) and `nodes` (x, y). `steps` contains the title and the explanation of each iteration.
 
     """
     scenario = METHODS_SCENARIO
@@ -118,16 +119,16 @@ def _leapfrog(scenario: Scenario, guess: Trajectory) -> dict[str, Any]:
 def _iterate(
     problem: OptimalControlProblem, times: np.ndarray, nodes: np.ndarray, cost: float, residual: float
 ) -> dict[str, Any]:
-    """An iterate with its path, integrated from each node to the next."""
+    """An iterate with its path, integrated from each node to the next, or to where the flow diverges."""
     _, states = dense_path(problem, times, nodes, PATH_POINTS)
-    pieces = states.reshape(len(times) - 1, -1, states.shape[1])
-    jumps = np.hypot(*(pieces[1:, 0, :2] - pieces[:-1, -1, :2]).T) if len(pieces) > 1 else np.zeros(1)
-    miss = math.hypot(*(pieces[-1, -1, :2] - problem.arrays.goal[:2]))
+    pieces = [piece[np.isfinite(piece).all(1)] for piece in np.split(states, len(times) - 1)]
+    jumps = [math.dist(before[-1, :2], after[0, :2]) for before, after in itertools.pairwise(pieces)]
+    miss = math.dist(pieces[-1][-1, :2], problem.arrays.goal[:2])
     return {
         "cost": float(cost),
         "residual": float(residual),
         "miss": round(miss, 6),
-        "jump": round(float(jumps.max()), 6),
+        "jump": round(max(jumps, default=0.0), 6),
         "pieces": [_rows(piece, 4) for piece in pieces],
         "nodes": _rows(nodes[:, :2], 4),
     }

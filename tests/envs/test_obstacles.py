@@ -121,7 +121,7 @@ def test_the_barrier_function_and_its_derivatives():
     for s in np.geomspace(CONTACT * 1.001, 300.0, 2000):
         b = 1 / math.expm1(s)
         expected = b, -b * (1 + b), b * (1 + b) * (1 + 2 * b)
-        assert barrier(s, CONTACT) == pytest.approx(expected, rel=2e-12)
+        assert barrier(s, CONTACT) == pytest.approx(expected, rel=1e-14, abs=2e-15)
     for s in (0.3, 2.0):
         h = 1e-4
         (left, right), (_, slope, bend) = (barrier(s + sign * h, CONTACT) for sign in (-1, 1)), barrier(s, CONTACT)

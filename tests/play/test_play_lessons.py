@@ -1,6 +1,7 @@
 """The lessons of `leapnav play`: their sentences are true for the numbers that are computed."""
 
 import itertools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +39,7 @@ def test_single_shooting_misses_the_goal_and_stalls(methods):
         assert path[0] == list(METHODS_SCENARIO.start)
         assert iterate["miss"] == pytest.approx(np.hypot(*np.subtract(path[-1], METHODS_SCENARIO.goal)[:2]), abs=1e-3)
         assert iterate["miss"] > 1
+    assert json.dumps(single, allow_nan=False)  # a path ends where the flow diverges
 
 
 def test_multiple_shooting_closes_the_jumps_in_a_few_newton_steps(methods):
