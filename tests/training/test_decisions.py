@@ -1,10 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from leapnav.envs.scenarios.bank import ScenarioBank
 from leapnav.experts import ExpertPolicy
 from leapnav.training import GoToGoal, regret
+from leapnav.training.scoring import decisions, evaluation
 from leapnav.training.scoring.decision_reports import costliest_decisions, plot_decisions, print_decisions
+from leapnav.training.scoring.policy_specs import load_policy_spec
 
 
 def late(policy, steps=40):
@@ -81,6 +85,23 @@ def test_a_robot_that_stands_still_loses_before_the_horizon():
     lost = int(np.searchsorted(one.times, one.lost_at - 1e-9))
     assert (one.regrets[lost:] == 0.0).all() and one.regrets[lost - 1] == one.regrets.max() > 10.0
     assert (np.diff(one.regrets[: lost - 1]) > 0.0).all()  # the later, the faster the robot must drive
+
+
+def test_a_policy_by_name_on_the_file_of_a_bank():
+    path = ScenarioBank.shipped("open", "test").path
+    found = regret("open", path, count=2, decisions=True, resolution=5.0, progress=False)
+    assert [one.episode.index for one in found.decisions] == [0, 1]
+    assert (found.levels == regret("open", "open", count=2, progress=False).levels).all()
+
+
+def test_decisions_are_scored_among_the_obstacles_of_the_training(monkeypatch):
+    """The bank is the one on which the policy is evaluated."""
+    spec = replace(load_policy_spec("go-to-goal"), obstacles="hard")
+    monkeypatch.setattr(evaluation, "load_policy_spec", lambda name, seed: spec)
+    seen = []
+    monkeypatch.setattr(decisions, "decisions_of", lambda evaluation, bank, **_: seen.append(bank) or [])
+    regret("go-to-goal", "clutter", count=1, decisions=True, progress=False)
+    assert seen == [ScenarioBank.shipped("clutter", "test", obstacles="hard")]
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -18,8 +19,9 @@ from leapnav.envs.utils.progress import progress_bar
 from leapnav.envs.utils.validation import check_at_least, check_positive
 from leapnav.experts.optimum import find_optimum
 from leapnav.training.scoring.adapters import PolicyOrFactory
-from leapnav.training.scoring.evaluation import evaluate
+from leapnav.training.scoring.evaluation import evaluate, resolve
 from leapnav.training.scoring.results import Episode, Evaluation
+from leapnav.training.threads import limit_threads
 
 RESOLUTION = 0.25  # s between the states from which the optimum is searched
 
@@ -88,9 +90,10 @@ class PolicyRegret:
         return sorted(rows, key=lambda row: -row[2])[:count]
 
 
+@limit_threads
 def regret(
-    policy: PolicyOrFactory,
-    bank: ScenarioBank | str = "clutter",
+    policy: PolicyOrFactory | str | Path,
+    bank: ScenarioBank | str | Path = "clutter",
     *,
     decisions: bool = False,
     resolution: float = RESOLUTION,
@@ -121,10 +124,8 @@ def regret(
     """
     check_positive("resolution", resolution)
     check_at_least("workers", workers, 1)
+    policy, bank, environment = resolve(policy, bank, environment, seed)
     evaluation = evaluate(policy, bank, count=count, environment=environment, seed=seed, timed=False, progress=progress)
-    if not isinstance(bank, ScenarioBank):
-        kinds = evaluation.settings.horizon, (environment or {}).get("obstacles") or "cost"
-        bank = ScenarioBank.shipped(bank, "test", evaluation.settings.robot, *kinds)
     if not decisions:
         return PolicyRegret(evaluation, level_regrets(evaluation))
     found = decisions_of(evaluation, bank, resolution=resolution, workers=workers, progress=progress)

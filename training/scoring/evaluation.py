@@ -54,7 +54,7 @@ MIN_REVERSE_SPEED = 0.05  # m/s; an optimum that reaches this speed backwards co
 @limit_threads
 def evaluate(
     policy: PolicyOrFactory | str | Path,
-    bank: ScenarioBank | str = "clutter",
+    bank: ScenarioBank | str | Path = "clutter",
     *,
     count: int | None = None,
     environment: Mapping[str, Any] | None = None,
@@ -100,24 +100,7 @@ def evaluate(
 
     """
     check_at_least("workers", workers, 1)
-    obstacles, trained, name = None, None, policy
-    if isinstance(policy, (str, Path)):
-        spec = load_policy_spec(str(policy), seed=seed)
-        policy, environment = spec.policy, {**spec.environment, **(environment or {})}
-        obstacles, trained = spec.obstacles, spec.trained_robot
-    environment = {**known_environment(policy), **(environment or {})}
-    if not (hasattr(policy, "predict") or callable(policy)):
-        raise TypeError(
-            "policy: expected a name, an object with `predict`, a function of an observation, or a PolicyFactory, got "
-            f"{type(policy).__name__}"
-        )
-    if not isinstance(bank, ScenarioBank):
-        if not isinstance(bank, str):
-            raise ValueError(f"bank: expected a ScenarioBank or the name of a family, got {type(bank).__name__}")
-        bank = _named_bank(bank, {"obstacles": obstacles, **environment})
-    differences = [] if trained is None else trained.differences(bank.robot)
-    if differences:
-        warnings.warn(f"{name}: trained with another robot: {'; '.join(differences)}", stacklevel=3)
+    policy, bank, environment = resolve(policy, bank, environment, seed)
     if len(bank) == 0 or (count is not None and count < 1):
         raise ValueError(f"count: expected at least one scenario, got {len(bank) if count is None else count}")
     arguments = {name: value for name, value in environment.items() if name != "obstacles"}
@@ -146,6 +129,34 @@ def known_environment(policy: Any) -> dict[str, Any]:
     if not found and isinstance(getattr(policy, "observation_space", None), gym.spaces.Dict):
         return {} if is_goal_conditioned(policy) else {"dict_observation": True}
     return found
+
+
+def resolve(
+    policy: PolicyOrFactory | str | Path,
+    bank: ScenarioBank | str | Path,
+    environment: Mapping[str, Any] | None,
+    seed: int,
+) -> tuple[PolicyOrFactory, ScenarioBank, dict[str, Any]]:
+    """Return the policy, the bank and the arguments of the environment of an evaluation, see `evaluate`."""
+    obstacles, trained, name = None, None, policy
+    if isinstance(policy, (str, Path)):
+        spec = load_policy_spec(str(policy), seed=seed)
+        policy, environment = spec.policy, {**spec.environment, **(environment or {})}
+        obstacles, trained = spec.obstacles, spec.trained_robot
+    environment = {**known_environment(policy), **(environment or {})}
+    if not (hasattr(policy, "predict") or callable(policy)):
+        raise TypeError(
+            "policy: expected a name, an object with `predict`, a function of an observation, or a PolicyFactory, got "
+            f"{type(policy).__name__}"
+        )
+    if not isinstance(bank, ScenarioBank):
+        if not isinstance(bank, (str, Path)):
+            raise ValueError(f"bank: expected a ScenarioBank, its file or a family, got {type(bank).__name__}")
+        bank = _named_bank(str(bank), {"obstacles": obstacles, **environment})
+    differences = [] if trained is None else trained.differences(bank.robot)
+    if differences:
+        warnings.warn(f"{name}: trained with another robot: {'; '.join(differences)}", stacklevel=4)
+    return policy, bank, environment
 
 
 def _named_bank(name: str, environment: Mapping[str, Any]) -> ScenarioBank:
