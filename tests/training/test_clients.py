@@ -1,6 +1,7 @@
 """Clients of the environments and the policies: wrappers of Gymnasium, models of Stable-Baselines3, recorders."""
 
 import json
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,7 @@ from gymnasium.wrappers import (
 )
 from gymnasium.wrappers.vector import RescaleAction as RescaleActions
 from onnxruntime import InferenceSession
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from leapnav.cli import main
@@ -125,6 +126,15 @@ def test_evaluations_normalise_the_observations_of_a_model_with_vec_normalize():
     assert max(seen) <= 0.5
     with pytest.raises(ValueError, match="model: its observations are normalised by VecNormalize"):
         behaviour_clone(model, [])
+
+
+def test_a_model_of_environments_in_processes_is_evaluated_with_their_sensors():
+    venv = SubprocVecEnv([partial(gym.make, "leapnav/Navigate-v0", lidar_beams=24)], start_method="fork")
+    model = sb3.PPO("MlpPolicy", venv, n_steps=16, batch_size=16)
+    assert evaluate(model, "open", count=1, timed=False, progress=False).settings.lidar_beams == 24
+    venv.close()
+    with pytest.raises(ValueError, match=r"policy: expected observations \(33,\), got \(41,\)"):
+        evaluate(model, "open", count=1, timed=False, progress=False)
 
 
 def test_the_network_refuses_normalised_observations():

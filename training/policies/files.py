@@ -223,12 +223,14 @@ def policy_environment(policy: str | Path | BaseAlgorithm) -> dict[str, Any]:
 def environment_of(model: Any) -> dict[str, Any]:
     """Return the arguments of `gym.make` that determine the observations and the period of a model's environment.
 
-    They are empty if the model has no environment, or not one of leapnav.
+    They are empty if the model has no environment, not one of leapnav, or one in processes that have ended.
     """
     venv = model.get_env() if isinstance(model, BaseAlgorithm) else None
     try:
-        settings = unwrap(venv)[0].settings
-    except TypeError:
+        settings = venv.get_attr("settings", 0)[0] if venv is not None and venv.has_attr("settings") else None
+    except (EOFError, OSError):  # the environment is closed, and its processes have ended
+        return {}
+    if not isinstance(settings, EnvironmentSettings):
         return {}
     return {**{name: getattr(settings, name) for name in OBSERVED}, **_period(_as_dict(settings))}
 
