@@ -8,14 +8,13 @@ processor, and some banks are older than changes of the search. Differences of t
 because the search omits some of the expensive alternatives. Lower bounds, which `leapnav bank prove` adds, and shortest
 paths are not compared.
 
-python scripts/build_banks.py --shortest # adds shortest lengths and minimum times to the test banks (hours)
+python scripts/build_banks.py --shortest # adds shortest lengths and minimum times to the test banks (days)
 """
 
 import argparse
 import os
 import sys
 import tempfile
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +30,15 @@ from leapnav.experts.data.bank_shortest import find_shortest
 BANKS = Path(__file__).resolve().parent.parent / "envs" / "scenarios" / "banks"
 # Number of scenarios, and seed. Different seeds give independent scenarios, so no scenario is in both splits.
 SPLITS = {"train": (400, 0), "test": (200, 1)}
-# Robots besides the unicycle: models, families, and number of scenarios of each split.
-ROBOTS, ROBOT_FAMILIES, ROBOT_COUNT = ("car", "dynamic_unicycle"), ("clutter", "rooms"), 200
+# Families of the robots besides the unicycle, and number of scenarios of each split.
+ROBOT_FAMILIES = {
+    "car": ("clutter", "rooms"),
+    "dynamic_unicycle": ("clutter", "rooms"),
+    "differential_drive": ("clutter",),
+    "dynamic_car": ("clutter",),
+    "trailer": ("clutter",),
+}
+ROBOT_COUNT = 200
 HARD_FAMILIES = "clutter", "polygons", "rooms", "slalom"  # test banks with hard obstacles
 LARGE_FAMILIES, LARGE_COUNT = ("maze", "corridors"), 200  # fixed horizon only
 COST_TOLERANCE = 1e-9  # relative
@@ -55,8 +61,8 @@ def build(directory: Path, workers: int) -> None:
     for family in HARD_FAMILIES:
         path = directory / f"{collection_name(family, obstacles='hard')}-test.bank"
         build_bank(family, count, path, obstacles="hard", seed=seed, workers=workers)
-    for robot in ROBOTS:
-        for family in ROBOT_FAMILIES:
+    for robot, families in ROBOT_FAMILIES.items():
+        for family in families:
             for split, (_, seed) in SPLITS.items():
                 path = directory / f"{collection_name(family, robot)}-{split}.bank"
                 build_bank(family, ROBOT_COUNT, path, robot=robot, seed=seed, workers=workers)
@@ -64,10 +70,11 @@ def build(directory: Path, workers: int) -> None:
 
 def add_shortest(directory: Path, workers: int) -> None:
     """Add the shortest lengths and minimum times to the test banks, once for each task."""
-    for robot, family in product(ROBOTS, ROBOT_FAMILIES):
-        path = directory / f"{collection_name(family, robot)}-test.bank"
-        if np.isnan(ScenarioBank(path).shortest_times).any():
-            find_shortest(path, workers=workers)
+    for robot, families in ROBOT_FAMILIES.items():
+        for family in families:
+            path = directory / f"{collection_name(family, robot)}-test.bank"
+            if np.isnan(ScenarioBank(path).shortest_times).any():
+                find_shortest(path, workers=workers)
     for family in (*ALL_FAMILIES, *LARGE_FAMILIES):
         path = directory / f"{family}-test.bank"
         if np.isnan(ScenarioBank(path).shortest_times).any():

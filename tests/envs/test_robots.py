@@ -310,8 +310,8 @@ def test_the_wrong_robot_is_refused_by_name():
         NavigateEnv(robot={"model": "car", "wheelbse": 0.5})
     with pytest.raises(ValueError, match="actuation: 'motor' needs the robot 'unicycle', got 'car'"):
         NavigateEnv(robot="car", actuation="motor", split="fresh")
-    with pytest.raises(ValueError, match="split: the robot 'differential_drive' has included banks for no family"):
-        NavigateEnv("clutter", split="test", robot="differential_drive")
+    with pytest.raises(ValueError, match="split: the robot 'unicycle_trailer' has included banks for no family"):
+        NavigateEnv("clutter", split="test", robot="unicycle_trailer")
 
 
 @pytest.mark.parametrize(
