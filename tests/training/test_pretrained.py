@@ -21,9 +21,9 @@ SOC = {
     "open": 0.999,
     "polygons": 0.961,
     "polygons-lidar": 0.935,
-    "rooms": 0.993,
+    "rooms": 0.997,
     "rooms-lidar": 0.880,
-    "slalom": 0.991,
+    "slalom": 0.994,
     "slalom-lidar": 0.987,
 }
 
